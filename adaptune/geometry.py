@@ -1,0 +1,137 @@
+"""Rigid transforms as homogeneous matrices, one or many at a time."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+Poses = NDArray[np.float64]
+"""Homogeneous matrices of shape (..., 4, 4), named ``T_target_source``."""
+
+
+def invert(T_target_source: Poses) -> Poses:
+    """Invert rigid transforms.
+
+    Parameters
+    ----------
+    T_target_source
+        Transforms of shape (..., 4, 4).
+
+    Returns
+    -------
+    ndarray of shape (..., 4, 4)
+        ``T_source_target``.
+    """
+    R_source_target = np.swapaxes(T_target_source[..., :3, :3], -1, -2)
+    T_source_target = np.zeros_like(T_target_source)
+    T_source_target[..., :3, :3] = R_source_target
+    T_source_target[..., :3, 3] = -(R_source_target @ T_target_source[..., :3, 3, None])[..., 0]
+    T_source_target[..., 3, 3] = 1.0
+    return T_source_target
+
+
+def steps(T_world_sensor: Poses) -> Poses:
+    """Motions between consecutive poses.
+
+    Parameters
+    ----------
+    T_world_sensor
+        Poses of shape (n, 4, 4).
+
+    Returns
+    -------
+    ndarray of shape (n - 1, 4, 4)
+        ``T_previous_current`` of every pose but the first.
+    """
+    return invert(T_world_sensor[:-1]) @ T_world_sensor[1:]
+
+
+def rotation_angle(T_target_source: Poses) -> Any:
+    """Angle of the rotations in radians, of shape (...)."""
+    R = T_target_source[..., :3, :3]
+    # atan2 keeps its precision at small angles, where the arc cosine of the trace loses it.
+    sine = 0.5 * np.sqrt(
+        (R[..., 2, 1] - R[..., 1, 2]) ** 2
+        + (R[..., 0, 2] - R[..., 2, 0]) ** 2
+        + (R[..., 1, 0] - R[..., 0, 1]) ** 2
+    )
+    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    return np.arctan2(sine, cosine)
+
+
+def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
+    """Poses from translations and unit quaternions.
+
+    Parameters
+    ----------
+    translations
+        Metres, of shape (n, 3).
+    quaternions
+        In the order x, y, z, w, of shape (n, 4); normalised here.
+
+    Returns
+    -------
+    ndarray of shape (n, 4, 4)
+    """
+    translations = np.asarray(translations, np.float64).reshape(-1, 3)
+    T = np.tile(np.eye(4), (len(translations), 1, 1))
+    if len(translations):
+        T[:, :3, :3] = Rotation.from_quat(np.asarray(quaternions, np.float64)).as_matrix()
+        T[:, :3, 3] = translations
+    return T
+
+
+def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
+    """Quaternions x, y, z, w (w >= 0) of poses of shape (n, 4, 4), of shape (n, 4)."""
+    if not len(T_target_source):
+        return np.empty((0, 4))
+    quaternions: NDArray[np.float64] = Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(
+        canonical=True
+    )
+    return quaternions
+
+
+def interpolate(
+    stamps: NDArray[np.int64], T_world_sensor: Poses, at: NDArray[np.int64], max_gap: int
+) -> Poses:
+    """Interpolate poses at other stamps: linearly in translation, spherically in rotation.
+
+    Parameters
+    ----------
+    stamps
+        Strictly increasing nanoseconds, of shape (n,).
+    T_world_sensor
+        Poses at `stamps`, of shape (n, 4, 4).
+    at
+        Nanoseconds, of shape (m,).
+    max_gap
+        Nanoseconds. Between two poses further apart than this nothing is interpolated.
+
+    Returns
+    -------
+    ndarray of shape (m, 4, 4)
+        NaN where `at` lies outside `stamps` or inside a gap.
+    """
+    T = np.full((len(at), 4, 4), np.nan)
+    if not len(stamps) or not len(at):
+        return T
+    after = np.searchsorted(stamps, at, side="left")
+    inside = (at >= stamps[0]) & (at <= stamps[-1])
+    after = np.clip(after, 0, len(stamps) - 1)
+    exact = inside & (stamps[after] == at)
+    T[exact] = T_world_sensor[after[exact]]
+    between = inside & ~exact
+    between[between] = (stamps[after[between]] - stamps[after[between] - 1]) <= max_gap
+    if between.any():
+        # Stamps are exact integers; only differences, which fit a double, become floats.
+        seconds = (stamps - stamps[0]) * 1e-9
+        query = (at[between] - stamps[0]) * 1e-9
+        T[between] = np.eye(4)
+        rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
+        T[between, :3, :3] = Slerp(seconds, rotations)(query).as_matrix()
+        left = after[between] - 1
+        share = ((query - seconds[left]) / (seconds[left + 1] - seconds[left]))[:, None]
+        translations = T_world_sensor[:, :3, 3]
+        T[between, :3, 3] = (1.0 - share) * translations[left] + share * translations[left + 1]
+    return T

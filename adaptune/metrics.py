@@ -1,0 +1,155 @@
+"""How wrong an odometry is: sub-trajectory errors, and KITTI's error built on them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert, rotation_angle
+
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+
+
+def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:
+    """Distance travelled until each pose in metres, of shape (n,).
+
+    Poses that are NaN add nothing.
+    """
+    distance = np.zeros(len(T_world_sensor))
+    if len(T_world_sensor) > 1:
+        lengths = np.linalg.norm(np.diff(T_world_sensor[:, :3, 3], axis=0), axis=1)
+        distance[1:] = np.cumsum(np.nan_to_num(lengths, nan=0.0))
+    return distance
+
+
+def window_ends(T_world_sensor: Poses, length: float) -> NDArray[np.intp]:
+    """End of the sub-trajectory of `length` metres that starts at each pose.
+
+    The end is the first pose further along the path than `length` from the start, as in KITTI's
+    development kit.
+
+    Parameters
+    ----------
+    T_world_sensor
+        Reference poses of shape (n, 4, 4).
+    length
+        Metres.
+
+    Returns
+    -------
+    ndarray of shape (n,)
+        Index of the end; -1 where the path ends before, or where a pose on the way is NaN.
+    """
+    distance = travelled(T_world_sensor)
+    ends = np.searchsorted(distance, distance + length, side="right")
+    missing = np.concatenate([[0], np.cumsum(np.isnan(T_world_sensor[:, 0, 0]))])
+    starts = np.arange(len(ends))
+    inside = ends < len(ends)
+    ends[~inside] = -1
+    whole = missing[ends + 1] == missing[starts]
+    return np.where(inside & whole, ends, -1)
+
+
+def _relative_errors(
+    T_ref_sensor: Poses, T_odom_sensor: Poses, starts: NDArray[np.intp], ends: NDArray[np.intp]
+) -> Poses:
+    """Transform inv(dEst) @ dGt for windows from `starts` to `ends`, of shape (m, 4, 4)."""
+    d_gt = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends]
+    d_est = invert(T_odom_sensor[starts]) @ T_odom_sensor[ends]
+    return invert(d_est) @ d_gt
+
+
+def sub_trajectory_rte(
+    T_ref_sensor: Poses,
+    T_odom_sensor: Poses,
+    length: float,
+    restarted: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Relative translation error of the sub-trajectory that starts at every frame.
+
+    After Koide et al., *Adaptive Hyperparameter Tuning for Black-box LiDAR Odometry*, IROS 2021.
+
+    Parameters
+    ----------
+    T_ref_sensor
+        Reference poses of shape (n, 4, 4); NaN where there is none.
+    T_odom_sensor
+        The odometry's poses, of shape (n, 4, 4).
+    length
+        Length of the sub-trajectories in metres.
+    restarted
+        Frames at which the odometry lost track and was started anew at the reference, of shape
+        (n,).
+
+    Returns
+    -------
+    ndarray of shape (n,)
+        Percent of `length`: NaN for frames without a full sub-trajectory, infinity for those
+        whose sub-trajectory contains a lost track.
+    """
+    ends = window_ends(T_ref_sensor, length)
+    starts = np.flatnonzero(ends >= 0)
+    errors = np.full(len(ends), np.nan)
+    T = _relative_errors(T_ref_sensor, T_odom_sensor, starts, ends[starts])
+    errors[starts] = 100.0 / length * np.linalg.norm(T[:, :3, 3], axis=1)
+    if restarted is not None:
+        # The step that failed ends at its frame: a window that starts there is sound.
+        failures = np.cumsum(restarted)
+        errors[starts[failures[ends[starts]] > failures[starts]]] = np.inf
+    return errors
+
+
+class KittiError(NamedTuple):
+    """Mean errors over sub-trajectories of several lengths.
+
+    Attributes
+    ----------
+    translation : float
+        Percent; NaN when the path is shorter than every length.
+    rotation : float
+        Degrees a metre.
+    lengths : tuple of float
+        The lengths in metres for which there was at least one sub-trajectory.
+    """
+
+    translation: float
+    rotation: float
+    lengths: tuple[float, ...]
+
+
+def kitti_error(
+    T_ref_sensor: Poses,
+    T_odom_sensor: Poses,
+    lengths: Sequence[float] = KITTI_LENGTHS,
+    stride: int = 10,
+) -> KittiError:
+    """Error of KITTI's odometry benchmark (Geiger et al., CVPR 2012).
+
+    Parameters
+    ----------
+    T_ref_sensor, T_odom_sensor
+        Reference and estimated poses, of shape (n, 4, 4).
+    lengths
+        Metres.
+    stride
+        Every how many frames a sub-trajectory starts.
+    """
+    translations, rotations, used = [], [], []
+    for length in lengths:
+        ends = window_ends(T_ref_sensor, length)[::stride]
+        starts = np.arange(len(T_ref_sensor))[::stride][ends >= 0]
+        ends = ends[ends >= 0]
+        if not len(starts):
+            continue
+        T = _relative_errors(T_ref_sensor, T_odom_sensor, starts, ends)
+        translations.append(np.linalg.norm(T[:, :3, 3], axis=1) / length)
+        rotations.append(rotation_angle(T) / length)
+        used.append(length)
+    if not used:
+        return KittiError(np.nan, np.nan, ())
+    return KittiError(
+        100.0 * float(np.mean(np.concatenate(translations))),
+        float(np.degrees(np.mean(np.concatenate(rotations)))),
+        tuple(used),
+    )

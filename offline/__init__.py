@@ -1,0 +1,1 @@
+"""Stage one: sample parameter sets, run trials, fit and validate the error model."""

@@ -1,0 +1,1 @@
+"""Stage two: replay or listen, select every second, switch, compare."""
