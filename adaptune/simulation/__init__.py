@@ -2,6 +2,7 @@
 
 from adaptune.simulation.course import Course, SceneLeg, SimulationError
 from adaptune.simulation.motion import MOTIONS
+from adaptune.simulation.recording import record
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import SENSORS
 from adaptune.simulation.simulate import SimulatedScan, simulate
@@ -14,5 +15,6 @@ __all__ = [
     "SceneLeg",
     "SimulatedScan",
     "SimulationError",
+    "record",
     "simulate",
 ]
