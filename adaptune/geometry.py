@@ -31,6 +31,27 @@ def invert(T_target_source: Poses) -> Poses:
     return T_source_target
 
 
+def rectify(T_target_source: Poses) -> Poses:
+    """Take rounding errors out of rotations, by one Newton step of the polar decomposition.
+
+    Chained motions amplify them: where each pose is predicted from the two before it, they more
+    than double with every scan.
+
+    Parameters
+    ----------
+    T_target_source
+        Transforms of shape (..., 4, 4), rigid but for rounding errors.
+
+    Returns
+    -------
+    ndarray of shape (..., 4, 4)
+    """
+    T = T_target_source.copy()
+    R = T[..., :3, :3]
+    T[..., :3, :3] = 1.5 * R - 0.5 * R @ np.swapaxes(R, -1, -2) @ R
+    return T
+
+
 def steps(T_world_sensor: Poses) -> Poses:
     """Motions between consecutive poses.
 

@@ -1,0 +1,120 @@
+"""What every odometry must do to be tuned."""
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+from pydantic import BaseModel, ConfigDict
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses
+from adaptune.sequence import Scan
+from adaptune.space import ParameterSet, ParameterSpace
+
+
+class OdometryError(AdaptuneError):
+    """An odometry that cannot do what is asked of it."""
+
+
+class BaseSettings(BaseModel):
+    """What is set once for a study and not tuned."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Registration(NamedTuple):
+    """Where an odometry believes the sensor was.
+
+    Attributes
+    ----------
+    T_odom_sensor : ndarray of shape (4, 4)
+        Pose at the scan's stamp.
+    registered : bool
+        False if the scan was too poor to register: the pose then goes on with the last motion.
+    """
+
+    T_odom_sensor: Poses
+    registered: bool = True
+
+
+class Odometry(ABC):
+    """A LiDAR odometry, seen from outside.
+
+    A new instance knows nothing; `start` places it, `register` moves it on scan by scan. All of
+    it runs on one thread, so that the same scans give the same poses.
+
+    Attributes
+    ----------
+    space : ParameterSpace
+        What can be tuned, with sensible ranges; class attribute.
+    settings_type : type
+        What is set once, as a pydantic model; class attribute.
+    live : bool
+        Whether `configure` may be called between scans; class attribute.
+    parameters : dict
+        The present value of every parameter in `space`.
+
+    Parameters
+    ----------
+    parameters
+        Values of any of the parameters in `space`; the others keep their baseline. Values
+        outside the range in `space` are the caller's to judge.
+    settings
+        An instance of `settings_type`.
+    """
+
+    space: ClassVar[ParameterSpace]
+    settings_type: ClassVar[type[BaseSettings]] = BaseSettings
+    live: ClassVar[bool]
+
+    def __init__(
+        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
+    ):
+        self.settings: Any = self.settings_type() if settings is None else settings
+        self.parameters = self.space.baseline | (parameters or {})
+
+    @abstractmethod
+    def prepare(self, scan: Scan) -> Any:
+        """Do to a scan all that does not depend on parameters, pose or earlier scans.
+
+        What it returns serves every instance with the same settings, and must not be changed by
+        any.
+        """
+
+    @abstractmethod
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """Forget all scans and begin with this one.
+
+        Parameters
+        ----------
+        prepared
+            A scan, prepared.
+        T_odom_sensor
+            Where the sensor is, of shape (4, 4).
+        T_previous_current
+            The last motion, of shape (4, 4), for odometries that predict by it; none means that
+            the sensor stood still.
+        """
+
+    @abstractmethod
+    def register(self, prepared: Any) -> Registration:
+        """Find the pose of the next scan."""
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """Change parameters between scans; those not named stay.
+
+        Raises
+        ------
+        OdometryError
+            If the odometry is not `live`.
+        """
+        if not self.live:
+            raise OdometryError(f"{type(self).__name__} cannot change its parameters between scans")
+        self.parameters |= parameters
+
+
+def prepared_bytes(prepared: Any) -> int:
+    """Memory that a prepared scan takes, roughly, in bytes."""
+    size = getattr(prepared, "nbytes", None)
+    return int(size) if size is not None else 1_000_000

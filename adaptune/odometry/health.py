@@ -1,0 +1,46 @@
+"""A check of an odometry's poses that needs no reference."""
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from adaptune.geometry import Poses
+
+
+class HealthCheck(BaseModel):
+    """Bounds on a platform's motion.
+
+    Odometries that predict by constant velocity run away after a failure and do not come back. A
+    step that the platform cannot have made shows it.
+
+    Attributes
+    ----------
+    max_speed : float
+        Metres a second.
+    max_acceleration : float
+        Metres a second squared, of the step's mean velocity against the last healthy one's;
+        generous enough for the noise of two differentiations.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    max_speed: float = Field(40.0, gt=0)
+    max_acceleration: float = Field(30.0, gt=0)
+
+    def healthy(self, velocity: Poses, last_velocity: Poses | None, elapsed: float) -> bool:
+        """Whether the platform can have moved like this.
+
+        Parameters
+        ----------
+        velocity
+            Metres a second in the sensor's frame, of shape (3,).
+        last_velocity
+            The last healthy one; none if there is none yet.
+        elapsed
+            Seconds since `last_velocity`.
+        """
+        if not np.isfinite(velocity).all() or np.linalg.norm(velocity) > self.max_speed:
+            return False
+        if last_velocity is None:
+            return True
+        change = float(np.linalg.norm(velocity - last_velocity))
+        return change <= self.max_acceleration * elapsed

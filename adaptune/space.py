@@ -1,0 +1,245 @@
+"""The parameters of an odometry: their types, their ranges, and the unit cube they map to."""
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+
+from adaptune.errors import AdaptuneError
+
+Value = float | int | str | bool
+ParameterSet = dict[str, Value]
+"""A value for every parameter, by name."""
+
+
+class SpaceError(AdaptuneError):
+    """A parameter set that is not of its space."""
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Half a sentence that helps with a wrong name: the nearest valid one, else all."""
+    names = sorted(names)
+    close = difflib.get_close_matches(name, names, n=1)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return f"there is {', '.join(map(repr, names))}" if names else "there is none"
+
+
+class _Parameter(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Float(_Parameter):
+    """A real number from `low` to `high`, both included; `log` spaces it evenly in ratio."""
+
+    type: Literal["float"] = "float"
+    low: float = Field(allow_inf_nan=False)
+    high: float = Field(allow_inf_nan=False)
+    baseline: float
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_range(self)
+        return self
+
+    def contains(self, value: object) -> bool:
+        """Whether `value` is a number in the range."""
+        return (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and self.low <= value <= self.high
+        )
+
+    def to_unit(self, value: Any) -> float:
+        """Map a value to [0, 1]."""
+        low, high = self._bounds()
+        return (self._scale(float(value)) - low) / (high - low)
+
+    def from_unit(self, unit: float) -> float:
+        """Map from [0, 1] to a value."""
+        low, high = self._bounds()
+        value = low + min(max(unit, 0.0), 1.0) * (high - low)
+        # The exponential may overshoot a bound by a rounding error.
+        return min(max(math.exp(value) if self.log else value, self.low), self.high)
+
+    def _scale(self, value: float) -> float:
+        return math.log(value) if self.log else value
+
+    def _bounds(self) -> tuple[float, float]:
+        return self._scale(self.low), self._scale(self.high)
+
+
+class Integer(_Parameter):
+    """A whole number from `low` to `high`, both included."""
+
+    type: Literal["integer"] = "integer"
+    low: int
+    high: int
+    baseline: int
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_range(self)
+        return self
+
+    def contains(self, value: object) -> bool:
+        """Whether `value` is a whole number in the range."""
+        return (
+            isinstance(value, int)
+            and not isinstance(value, bool)
+            and self.low <= value <= self.high
+        )
+
+    def to_unit(self, value: Any) -> float:
+        """Map a value to the middle of its share of [0, 1]."""
+        low, high = self._bounds()
+        return (self._scale(float(value)) - low) / (high - low)
+
+    def from_unit(self, unit: float) -> int:
+        """Map from [0, 1] to the value whose share it falls in."""
+        low, high = self._bounds()
+        scaled = low + min(max(unit, 0.0), 1.0) * (high - low)
+        value = round(math.exp(scaled) if self.log else scaled)
+        return min(max(value, self.low), self.high)
+
+    def _scale(self, value: float) -> float:
+        return math.log(value) if self.log else value
+
+    def _bounds(self) -> tuple[float, float]:
+        # Half a step on either side gives the first and the last value a whole share.
+        return self._scale(self.low - 0.5), self._scale(self.high + 0.5)
+
+
+class Categorical(_Parameter):
+    """One of a list of values, without an order."""
+
+    type: Literal["categorical"] = "categorical"
+    choices: tuple[Value, ...] = Field(min_length=2)
+    baseline: Value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(set(map(repr, self.choices))) < len(self.choices):
+            raise ValueError("choices repeat themselves")
+        if not self.contains(self.baseline):
+            raise ValueError(f"baseline {self.baseline!r} is not one of the choices")
+        return self
+
+    def contains(self, value: object) -> bool:
+        """Whether `value` is one of the choices, of the same type."""
+        return any(type(value) is type(choice) and value == choice for choice in self.choices)
+
+    def to_unit(self, value: Any) -> float:
+        """Map a choice to the middle of its share of [0, 1]."""
+        return (self.choices.index(value) + 0.5) / len(self.choices)
+
+    def from_unit(self, unit: float) -> Value:
+        """Map from [0, 1] to the choice whose share it falls in."""
+        n = len(self.choices)
+        return self.choices[min(int(min(max(unit, 0.0), 1.0) * n), n - 1)]
+
+
+def _check_range(parameter: Float | Integer) -> None:
+    if not parameter.low < parameter.high:
+        raise ValueError(f"low ({parameter.low:g}) must be less than high ({parameter.high:g})")
+    if not parameter.low <= parameter.baseline <= parameter.high:
+        raise ValueError(
+            f"baseline ({parameter.baseline:g}) must lie between low ({parameter.low:g}) "
+            f"and high ({parameter.high:g})"
+        )
+    if parameter.log and parameter.low <= 0:
+        raise ValueError(f"a log scale needs low ({parameter.low:g}) above 0")
+
+
+Parameter = Annotated[Float | Integer | Categorical, Field(discriminator="type")]
+_adapter: TypeAdapter[Float | Integer | Categorical] = TypeAdapter(Parameter)
+
+
+class ParameterSpace:
+    """The parameters that are tuned, in their order.
+
+    Parameters
+    ----------
+    parameters
+        By name.
+    """
+
+    def __init__(self, parameters: Mapping[str, Float | Integer | Categorical]):
+        self.parameters = dict(parameters)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ParameterSpace) and (
+            list(self.parameters.items()) == list(other.parameters.items())
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in order."""
+        return tuple(self.parameters)
+
+    @property
+    def baseline(self) -> ParameterSet:
+        """The odometry's own choice of every parameter."""
+        return {name: parameter.baseline for name, parameter in self.parameters.items()}
+
+    def check(self, parameters: Mapping[str, object]) -> None:
+        """Refuse a set with missing, unknown or out-of-range parameters.
+
+        Raises
+        ------
+        SpaceError
+        """
+        for name, value in parameters.items():
+            if name not in self.parameters:
+                raise SpaceError(f"unknown parameter {name!r}: {nearest(name, self.names)}")
+            if not self.parameters[name].contains(value):
+                raise SpaceError(f"{name} = {value!r} is outside {describe(self.parameters[name])}")
+        if missing := [name for name in self.names if name not in parameters]:
+            raise SpaceError(f"no value for {', '.join(missing)}")
+
+    def to_unit(self, sets: Sequence[Mapping[str, Value]]) -> NDArray[np.float64]:
+        """Map parameter sets to the unit cube, of shape (n_sets, n_parameters)."""
+        return np.array(
+            [[p.to_unit(s[name]) for name, p in self.parameters.items()] for s in sets],
+            np.float64,
+        ).reshape(len(sets), len(self))
+
+    def from_unit(self, unit: NDArray[np.float64]) -> list[ParameterSet]:
+        """Map points of the unit cube, of shape (n_sets, n_parameters), to parameter sets."""
+        parameters = self.parameters.items()
+        return [
+            {name: p.from_unit(u) for (name, p), u in zip(parameters, row, strict=True)}
+            for row in unit.tolist()
+        ]
+
+    def dump(self) -> dict[str, dict[str, Any]]:
+        """The space as plain data, for files."""
+        return {name: p.model_dump(mode="json") for name, p in self.parameters.items()}
+
+    @classmethod
+    def load(cls, data: Mapping[str, Any]) -> Self:
+        """Make a space from what `dump` gave.
+
+        Raises
+        ------
+        pydantic.ValidationError
+        """
+        return cls({name: _adapter.validate_python(p) for name, p in data.items()})
+
+
+def describe(parameter: Float | Integer | Categorical) -> str:
+    """A parameter's range in a few words."""
+    if isinstance(parameter, Categorical):
+        return "{" + ", ".join(map(repr, parameter.choices)) + "}"
+    return f"[{parameter.low:g}, {parameter.high:g}]"
