@@ -67,7 +67,9 @@ class Preview:
             azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
             elevation = np.degrees(np.arcsin(points[:, 2] / away))
             drawn = panel.scatter(azimuth, elevation, s=2.5, marker="s", linewidths=0, **look)
-            panel.set(xlim=(180, -180), facecolor="black", title="the same scan as the sensor sees it")
+            panel.set(
+                xlim=(180, -180), facecolor="black", title="the same scan as the sensor sees it"
+            )
             panel.set(xlabel="azimuth (deg)", ylabel="elevation (deg)")
             figure.colorbar(drawn, ax=panel, label="range (m)", pad=0.01)
         figure.savefig(path, format="png")
@@ -77,8 +79,14 @@ class Preview:
         points = np.concatenate(self._map) if self._map else np.empty((0, 3))
         points = points[np.argsort(points[:, 2], kind="stable")]
         axes.scatter(  # type: ignore[attr-defined]
-            points[:, 0], points[:, 1], c=points[:, 2], s=0.5, linewidths=0, cmap="viridis",
-            vmin=-1.5, vmax=4.0,
+            points[:, 0],
+            points[:, 1],
+            c=points[:, 2],
+            s=0.5,
+            linewidths=0,
+            cmap="viridis",
+            vmin=-1.5,
+            vmax=4.0,
         )
         T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
         axes.plot(T[:, 0, 3], T[:, 1, 3], color="red", linewidth=1.2)  # type: ignore[attr-defined]

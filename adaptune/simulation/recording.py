@@ -118,9 +118,7 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
         raise SimulationError(f"{path} is a file where a folder shall be written: it stays")
 
 
-def _watched(
-    drive: Drive, preview: Preview, progress: Progress | None
-) -> Iterator[SimulatedScan]:
+def _watched(drive: Drive, preview: Preview, progress: Progress | None) -> Iterator[SimulatedScan]:
     for number, scan in enumerate(drive.scans(), start=1):
         preview.add(scan)
         yield scan
@@ -152,7 +150,9 @@ class _Composer:
         self.typestore = get_typestore(store)
         self._types = self.typestore.types
         # Only a ROS 1 header counts its messages.
-        self._counts: dict[str, int] | None = {POINTS: 0, POSES: 0, IMU: 0} if version == 1 else None
+        self._counts: dict[str, int] | None = (
+            {POINTS: 0, POSES: 0, IMU: 0} if version == 1 else None
+        )
         self._drive = drive
         fields = self._types["sensor_msgs/msg/PointField"]
         kinds = {"<f4": 7, "<u2": 4}
@@ -291,7 +291,9 @@ def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> Non
         file.replace(path)
 
 
-_TR = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+_TR = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 """``T_camera_lidar``: KITTI's poses are those of a camera which looks ahead, z forward."""
 
 

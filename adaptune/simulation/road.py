@@ -58,7 +58,9 @@ class Road:
         self.length = self.legs[-1].stop - APRON
         stations = np.arange(self.legs[0].start, self.legs[-1].stop + _STEP, _STEP)
         rng = np.random.default_rng([seed, 1])
-        heading = _bends([(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs], stations, rng)
+        heading = _bends(
+            [(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs], stations, rng
+        )
         slope = _bends([(leg, leg.scene.slope, 35.0) for leg in self.legs], stations, rng)
         # Bends of a metre or two are rounded off, which no vehicle drives sharper.
         heading = gaussian_filter1d(heading, 2.0 / _STEP, mode="nearest")
@@ -66,7 +68,8 @@ class Road:
         zero = int(np.searchsorted(stations, 0.0))
         line = np.stack([np.cos(heading), np.sin(heading), slope])
         line = np.concatenate(
-            [np.zeros((3, 1)), np.cumsum((line[:, 1:] + line[:, :-1]) * (_STEP / 2.0), axis=1)], axis=1
+            [np.zeros((3, 1)), np.cumsum((line[:, 1:] + line[:, :-1]) * (_STEP / 2.0), axis=1)],
+            axis=1,
         )
         self._x, self._y, self._z = line - line[:, zero : zero + 1]
         self._stations, self._heading = stations, heading

@@ -75,7 +75,9 @@ class Drive:
 
     def stamps(self) -> NDArray[np.int64]:
         """Borders of the scans in nanoseconds: one more than there are scans, of shape (n + 1,)."""
-        return EPOCH + np.rint(np.arange(len(self) + 1) * (1e9 / self.course.turns)).astype(np.int64)
+        return EPOCH + np.rint(np.arange(len(self) + 1) * (1e9 / self.course.turns)).astype(
+            np.int64
+        )
 
     def seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """Seconds since the start of stamps in nanoseconds."""
@@ -127,7 +129,9 @@ class _Caster:
         self._world = World(drive.road)
         self._here: int | None = None
         self._movers = populate(drive.road) if drive.course.moving_objects else []
-        self._models = {kind: _Target(model(kind), np.zeros(3)) for kind in {m.kind for m in self._movers}}
+        self._models = {
+            kind: _Target(model(kind), np.zeros(3)) for kind in {m.kind for m in self._movers}
+        }
 
     def cast(
         self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]

@@ -56,7 +56,9 @@ def _build(tile: Tile) -> list[Mesh]:
     rock[..., 2] = tile.at(s, 0.0)[..., 2] + z
     meshes = [grid(rock, Material.ROCK)]
     meshes.extend(
-        _face(tile, end, angle) for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes)) if used
+        _face(tile, end, angle)
+        for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes))
+        if used
     )
     meshes.extend(_dripstones(tile))
     s_rocks, d_rocks = tile.scatter(0.08, 1.8, 4.5)
@@ -86,7 +88,11 @@ def _dripstones(tile: Tile) -> list[Mesh]:
     s, d = tile.scatter(0.10, 1.5, 3.2, margin=2.0)
     n = len(s)
     radius, height = tile.rng.uniform(0.12, 0.35, n), tile.rng.uniform(0.4, 2.2, n)
-    cone = tube([[0, 0, -0.4, 1.3], [0, 0, 0.1, 1.0], [0.08, 0, 0.5, 0.55], [0, 0.1, 1.0, 0.1]], Material.ROCK, 9)
+    cone = tube(
+        [[0, 0, -0.4, 1.3], [0, 0, 0.1, 1.0], [0.08, 0, 0.5, 0.55], [0, 0.1, 1.0, 0.1]],
+        Material.ROCK,
+        9,
+    )
     scale = np.column_stack([radius, radius, height])
     standing = place(cone, tile.at(s, d), tile.rng.uniform(0.0, 6.28, n), scale)
     s, d = tile.scatter(0.06, 0.0, 2.5, margin=2.0)

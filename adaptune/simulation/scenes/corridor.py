@@ -30,7 +30,9 @@ def _build(tile: Tile) -> list[Mesh]:
         meshes.append(parts.wall(tile, s, d, _HEIGHT, Material.PLASTER))
         for door in doors:
             lintel = box((_DOOR, _RECESS, _HEIGHT - 2.1), Material.PLASTER, (0.0, 0.0, 2.1))
-            handle = box((0.12, 0.08, 0.04), Material.METAL, (0.38, side * (_RECESS / 2 - 0.04), 1.05))
+            handle = box(
+                (0.12, 0.08, 0.04), Material.METAL, (0.38, side * (_RECESS / 2 - 0.04), 1.05)
+            )
             middle = door + _DOOR / 2
             at = tile.at(middle, side * (_HALF + _RECESS / 2))
             meshes.append(place(merge([lintel, handle]), at, tile.heading(middle)))
@@ -59,7 +61,8 @@ def _doors(tile: Tile) -> list[float]:
 def _front(tile: Tile, end: float) -> list[Mesh]:
     """Build the front of the building, open where the corridor ends."""
     front = [
-        parts.wall(tile, [end, end], [side * _HALF, side * 18.0], 7.0, Material.BRICK) for side in (-1.0, 1.0)
+        parts.wall(tile, [end, end], [side * _HALF, side * 18.0], 7.0, Material.BRICK)
+        for side in (-1.0, 1.0)
     ]
     above = tile.at(np.full((2, 2), end), np.array([[-_HALF, _HALF]] * 2))
     above[..., 2] += np.array([[_HEIGHT], [7.0]])

@@ -11,7 +11,9 @@ from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, 
 def _relief(spots: Spots, seed: int) -> Floats:
     swell = fractal_plane(spots.x, spots.y, 22.0, seed + 41, 3)
     hills = 7.0 + 6.0 * fractal_plane(spots.x, spots.y, 40.0, seed + 42, 3)
-    return 0.1 * swell + 0.9 * beyond(spots.d, 3.0, 15.0) * swell + beyond(spots.d, 45.0, 40.0) * hills
+    return (
+        0.1 * swell + 0.9 * beyond(spots.d, 3.0, 15.0) * swell + beyond(spots.d, 45.0, 40.0) * hills
+    )
 
 
 def _build(tile: Tile) -> list[Mesh]:
