@@ -1,8 +1,6 @@
 """The command line: the one place that knows both stages."""
 
 import logging
-import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,13 +19,35 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from typer.core import TyperGroup
 
 import adaptune
 from adaptune.errors import AdaptuneError
 from adaptune.study import load_study
 
+console = Console()
+errors = Console(stderr=True)
+
+
+class _Commands(TyperGroup):
+    """Ends with code 2 for what the user can mend, and with 130 for Ctrl-C."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (AdaptuneError, OSError) as error:
+            if isinstance(error, BrokenPipeError):
+                raise  # whoever read our output has gone
+            errors.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+            raise typer.Exit(2) from error
+        except KeyboardInterrupt as error:
+            errors.print("interrupted; run the same command again to resume", style="yellow")
+            raise typer.Exit(130) from error
+
+
 app = typer.Typer(
     name="adaptune",
+    cls=_Commands,
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -45,9 +65,6 @@ app = typer.Typer(
 
 LOG_EVERY = 5.0
 """Seconds between lines of progress where there is no terminal to draw a bar on."""
-
-console = Console()
-errors = Console(stderr=True)
 
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study's YAML.", show_default=False)
@@ -149,19 +166,19 @@ def offline(
         best = min(range(len(means)), key=means.__getitem__)
         rows.append(
             {
-                "training sequence": name,
-                "baseline [%]": means[0],
-                "fixed [%]": means[model.fixed],
-                "own best [%]": means[best],
+                "sequence": name,
+                "baseline": means[0],
+                "fixed": means[model.fixed],
+                "own best": means[best],
                 "_own best set": _short(model.sets[best]),
-                "baseline, whole run [%]": training.whole[name][0],
-                "fixed, whole run [%]": training.whole[name][1],
+                "baseline, whole run": training.whole[name][0],
+                "fixed, whole run": training.whole[name][1],
             }
         )
     report.write_rows(loaded.folder, "training", rows)
     console.print(
         report.table(
-            f"RTE over {model.length:g} m, {len(model.sets)} parameter sets",
+            f"RTE [%] over {model.length:g} m in training, {len(model.sets)} parameter sets",
             rows,
             "Trials start anew at the reference after a lost track, which counts as 30 %; whole "
             "runs do not.",
@@ -224,8 +241,8 @@ def compare(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m on test sequences",
             rows,
-            "Intervals: block bootstrap over time, 2000 resamples, seed 0. In the last rows: mean "
-            "RTE, and geometric mean of the ratios.",
+            "Intervals: block bootstrap over time, 2000 resamples, seed 0. All: mean RTE, "
+            "geometric mean of the ratios.",
         )
     )
     console.print(f"Tables and pictures: {loaded.folder / 'comparison'}/", highlight=False)
@@ -273,22 +290,8 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def main() -> None:
-    """Run the command line: 2 for what the user can mend, 130 for Ctrl-C."""
-    try:
-        app()
-    except AdaptuneError as error:
-        errors.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        errors.print("interrupted; run the same command again to resume", style="yellow")
-        sys.exit(130)
-    except BrokenPipeError:
-        # Whoever read our output has gone; nothing is left to say, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except OSError as error:
-        errors.print(f"error: {error}", style="red", markup=False, highlight=False)
-        sys.exit(2)
+    """Run the command line."""
+    app()
 
 
 if __name__ == "__main__":

@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import rich.box
 from numpy.typing import NDArray
 from rich.table import Table
 
 from adaptune.files import replacing, write_text
 
 COLOURS = {"baseline": "#7f7f7f", "fixed": "#1f77b4", "paper": "#ff7f0e", "paired": "#2ca02c"}
+STYLES: dict[str, dict[str, Any]] = {"fixed": {"lw": 4.0, "alpha": 0.35}}
+"""Adaptive modes often take the fixed set, and must not hide it."""
 _FEW = 10
 
 
@@ -39,11 +42,20 @@ class Track(NamedTuple):
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
-    """Rows of equal keys as a table; numbers to the right, a rule where the first column changes.
+    """Rows of equal keys as a table that fits 80 columns where it can.
 
-    Keys that start with an underscore are for files only.
+    Numbers stand to the right, and a gap where the first column changes. Keys that start with an
+    underscore are for files only.
     """
-    made = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    made = Table(
+        title=title,
+        title_justify="left",
+        caption=caption,
+        caption_justify="left",
+        box=rich.box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
     keys = [key for key in (rows[0] if rows else {}) if not key.startswith("_")]
     for key in keys:
         numbers = all(isinstance(row[key], int | float | None) for row in rows)
@@ -51,9 +63,14 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
             key, justify="right" if numbers else "left", no_wrap=key == keys[0], overflow="fold"
         )
     for i, row in enumerate(rows):
-        last = i + 1 == len(rows) or rows[i + 1][keys[0]] != row[keys[0]]
-        made.add_row(*(_cell(row[key]) for key in keys), end_section=last)
+        if i and len(rows) > 1 and rows[i - 1][keys[0]] != row[keys[0]] and _grouped(rows, keys[0]):
+            made.add_row()
+        made.add_row(*(_cell(row[key]) for key in keys))
     return made
+
+
+def _grouped(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
+    return len({row[key] for row in rows}) < len(rows)
 
 
 def _cell(value: Any) -> str:
@@ -108,7 +125,8 @@ def draw_tracks(path: Path, title: str, length: float, tracks: Mapping[str, Trac
         colour = COLOURS.get(mode, "#9467bd")
         known = np.isfinite(track.errors)
         mean = f"{track.errors[known].mean():.2f} %" if known.any() else "no reference"
-        axes[0].plot(track.seconds, track.errors, color=colour, lw=1.3, label=f"{mode} ({mean})")
+        style = {"color": colour} | STYLES.get(mode, {"lw": 1.3})
+        axes[0].plot(track.seconds, track.errors, label=f"{mode} ({mean})", **style)
         restarts = track.seconds[track.restarted]
         if len(restarts):
             axes[0].plot(
@@ -124,8 +142,8 @@ def draw_tracks(path: Path, title: str, length: float, tracks: Mapping[str, Trac
             values = list(track.choices[name])
             # The last choice holds until the end.
             x = np.append(track.choice_seconds, track.seconds[-1])
-            axis.step(x, [*values, values[-1]], where="post", color=colour, lw=1.3)
-            axis.set_ylabel(name, fontsize=8)
+            axis.step(x, [*values, values[-1]], where="post", **style)
+            axis.set_ylabel(name.replace("_", "\n"), fontsize=8)
     axes[0].set_ylabel(f"RTE over {length:g} m [%]")
     if any(np.isfinite(t.errors).any() for t in tracks.values()):
         axes[0].set_yscale("log")

@@ -267,8 +267,9 @@ def load_study(
     config, problems = _check(data, path.parent)
     if problems or config is None:
         lines = []
-        for key, message in problems:
-            by_option = any(key[: len(o)] == o for o in overridden)
+        for key, message in sorted(problems, key=lambda p: document.line(p[0]) or 0):
+            # A mistake told of a whole section may be that of a value in it.
+            by_option = any(key[: len(o)] == o[: len(key)] for o in overridden)
             line = None if by_option else document.line(key)
             where = "-o" if by_option else f"{path}" + (f", line {line}" if line else "")
             dotted = ".".join(map(str, key))

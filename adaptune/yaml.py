@@ -78,8 +78,8 @@ class Document:
     """
 
     def __init__(self, text: str):
-        loader = _Loader(text)
         try:
+            loader = _Loader(text)
             self._node = loader.get_single_node()
             self.data = None if self._node is None else loader.construct_document(self._node)
         except yaml.MarkedYAMLError as error:
@@ -88,8 +88,6 @@ class Document:
             raise YamlError(f"{where}{error.problem or error.context}") from error
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise YamlError(str(error)) from error
-        finally:
-            loader.dispose()
 
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""

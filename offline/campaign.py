@@ -178,5 +178,5 @@ def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
         sequence=all_sequences,
         errors=all_errors,
         provenance={"adaptune": __version__, "study": study.name}
-        | study.config.offline.model_dump(mode="json"),
+        | study.config.offline.model_dump(mode="json", exclude={"workers", "memory"}),
     )

@@ -80,7 +80,8 @@ def _tpe(
     """
     distributions = {name: _distribution(p) for name, p in space.parameters.items()}
     seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
-    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
+    # The initial points are the start-up: Optuna needs no random ones of its own.
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=1))
     study.add_trials(
         optuna.trial.create_trial(params=params, distributions=distributions, value=value)
         for params, value in history

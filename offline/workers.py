@@ -100,7 +100,8 @@ class Workers:
                 waiting.remove(task)
                 near[w].add(task.sequence)
                 running[w] = task
-                self._connection(w).send(task)
+                with contextlib.suppress(BrokenPipeError):  # reading from it will tell
+                    self._connection(w).send(task)
             ready = wait([self._workers[w].connection for w in running])
             for w in [w for w in running if self._workers[w].connection in ready]:
                 task = running.pop(w)

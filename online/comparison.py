@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +20,6 @@ from adaptune.space import ParameterSet
 from adaptune.study import Study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from online.replay import adaptive, replay, write_replay
-import itertools
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -295,13 +295,12 @@ def _row(
         "sequence": name,
         "mode": mode,
         "RTE [%]": mean,
-        "95 % interval": None if low is None else f"{low:.3f} - {high:.3f}",
         "vs fixed": ratio,
-        "95 % interval of it": None if ratio_low is None else f"{ratio_low:.2f} - {ratio_high:.2f}",
+        "95 %": None if ratio_low is None else f"{ratio_low:.2f}-{ratio_high:.2f}",
         "restarts": summary["restarts"],
-        "poor scans": summary["poor_scans"],
         "switches": switches,
-        "x real time": round(summary["duration_s"] / summary["replay_s"], 2),
+        "_poor_scans": summary["poor_scans"],
+        "_x_real_time": round(summary["duration_s"] / summary["replay_s"], 2),
         "_rte_low": low,
         "_rte_high": high,
         "_ratio_low": ratio_low,
@@ -356,9 +355,8 @@ def _pooled(rows: list[dict[str, Any]], ratios: dict[str, list[float]]) -> list[
             "mode": mode,
             "RTE [%]": float(np.mean([r["RTE [%]"] for r in mine])),
             "vs fixed": float(np.exp(np.mean(np.log(np.maximum(of_mode, 1e-12))))),
-            "95 % interval of it": f"{min(of_mode):.2f} - {max(of_mode):.2f} (extremes)",
             "restarts": sum(r["restarts"] for r in mine),
-            "poor scans": sum(r["poor scans"] for r in mine),
+            "_poor_scans": sum(r["_poor_scans"] for r in mine),
             "switches": sum(r["switches"] for r in mine),
         }
         pooled.append(row)

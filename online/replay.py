@@ -200,9 +200,11 @@ class _Guard:
 
     def check(self, T_odom_previous: Poses, T_odom_current: Poses, elapsed: float) -> Poses | None:
         """The motion to go on with instead, or None if this one is healthy."""
+        self._since += elapsed
+        if not np.isfinite(T_odom_current).all():
+            return self._T_previous_current
         T_previous_current = invert(T_odom_previous) @ T_odom_current
         velocity = T_previous_current[:3, 3] / elapsed
-        self._since += elapsed
         if self._health.healthy(velocity, self._velocity, self._since):
             self._T_previous_current = T_previous_current
             self._velocity = velocity
