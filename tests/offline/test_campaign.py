@@ -104,7 +104,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
 
     monkeypatch.setattr(Workers, "_spawn", remember)
 
-    def kill(what, done, total):
+    def kill(_what, done, _total):
         if done and len(spawned) == 2:
             os.kill(spawned[0].pid, signal.SIGKILL)
             time.sleep(0.05)
