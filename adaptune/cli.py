@@ -58,6 +58,7 @@ app = typer.Typer(
         "the last one stopped.\n\n"
         "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
         "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
+        "    adaptune validate configs/demo.yaml    # would adapting pay elsewhere?\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive"
     ),
@@ -187,6 +188,35 @@ def offline(
     console.print(f"Baseline: {_short(model.sets[0])}", highlight=False)
     console.print(f"Fixed: {_short(model.sets[model.fixed])}", highlight=False)
     console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)
+
+
+@app.command()
+def validate(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+) -> None:
+    """Tell whether adapting would pay in places that were not trained on.
+
+    Leaves out one training sequence after the other, fits on the rest, and looks up the errors of
+    the sets that would have been chosen, second by second: no odometry is run. Numbers are ratios
+    to the error of the fixed set, which is chosen without that sequence too.
+    """
+    from adaptune import report
+    from offline.validation import validate as validate_study
+
+    loaded = load_study(study, override, folder)
+    with _progress() as progress:
+        validation, rows = validate_study(loaded, lambda i, n: progress("sequences", i, n))
+    console.print(
+        report.table(
+            "Error as a ratio to the fixed set's, each sequence left out in turn",
+            rows,
+            "Oracles know the errors: the best set of the sequence, and of every second.",
+        )
+    )
+    for rule in loaded.config.online.rules:
+        console.print(validation.verdict(rule), highlight=False)
 
 
 @app.command()
