@@ -33,7 +33,7 @@ def _relief(spots: Spots, seed: int) -> Floats:
     river = 2.2 * beyond(np.minimum(spots.d - _BANK, 0.0), 0.0, 4.0)
     brook = 2.0 * _channel(spots, seed)
     rise = 3.0 * beyond(np.maximum(spots.d, 0.0), 6.0, 25.0)
-    return 0.05 * swell + 0.6 * beyond(spots.d, 1.6, 6.0) * swell + rise - np.maximum(river, brook)
+    return 0.03 * swell + 0.6 * beyond(spots.d, 1.6, 6.0) * swell + rise - np.maximum(river, brook)
 
 
 def _trees(tile: Tile, s: Floats, d: Floats, sizes: tuple[float, float]) -> Mesh:
@@ -115,10 +115,10 @@ GARDEN = Scene(
     build=_build,
     relief=_relief,
     surface=paved((1.6, Material.SOIL), (np.inf, Material.GRASS)),
-    winding=0.45,
+    winding=0.3,
     bend=22.0,
-    slope=0.07,
+    slope=0.06,
     shake=1.2,
-    pace=0.9,
+    pace=0.6,
     movers=(("walker", 1.1), ("walker", -1.2)),
 )

@@ -11,7 +11,7 @@ from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, 
 def _relief(spots: Spots, seed: int) -> Floats:
     swell = fractal_plane(spots.x, spots.y, 22.0, seed + 41, 3)
     hills = 7.0 + 6.0 * fractal_plane(spots.x, spots.y, 40.0, seed + 42, 3)
-    return 0.1 * swell + 0.9 * beyond(spots.d, 3.0, 15.0) * swell + beyond(spots.d, 45.0, 40.0) * hills
+    return 0.05 * swell + 0.9 * beyond(spots.d, 3.0, 15.0) * swell + beyond(spots.d, 45.0, 40.0) * hills
 
 
 def _build(tile: Tile) -> list[Mesh]:
@@ -45,7 +45,7 @@ OPEN = Scene(
     build=_build,
     relief=_relief,
     surface=paved((np.inf, Material.SOIL)),
-    winding=0.35,
+    winding=0.18,
     bend=30.0,
     slope=0.03,
     shake=1.2,
