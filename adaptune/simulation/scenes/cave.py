@@ -7,7 +7,7 @@ from adaptune.simulation.noise import fractal, fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
 
-_CHAMBERS, _ROOMS = 12.0, 4.0
+_CHAMBERS, _ROOMS = 13.0, 6.0
 """Metres from one side chamber to the next, and from one narrow to the next."""
 
 
@@ -35,8 +35,8 @@ def _rooms(s: Floats, seed: int) -> Floats:
     share = np.ones_like(s)
     for n in range(int(np.floor(s.min() / _ROOMS)) - 1, int(np.floor(s.max() / _ROOMS)) + 2):
         rng = np.random.default_rng([seed, 32, n + 1000])
-        middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.7, 1.2)
-        share = np.minimum(share, 1.0 - rng.uniform(0.75, 1.0) * np.exp(-(((s - middle) / half) ** 4)))
+        middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.45, 0.75)
+        share = np.minimum(share, 1.0 - rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4)))
     return share
 
 
@@ -44,7 +44,7 @@ def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     """Give offset and height of the rock at stations and angles from the left, over the top."""
     along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
     room = _rooms(s, seed)
-    half = 1.0 + room * (1.7 + 0.7 * fractal(along, 9.0, seed + 21).reshape(s.shape))
+    half = 1.0 + room * (2.4 + 0.8 * fractal(along, 9.0, seed + 21).reshape(s.shape))
     roof = 1.6 + room * (1.2 + 0.9 * fractal(along, 13.0, seed + 22).reshape(s.shape))
     lean = 0.9 * room * fractal(along, 7.0, seed + 23).reshape(s.shape)
     chamber = room * _chambers(s, angle, seed)
@@ -111,7 +111,7 @@ def _dripstones(tile: Tile) -> list[Mesh]:
 
 def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
     """Let dripstones grow together to columns, which hide what lies behind."""
-    s, d = tile.scatter(0.16, 1.2, 3.0, margin=2.0)
+    s, d = tile.scatter(0.10, 1.2, 3.6, margin=2.0)
     at, n = tile.at(s, d), len(s)
     radius = tile.rng.uniform(0.25, 0.6, n)
     lower = place(cone, at, 0.0, np.column_stack([radius, radius, np.full(n, 2.6)]))
@@ -125,8 +125,8 @@ CAVE = Scene(
     relief=_relief,
     surface=paved((np.inf, Material.ROCK)),
     winding=0.4,
-    bend=9.0,
+    bend=7.0,
     slope=0.03,
     shake=1.2,
-    pace=0.5,
+    pace=0.35,
 )

@@ -7,7 +7,7 @@ from adaptune.simulation.noise import fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
 
-_KERB, _CROSSING = 7.0, 4
+_KERB, _CROSSING = 9.0, 4
 """Metres from the road's middle to the kerb, and tiles from one crossing to the next."""
 
 
@@ -58,11 +58,11 @@ def _build(tile: Tile) -> list[Mesh]:
         while s < tile.stop - 5.0:
             width = min(rng.uniform(7.0, 13.0), tile.stop - 0.4 - s)
             middle = s + width / 2.0
-            gap = rng.uniform(2.5, 6.0) if rng.random() < 0.75 else 0.3
+            gap = rng.uniform(3.0, 8.0) if rng.random() < 0.75 else 0.3
             away = abs(middle - (tile.index + 0.5) * 20.0)
-            if width >= 4.0 and not (crossing and away < width / 2.0 + 4.5):
+            if width >= 4.0 and not (crossing and away < width / 2.0 + 6.0):
                 house = _house(width, rng.uniform(8.0, 12.0), int(rng.integers(2, 6)), rng)
-                at = tile.at(middle, side * (_KERB + rng.uniform(3.5, 9.0)))
+                at = tile.at(middle, side * (_KERB + rng.uniform(4.0, 10.0)))
                 meshes.append(place(house, at, tile.heading(middle) + turn))
             elif width >= 4.0 and rng.random() < 0.5:
                 hedge = box((width, 0.8, 1.6), Material.LEAVES)
@@ -83,12 +83,12 @@ def _side_street(tile: Tile, side: float) -> list[Mesh]:
     meshes = []
     heading = float(tile.heading(middle))
     for hand in (-1.0, 1.0):
-        for d in (19.0, 32.0, 45.0):
+        for d in (24.0, 37.0, 50.0):
             house = _house(rng.uniform(9.0, 12.0), 8.0, int(rng.integers(2, 5)), rng)
-            at = tile.at(middle + hand * (5.5 + rng.uniform(0.0, 1.0)), side * d)
+            at = tile.at(middle + hand * (7.0 + rng.uniform(0.0, 1.0)), side * d)
             yaw = heading + (-np.pi / 2.0 if hand > 0 else np.pi / 2.0)
             meshes.append(place(house, at, yaw))
-    at = tile.at(middle + 5.0, side * (_KERB + 0.6))
+    at = tile.at(middle + 6.5, side * (_KERB + 0.6))
     return [*meshes, place(parts.sign(), at, heading + np.pi)]
 
 
@@ -97,7 +97,7 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
     rng, meshes = tile.rng, []
     slots = np.arange(tile.start + 3.0, tile.stop - 2.0, 5.6)
     if crossing:
-        slots = slots[np.abs(slots - (tile.index + 0.5) * 20.0) > 7.5]
+        slots = slots[np.abs(slots - (tile.index + 0.5) * 20.0) > 9.0]
     slots = slots[rng.random(len(slots)) < 0.4] + rng.uniform(-0.3, 0.3)
     if len(slots):
         at = tile.at(slots, side * (_KERB - 1.05 + rng.uniform(-0.1, 0.1, len(slots))))
