@@ -77,9 +77,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def place(
-    model: Mesh, at: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0
-) -> Mesh:
+def place(model: Mesh, at: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0) -> Mesh:
     """Put copies of a model in the world.
 
     Parameters

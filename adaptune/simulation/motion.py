@@ -69,16 +69,37 @@ def _degrees(*angles: float) -> tuple[float, ...]:
 MOTIONS: Mapping[str, Motion] = MappingProxyType(
     {
         "robot": Motion(
-            speed=3.0, acceleration=0.8, turning=1.0, height=0.9, base=(0.8, 0.6), weave=0.15,
-            shift=(0.002, 0.003, 0.004), turn=(0.0015, 0.0015, 0.001), band=(0.5, 3.5),
+            speed=3.0,
+            acceleration=0.8,
+            turning=1.0,
+            height=0.9,
+            base=(0.8, 0.6),
+            weave=0.15,
+            shift=(0.002, 0.003, 0.004),
+            turn=(0.0015, 0.0015, 0.001),
+            band=(0.5, 3.5),
         ),
         "car": Motion(
-            speed=10.0, acceleration=2.0, turning=2.5, height=1.75, base=(2.7, 1.6), weave=0.15,
-            shift=(0.003, 0.006, 0.010), turn=(0.0015, 0.0020, 0.0007), band=(0.6, 2.5),
+            speed=10.0,
+            acceleration=2.0,
+            turning=2.5,
+            height=1.75,
+            base=(2.7, 1.6),
+            weave=0.15,
+            shift=(0.003, 0.006, 0.010),
+            turn=(0.0015, 0.0020, 0.0007),
+            band=(0.6, 2.5),
         ),
         "handheld": Motion(
-            speed=1.3, acceleration=0.6, turning=0.8, height=1.5, base=(0.4, 0.4), weave=0.3,
-            shift=(0.012, 0.020, 0.022), turn=(0.012, 0.012, 0.015), band=(0.4, 2.5),
+            speed=1.3,
+            acceleration=0.6,
+            turning=0.8,
+            height=1.5,
+            base=(0.4, 0.4),
+            weave=0.3,
+            shift=(0.012, 0.020, 0.022),
+            turn=(0.012, 0.012, 0.015),
+            band=(0.4, 2.5),
         ),
     }
 )
@@ -242,10 +263,16 @@ def _angular_acceleration(angles: Floats, rates: Floats, second: Floats) -> Floa
     return np.stack(
         [
             dd_roll - dd_yaw * sp - d_yaw * d_pitch * cp,
-            dd_pitch * cr - d_pitch * d_roll * sr
-            + dd_yaw * sr * cp + d_yaw * d_roll * cr * cp - d_yaw * d_pitch * sr * sp,
-            -dd_pitch * sr - d_pitch * d_roll * cr
-            + dd_yaw * cr * cp - d_yaw * d_roll * sr * cp - d_yaw * d_pitch * cr * sp,
+            dd_pitch * cr
+            - d_pitch * d_roll * sr
+            + dd_yaw * sr * cp
+            + d_yaw * d_roll * cr * cp
+            - d_yaw * d_pitch * sr * sp,
+            -dd_pitch * sr
+            - d_pitch * d_roll * cr
+            + dd_yaw * cr * cp
+            - d_yaw * d_roll * sr * cp
+            - d_yaw * d_pitch * cr * sp,
         ],
         axis=1,
     )

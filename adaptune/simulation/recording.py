@@ -1,6 +1,5 @@
 """Recordings of simulated courses: ROS bags and KITTI odometry folders."""
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -118,9 +117,7 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
         raise SimulationError(f"{path} is a file where a folder shall be written: it stays")
 
 
-def _watched(
-    drive: Drive, preview: Preview, progress: Progress | None
-) -> Iterator[SimulatedScan]:
+def _watched(drive: Drive, preview: Preview, progress: Progress | None) -> Iterator[SimulatedScan]:
     for number, scan in enumerate(drive.scans(), start=1):
         preview.add(scan)
         yield scan
@@ -152,13 +149,21 @@ class _Composer:
         self.typestore = get_typestore(store)
         self._types = self.typestore.types
         # Only a ROS 1 header counts its messages.
-        self._counts: dict[str, int] | None = {POINTS: 0, POSES: 0, IMU: 0} if version == 1 else None
+        self._counts: dict[str, int] | None = (
+            {POINTS: 0, POSES: 0, IMU: 0} if version == 1 else None
+        )
         self._drive = drive
         fields = self._types["sensor_msgs/msg/PointField"]
+        offsets: Any = CLOUD.fields
         kinds = {"<f4": 7, "<u2": 4}
         self._fields = [
-            fields(name=name, offset=offset, datatype=kinds[dtype.str], count=1)
-            for name, (dtype, offset) in (CLOUD.fields or {}).items()  # type: ignore[misc]
+            fields(
+                name=name,
+                offset=offsets[name][1],
+                datatype=kinds[offsets[name][0].str],
+                count=1,
+            )
+            for name in CLOUD.names or ()
         ]
 
     @property
@@ -291,7 +296,9 @@ def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> Non
         file.replace(path)
 
 
-_TR = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+_TR = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 """``T_camera_lidar``: KITTI's poses are those of a camera which looks ahead, z forward."""
 
 

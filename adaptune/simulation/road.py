@@ -58,7 +58,9 @@ class Road:
         self.length = self.legs[-1].stop - APRON
         stations = np.arange(self.legs[0].start, self.legs[-1].stop + _STEP, _STEP)
         rng = np.random.default_rng([seed, 1])
-        heading = _bends([(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs], stations, rng)
+        heading = _bends(
+            [(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs], stations, rng
+        )
         slope = _bends([(leg, leg.scene.slope, 35.0) for leg in self.legs], stations, rng)
         # Bends of a metre or two are rounded off, which no vehicle drives sharper.
         heading = gaussian_filter1d(heading, 2.0 / _STEP, mode="nearest")
@@ -66,18 +68,19 @@ class Road:
         zero = int(np.searchsorted(stations, 0.0))
         line = np.stack([np.cos(heading), np.sin(heading), slope])
         line = np.concatenate(
-            [np.zeros((3, 1)), np.cumsum((line[:, 1:] + line[:, :-1]) * (_STEP / 2.0), axis=1)], axis=1
+            [np.zeros((3, 1)), np.cumsum((line[:, 1:] + line[:, :-1]) * (_STEP / 2.0), axis=1)],
+            axis=1,
         )
         self._x, self._y, self._z = line - line[:, zero : zero + 1]
         self._stations, self._heading = stations, heading
 
     def heading(self, s: Floats) -> Floats:
         """Radians from the x axis at each station."""
-        return np.interp(s, self._stations, self._heading)
+        return np.asarray(np.interp(s, self._stations, self._heading), np.float64)
 
     def height(self, s: Floats) -> Floats:
         """Metres above the start at each station."""
-        return np.interp(s, self._stations, self._z)
+        return np.asarray(np.interp(s, self._stations, self._z), np.float64)
 
     def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
         """Coordinates x and y of a station and an offset."""
@@ -88,7 +91,7 @@ class Road:
 
     def station(self, x: Floats) -> Floats:
         """Station at which the line passes an x."""
-        return np.interp(x, self._x, self._stations)
+        return np.asarray(np.interp(x, self._x, self._stations), np.float64)
 
     def shares(self, s: Floats) -> list[tuple[Leg, Floats]]:
         """How much each leg's scene has to say at each station: weights that sum to one."""

@@ -52,19 +52,31 @@ def _hdl64e() -> NDArray[np.float64]:
     """Give the two blocks of 32 lasers: a third of a degree apart above, half a degree below."""
     upper = 2.0 - np.arange(32) / 3.0
     lower = -8.83 - 0.5 * np.arange(32)
-    return np.radians(np.concatenate([upper, lower])[::-1])
+    elevations: NDArray[np.float64] = np.radians(np.concatenate([upper, lower])[::-1])
+    return elevations
 
 
 SENSORS: Mapping[str, Sensor] = MappingProxyType(
     {
-        "vlp16": Sensor(np.radians(np.arange(-15.0, 16.0, 2.0)), 1800, 10.0, (0.5, 100.0), 0.015, 0.005),
+        "vlp16": Sensor(
+            np.radians(np.arange(-15.0, 16.0, 2.0)), 1800, 10.0, (0.5, 100.0), 0.015, 0.005
+        ),
         # 900 columns, half of what it can do, keep a scan at 28,800 rays.
         "hdl32e": Sensor(
-            np.radians(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1)), 900, 10.0, (1.0, 100.0), 0.015, 0.005
+            np.radians(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1)),
+            900,
+            10.0,
+            (1.0, 100.0),
+            0.015,
+            0.005,
         ),
         "hdl64e": Sensor(_hdl64e(), 2083, 10.0, (0.9, 120.0), 0.015, 0.005),
-        "os0-64": Sensor(np.radians(np.linspace(45.0, -45.0, 64)), 1024, 10.0, (0.3, 50.0), 0.015, 0.005),
-        "os1-128": Sensor(np.radians(np.linspace(22.5, -22.5, 128)), 1024, 10.0, (0.5, 120.0), 0.015, 0.005),
+        "os0-64": Sensor(
+            np.radians(np.linspace(45.0, -45.0, 64)), 1024, 10.0, (0.3, 50.0), 0.015, 0.005
+        ),
+        "os1-128": Sensor(
+            np.radians(np.linspace(22.5, -22.5, 128)), 1024, 10.0, (0.5, 120.0), 0.015, 0.005
+        ),
         "avia": Sensor(
             np.radians((np.arange(6) - 2.5) * 0.6), 4000, 10.0, (1.0, 190.0), 0.02, 0.005, "rosette"
         ),

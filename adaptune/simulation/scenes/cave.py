@@ -36,7 +36,9 @@ def _rooms(s: Floats, seed: int) -> Floats:
     for n in range(int(np.floor(s.min() / _ROOMS)) - 1, int(np.floor(s.max() / _ROOMS)) + 2):
         rng = np.random.default_rng([seed, 32, n + 1000])
         middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.45, 0.75)
-        share = np.minimum(share, 1.0 - rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4)))
+        share = np.minimum(
+            share, 1.0 - rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4))
+        )
     return share
 
 
@@ -64,7 +66,9 @@ def _build(tile: Tile) -> list[Mesh]:
     rock[..., 2] = tile.at(s, 0.0)[..., 2] + z
     meshes = [grid(rock, Material.ROCK)]
     meshes.extend(
-        _face(tile, end, angle) for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes)) if used
+        _face(tile, end, angle)
+        for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes))
+        if used
     )
     meshes.extend(_dripstones(tile))
     s_rocks, d_rocks = tile.scatter(0.05, 1.8, 4.5)
@@ -94,7 +98,11 @@ def _dripstones(tile: Tile) -> list[Mesh]:
     s, d = tile.scatter(0.10, 1.5, 3.2, margin=2.0)
     n = len(s)
     radius, height = tile.rng.uniform(0.12, 0.35, n), tile.rng.uniform(0.4, 2.2, n)
-    cone = tube([[0, 0, -0.4, 1.3], [0, 0, 0.1, 1.0], [0.08, 0, 0.5, 0.55], [0, 0.1, 1.0, 0.1]], Material.ROCK, 9)
+    cone = tube(
+        [[0, 0, -0.4, 1.3], [0, 0, 0.1, 1.0], [0.08, 0, 0.5, 0.55], [0, 0.1, 1.0, 0.1]],
+        Material.ROCK,
+        9,
+    )
     scale = np.column_stack([radius, radius, height])
     standing = place(cone, tile.at(s, d), tile.rng.uniform(0.0, 6.28, n), scale)
     s, d = tile.scatter(0.06, 0.0, 2.5, margin=2.0)
@@ -115,7 +123,12 @@ def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
     at, n = tile.at(s, d), len(s)
     radius = tile.rng.uniform(0.25, 0.6, n)
     lower = place(cone, at, 0.0, np.column_stack([radius, radius, np.full(n, 2.6)]))
-    upper = place(cone, at + [0.0, 0.0, 3.6], 1.0, np.column_stack([radius, radius, np.full(n, -2.6)]))
+    upper = place(
+        cone,
+        at + np.array([0.0, 0.0, 3.6]),
+        1.0,
+        np.column_stack([radius, radius, np.full(n, -2.6)]),
+    )
     return [lower, upper]
 
 

@@ -30,19 +30,21 @@ def _build(tile: Tile) -> list[Mesh]:
         meshes.append(parts.wall(tile, s, d, _HEIGHT, Material.PLASTER))
         for door in doors:
             lintel = box((_DOOR, _RECESS, _HEIGHT - 2.1), Material.PLASTER, (0.0, 0.0, 2.1))
-            handle = box((0.12, 0.08, 0.04), Material.METAL, (0.38, side * (_RECESS / 2 - 0.04), 1.05))
+            handle = box(
+                (0.12, 0.08, 0.04), Material.METAL, (0.38, side * (_RECESS / 2 - 0.04), 1.05)
+            )
             middle = door + _DOOR / 2
             at = tile.at(middle, side * (_HALF + _RECESS / 2))
             meshes.append(place(merge([lintel, handle]), at, tile.heading(middle)))
     # Beams under the ceiling, extinguishers, and a cupboard now and then.
-    for s in np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0:
+    for station in np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0:
         beam = box((0.25, 2 * _HALF, 0.22), Material.PLASTER, (0.0, 0.0, _HEIGHT - 0.22))
-        meshes.append(place(beam, tile.at(s, 0.0), tile.heading(s)))
+        meshes.append(place(beam, tile.at(station, 0.0), tile.heading(station)))
     for size, chance in (((0.18, 0.18, 0.6), 0.6), ((0.9, 0.4, 1.9), 0.5), ((0.4, 0.35, 0.7), 0.5)):
         if rng.random() < chance:
-            s, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
-            at = tile.at(s, side * (_HALF - size[1] / 2))
-            meshes.append(place(box(size, Material.METAL), at, tile.heading(s)))
+            station, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
+            at = tile.at(station, side * (_HALF - size[1] / 2))
+            meshes.append(place(box(size, Material.METAL), at, tile.heading(station)))
     for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes)):
         if used:
             meshes.extend(_front(tile, end))
@@ -53,13 +55,15 @@ def _doors(tile: Tile) -> list[float]:
     """Stations of the doors' nearer jambs, apart from one another and from the tile's ends."""
     slots = np.arange(tile.start + 0.6, tile.stop - 4.0, 4.5)
     slots = slots[tile.rng.random(len(slots)) < 0.75]
-    return (slots + tile.rng.uniform(0.0, 2.4, len(slots))).tolist()
+    doors: list[float] = (slots + tile.rng.uniform(0.0, 2.4, len(slots))).tolist()
+    return doors
 
 
 def _front(tile: Tile, end: float) -> list[Mesh]:
     """Build the front of the building, open where the corridor ends."""
     front = [
-        parts.wall(tile, [end, end], [side * _HALF, side * 18.0], 7.0, Material.BRICK) for side in (-1.0, 1.0)
+        parts.wall(tile, [end, end], [side * _HALF, side * 18.0], 7.0, Material.BRICK)
+        for side in (-1.0, 1.0)
     ]
     above = tile.at(np.full((2, 2), end), np.array([[-_HALF, _HALF]] * 2))
     above[..., 2] += np.array([[_HEIGHT], [7.0]])

@@ -19,11 +19,13 @@ def _build(tile: Tile) -> list[Mesh]:
     boulders = [parts.boulder(v) for v in range(parts.VARIANTS)]
     s, d = tile.scatter(0.0008, 4.0, 50.0, margin=3.0)
     meshes = [parts.strew(tile, boulders, s, d, rng.uniform(0.25, 0.6, len(s)))]
-    post = merge([box((0.12, 0.12, 1.5), Material.WOOD), box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))])
+    post = merge(
+        [box((0.12, 0.12, 1.5), Material.WOOD), box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))]
+    )
     # An old fence on one side, some of its posts missing.
     stations = np.arange(np.ceil(tile.start / 4.0), tile.stop / 4.0) * 4.0
     stations = stations[rng.random(len(stations)) < 0.75]
-    meshes.append(parts.strew(tile, [post], stations, np.full(len(stations), 17.0), 1.0, 0.3))
+    meshes.append(parts.strew(tile, [post], stations, np.full(len(stations), 17.0), 1.0, sink=0.3))
     return meshes
 
 

@@ -38,7 +38,7 @@ def _relief(spots: Spots, seed: int) -> Floats:
 
 def _trees(tile: Tile, s: Floats, d: Floats, sizes: tuple[float, float]) -> Mesh:
     models = [parts.tree(v) for v in range(parts.VARIANTS)]
-    return parts.strew(tile, models, s, d, tile.rng.uniform(*sizes, len(s)), 0.02)
+    return parts.strew(tile, models, s, d, tile.rng.uniform(*sizes, len(s)), sink=0.02)
 
 
 def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -49,7 +49,9 @@ def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
 def _build(tile: Tile) -> list[Mesh]:
     rng, kind = tile.rng, _kind(tile.index, tile.seed)
     bushes = [parts.bush(v) for v in range(parts.VARIANTS)]
-    density = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}[kind]
+    density = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}[
+        kind
+    ]
     near = 9.0 if kind == "clearing" else 3.2
     s, d = _on_land(*tile.scatter(density, near, 32.0, margin=4.0))
     meshes = [_trees(tile, s, d, (0.7, 1.3))]
@@ -70,7 +72,9 @@ def _build(tile: Tile) -> list[Mesh]:
     elif kind == "clearing":
         for side in (-1.0, 1.0):
             at = tile.at(middle + 4.0 * side, 2.6 * side)
-            meshes.append(place(parts.bench(), at, tile.heading(middle) + (np.pi if side < 0 else 0.0)))
+            meshes.append(
+                place(parts.bench(), at, tile.heading(middle) + (np.pi if side < 0 else 0.0))
+            )
     elif kind == "bridge":
         meshes.extend(_railings(tile, (tile.index + 0.5) * TILE))
     return meshes
@@ -87,7 +91,9 @@ def _hedges(tile: Tile) -> list[Mesh]:
             heart = box((length, 0.6, height), Material.LEAVES, (0.0, 0.0, -0.2))
             n = int(40 * length)
             spread = rng.uniform(-0.5, 0.5, (n, 3)) * [length, 0.9, height + 0.2]
-            leaves = foliage(spread + [0.0, 0.0, height / 2.0], 0.15, 0.16, int(rng.integers(2**31)))
+            leaves = foliage(
+                spread + np.array([0.0, 0.0, height / 2.0]), 0.15, 0.16, int(rng.integers(2**31))
+            )
             meshes.append(
                 place(merge([heart, leaves]), tile.at(middle, side * 2.3), tile.heading(middle))
             )

@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adaptune.simulation import mesh as meshes
 from adaptune.simulation.mesh import Material, Mesh, blob, box, foliage, grid, merge, mesh, tube
 from adaptune.simulation.scenes.base import Floats, Tile
-from adaptune.simulation import mesh as meshes
 
 VARIANTS = 4
 """How many different trees, bushes and boulders there are."""
@@ -64,10 +64,20 @@ def _extrude(profile: ArrayLike, width: float, material: Material) -> Mesh:
 @cache
 def car() -> Mesh:
     """Car of 4.3 m, heading along x."""
-    body = [(-2.1, 0.3), (2.15, 0.3), (2.15, 0.62), (1.95, 0.75), (1.0, 0.86), (-2.0, 0.92), (-2.15, 0.7)]
+    body = [
+        (-2.1, 0.3),
+        (2.15, 0.3),
+        (2.15, 0.62),
+        (1.95, 0.75),
+        (1.0, 0.86),
+        (-2.0, 0.92),
+        (-2.15, 0.7),
+    ]
     cabin = [(-1.9, 0.9), (1.0, 0.85), (0.3, 1.42), (-0.3, 1.48), (-1.3, 1.42)]
     turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    wheel = _extrude(np.column_stack([0.31 * np.cos(turn), 0.31 + 0.31 * np.sin(turn)]), 0.2, Material.METAL)
+    wheel = _extrude(
+        np.column_stack([0.31 * np.cos(turn), 0.31 + 0.31 * np.sin(turn)]), 0.2, Material.METAL
+    )
     wheels = [[x, y, 0.0] for x in (-1.3, 1.35) for y in (-0.78, 0.78)]
     return merge(
         [
@@ -85,7 +95,12 @@ def walker() -> Mesh:
     limbs = [
         [[-0.25, 0.1, 0.0, 0.06], [-0.05, 0.1, 0.5, 0.07], [0.0, 0.08, 0.9, 0.1]],
         [[0.3, -0.1, 0.0, 0.06], [0.15, -0.1, 0.5, 0.07], [0.0, -0.08, 0.9, 0.1]],
-        [[0.0, 0.0, 0.85, 0.16], [0.0, 0.0, 1.1, 0.17], [0.02, 0.0, 1.42, 0.19], [0.02, 0.0, 1.5, 0.06]],
+        [
+            [0.0, 0.0, 0.85, 0.16],
+            [0.0, 0.0, 1.1, 0.17],
+            [0.02, 0.0, 1.42, 0.19],
+            [0.02, 0.0, 1.5, 0.06],
+        ],
         [[0.03, 0.0, 1.48, 0.06], [0.04, 0.0, 1.62, 0.1], [0.04, 0.0, 1.75, 0.03]],
         [[0.2, 0.26, 0.85, 0.04], [0.02, 0.24, 1.4, 0.05]],
         [[-0.2, -0.26, 0.85, 0.04], [0.02, -0.24, 1.4, 0.05]],
@@ -129,19 +144,25 @@ def bench() -> Mesh:
     )
 
 
-def strew(tile: Tile, models: list[Mesh], s: Floats, d: Floats, scale: ArrayLike, sink: float = 0.1) -> Mesh:
+def strew(
+    tile: Tile, models: list[Mesh], s: Floats, d: Floats, scale: ArrayLike, *, sink: float = 0.1
+) -> Mesh:
     """Put models, in turn and turned at random, at stations and offsets, sunk into the ground."""
     scale = np.broadcast_to(np.asarray(scale, np.float64), len(s))
     yaw = tile.rng.uniform(0.0, 2.0 * np.pi, len(s))
     at = tile.at(s, d, -sink * scale)
     n = len(models)
     return merge(
-        [meshes.place(m, at[i::n], yaw[i::n], scale[i::n]) for i, m in enumerate(models) if len(s) > i]
+        [
+            meshes.place(m, at[i::n], yaw[i::n], scale[i::n])
+            for i, m in enumerate(models)
+            if len(s) > i
+        ]
     )
 
 
 def wall(tile: Tile, s: ArrayLike, d: ArrayLike, height: ArrayLike, material: Material) -> Mesh:
-    """Raise a wall over a line of stations and offsets, from below the ground to `height` metres."""
+    """Raise a wall of some height over a line of stations and offsets, from below the ground."""
     foot = tile.at(s, d, -0.3)
     top = foot.copy()
     top[:, 2] += 0.3 + np.asarray(height)

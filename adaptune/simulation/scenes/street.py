@@ -44,8 +44,9 @@ def _house(width: float, depth: float, floors: int, rng: np.random.Generator) ->
         box((width + 0.3, 0.5, 0.25), plain, (0.0, 0.1, height)),
     ]
     if rng.random() < 0.4:
-        for m in middle[1::2]:
-            parts_.append(box((opening + 0.8, 1.0, 1.0), Material.METAL, (m, -0.5, storey)))
+        parts_.extend(
+            box((opening + 0.8, 1.0, 1.0), Material.METAL, (m, -0.5, storey)) for m in middle[1::2]
+        )
     return merge(parts_)
 
 
@@ -67,7 +68,9 @@ def _build(tile: Tile) -> list[Mesh]:
             elif width >= 4.0 and rng.random() < 0.5:
                 hedge = box((width, 0.8, 1.6), Material.LEAVES)
                 if not crossing:
-                    meshes.append(place(hedge, tile.at(middle, side * (_KERB + 4.0)), tile.heading(middle)))
+                    meshes.append(
+                        place(hedge, tile.at(middle, side * (_KERB + 4.0)), tile.heading(middle))
+                    )
             s += width + gap
         if crossing:
             meshes.extend(_side_street(tile, side))
@@ -108,7 +111,11 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
         stations = stations[np.abs(stations - (tile.index + 0.5) * 20.0) > 6.0]
     for s in stations:
         if round(s / 10.0) % 3 == (0 if side > 0 else 1):
-            meshes.append(place(parts.lamp(), tile.at(s, side * (_KERB + 0.5)), tile.heading(s) + turn + np.pi))
+            meshes.append(
+                place(
+                    parts.lamp(), tile.at(s, side * (_KERB + 0.5)), tile.heading(s) + turn + np.pi
+                )
+            )
         elif rng.random() < 0.45:
             model = parts.tree(int(rng.integers(parts.VARIANTS)))
             at = tile.at(s + rng.uniform(-1.5, 1.5), side * (_KERB + 1.2))
