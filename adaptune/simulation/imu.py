@@ -64,7 +64,7 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
     acceleration, turn_rate = ride.accelerations(times)
     # The IMU goes round the LiDAR as both turn.
     round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
-    force = acceleration + [0.0, 0.0, GRAVITY]
+    force = acceleration + np.array([0.0, 0.0, GRAVITY])
     force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_
     return Inertial(times, turn @ R_lidar_imu, force @ R_lidar_imu)
 

@@ -74,9 +74,9 @@ MOTIONS: Mapping[str, Motion] = MappingProxyType(
             turning=1.0,
             height=0.9,
             base=(0.8, 0.6),
-            weave=0.25,
-            shift=(0.003, 0.005, 0.006),
-            turn=(0.008, 0.008, 0.006),
+            weave=0.15,
+            shift=(0.002, 0.003, 0.004),
+            turn=(0.0015, 0.0015, 0.001),
             band=(0.5, 3.5),
         ),
         "car": Motion(
@@ -87,7 +87,7 @@ MOTIONS: Mapping[str, Motion] = MappingProxyType(
             base=(2.7, 1.6),
             weave=0.15,
             shift=(0.003, 0.006, 0.010),
-            turn=(0.004, 0.004, 0.002),
+            turn=(0.0015, 0.0020, 0.0007),
             band=(0.6, 2.5),
         ),
         "handheld": Motion(
@@ -98,7 +98,7 @@ MOTIONS: Mapping[str, Motion] = MappingProxyType(
             base=(0.4, 0.4),
             weave=0.3,
             shift=(0.012, 0.020, 0.022),
-            turn=(0.030, 0.030, 0.035),
+            turn=(0.012, 0.012, 0.015),
             band=(0.4, 2.5),
         ),
     }
@@ -224,7 +224,7 @@ def _shake(motion: Motion, t: Floats, rng: np.random.Generator) -> Floats:
     frequency = rng.uniform(*motion.band, (waves, 6))
     phase = rng.uniform(0.0, 2.0 * np.pi, (waves, 6))
     # Lower frequencies swing further, as masses on springs do.
-    weight = 1.0 / frequency
+    weight = 1.0 / frequency**2
     weight *= deviation * np.sqrt(2.0 / np.sum(weight**2, axis=0))
     shake = np.zeros((len(t), 6))
     for f, p, w in zip(frequency, phase, weight, strict=True):

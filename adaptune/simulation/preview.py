@@ -1,10 +1,12 @@
 """A picture of a simulated recording."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from adaptune.simulation.simulate import Drive, SimulatedScan
 
@@ -26,7 +28,7 @@ class Preview:
         self._every = max(len(drive) // _MAP_SCANS, 1)
         self._shown = len(drive) // 2
         self._count = 0
-        self._map: list[np.ndarray] = []
+        self._map: list[NDArray[np.float64]] = []
         self._scan: SimulatedScan | None = None
 
     def add(self, scan: SimulatedScan) -> None:
@@ -74,11 +76,10 @@ class Preview:
             figure.colorbar(drawn, ax=panel, label="range (m)", pad=0.01)
         figure.savefig(path, format="png")
 
-    def _draw_map(self, panel: object) -> None:
-        axes: object = panel
+    def _draw_map(self, axes: Any) -> None:
         points = np.concatenate(self._map) if self._map else np.empty((0, 3))
         points = points[np.argsort(points[:, 2], kind="stable")]
-        axes.scatter(  # type: ignore[attr-defined]
+        axes.scatter(
             points[:, 0],
             points[:, 1],
             c=points[:, 2],
@@ -89,6 +90,6 @@ class Preview:
             vmax=4.0,
         )
         T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
-        axes.plot(T[:, 0, 3], T[:, 1, 3], color="red", linewidth=1.2)  # type: ignore[attr-defined]
-        axes.set(aspect="equal", facecolor="black", xlabel="x (m)", ylabel="y (m)")  # type: ignore[attr-defined]
-        axes.set_title("from above, by height, with the path")  # type: ignore[attr-defined]
+        axes.plot(T[:, 0, 3], T[:, 1, 3], color="red", linewidth=1.2)
+        axes.set(aspect="equal", facecolor="black", xlabel="x (m)", ylabel="y (m)")
+        axes.set_title("from above, by height, with the path")

@@ -1,6 +1,5 @@
 """Recordings of simulated courses: ROS bags and KITTI odometry folders."""
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -155,10 +154,16 @@ class _Composer:
         )
         self._drive = drive
         fields = self._types["sensor_msgs/msg/PointField"]
+        offsets: Any = CLOUD.fields
         kinds = {"<f4": 7, "<u2": 4}
         self._fields = [
-            fields(name=name, offset=offset, datatype=kinds[dtype.str], count=1)
-            for name, (dtype, offset) in (CLOUD.fields or {}).items()  # type: ignore[misc]
+            fields(
+                name=name,
+                offset=offsets[name][1],
+                datatype=kinds[offsets[name][0].str],
+                count=1,
+            )
+            for name in CLOUD.names or ()
         ]
 
     @property

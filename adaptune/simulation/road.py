@@ -76,11 +76,11 @@ class Road:
 
     def heading(self, s: Floats) -> Floats:
         """Radians from the x axis at each station."""
-        return np.interp(s, self._stations, self._heading)
+        return np.asarray(np.interp(s, self._stations, self._heading), np.float64)
 
     def height(self, s: Floats) -> Floats:
         """Metres above the start at each station."""
-        return np.interp(s, self._stations, self._z)
+        return np.asarray(np.interp(s, self._stations, self._z), np.float64)
 
     def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
         """Coordinates x and y of a station and an offset."""
@@ -91,7 +91,7 @@ class Road:
 
     def station(self, x: Floats) -> Floats:
         """Station at which the line passes an x."""
-        return np.interp(x, self._x, self._stations)
+        return np.asarray(np.interp(x, self._x, self._stations), np.float64)
 
     def shares(self, s: Floats) -> list[tuple[Leg, Floats]]:
         """How much each leg's scene has to say at each station: weights that sum to one."""

@@ -52,7 +52,8 @@ def _hdl64e() -> NDArray[np.float64]:
     """Give the two blocks of 32 lasers: a third of a degree apart above, half a degree below."""
     upper = 2.0 - np.arange(32) / 3.0
     lower = -8.83 - 0.5 * np.arange(32)
-    return np.radians(np.concatenate([upper, lower])[::-1])
+    elevations: NDArray[np.float64] = np.radians(np.concatenate([upper, lower])[::-1])
+    return elevations
 
 
 SENSORS: Mapping[str, Sensor] = MappingProxyType(

@@ -74,14 +74,13 @@ class Drive:
         return int(self.ride.duration * self.course.turns)
 
     def stamps(self) -> NDArray[np.int64]:
-        """Borders of the scans in nanoseconds: one more than there are scans, of shape (n + 1,)."""
-        return EPOCH + np.rint(np.arange(len(self) + 1) * (1e9 / self.course.turns)).astype(
-            np.int64
-        )
+        """Borders of the scans in nanoseconds, one more than there are scans."""
+        borders = np.arange(len(self) + 1) * (1e9 / self.course.turns)
+        return np.asarray(EPOCH + np.rint(borders).astype(np.int64), np.int64)
 
     def seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """Seconds since the start of stamps in nanoseconds."""
-        return (stamps - EPOCH) * 1e-9
+        return np.asarray((stamps - EPOCH) * 1e-9, np.float64)
 
     def scans(self) -> Iterator[SimulatedScan]:
         """Scan the world from one end of the drive to the other."""

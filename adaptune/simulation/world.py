@@ -75,7 +75,7 @@ class World:
     def _ground(self, start: float, stop: float) -> Mesh:
         road = self._road
         ends, _ = road.plane(np.array([start, stop]), np.zeros(2))
-        x = np.linspace(*ends, max(int((ends[1] - ends[0]) / _CELL), 1) + 1)
+        x = np.linspace(ends[0], ends[1], max(int((ends[1] - ends[0]) / _CELL), 1) + 1)
         s = road.station(x)
         _, middle = road.plane(s, np.zeros_like(s))
         # Sheared along y rather than swept along the road, lest it fold in bends.

@@ -34,7 +34,7 @@ class Spots:
 
 
 class Line(Protocol):
-    """The line along which a scene is built; `adaptune.simulation.road.Road` is the one there is."""
+    """The line along which a scene is built: what `Road` offers to scenes."""
 
     def heading(self, s: Floats) -> Floats:
         """Radians from the x axis at each station."""

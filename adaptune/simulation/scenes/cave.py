@@ -7,13 +7,13 @@ from adaptune.simulation.noise import fractal, fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
 
-_CHAMBERS = 14.0
-"""Metres from one side chamber to the next."""
+_CHAMBERS, _ROOMS = 13.0, 6.0
+"""Metres from one side chamber to the next, and from one narrow to the next."""
 
 
 def _relief(spots: Spots, seed: int) -> Floats:
-    rubble = fractal_plane(spots.x, spots.y, 2.2, seed + 11, 3)
-    return 0.04 * rubble + 0.35 * beyond(spots.d, 0.9, 1.6) * rubble
+    rubble = fractal_plane(spots.x, spots.y, 2.2, seed + 11, 2)
+    return 0.010 * rubble + 0.35 * beyond(spots.d, 0.9, 1.6) * rubble
 
 
 def _chambers(s: Floats, angle: Floats, seed: int) -> Floats:
@@ -26,29 +26,39 @@ def _chambers(s: Floats, angle: Floats, seed: int) -> Floats:
             side, half = (0.0 if rng.random() < 0.5 else np.pi), rng.uniform(1.3, 2.4)
             bump = reach * np.exp(-(((s - middle) / half) ** 4))
             bump = bump * np.exp(-(((angle - side) / 0.75) ** 2))
-            if n == number:
-                depth = np.where(np.floor(s / _CHAMBERS) == n, depth + bump, depth)
-            else:
-                depth = np.where(np.floor(s / _CHAMBERS) == number, depth + bump, depth)
+            depth = np.where(np.floor(s / _CHAMBERS) == number, depth + bump, depth)
     return depth
+
+
+def _rooms(s: Floats, seed: int) -> Floats:
+    """Say how far each station is from a narrow: 0 in the middle of one, 1 in a room."""
+    share = np.ones_like(s)
+    for n in range(int(np.floor(s.min() / _ROOMS)) - 1, int(np.floor(s.max() / _ROOMS)) + 2):
+        rng = np.random.default_rng([seed, 32, n + 1000])
+        middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.45, 0.75)
+        share = np.minimum(
+            share, 1.0 - rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4))
+        )
+    return share
 
 
 def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     """Give offset and height of the rock at stations and angles from the left, over the top."""
     along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
-    half = (2.9 + 1.1 * fractal(along, 9.0, seed + 21)).reshape(s.shape)
-    roof = (3.2 + 1.3 * fractal(along, 13.0, seed + 22)).reshape(s.shape)
-    lean = (0.7 * fractal(along, 7.0, seed + 23)).reshape(s.shape)
-    chamber = _chambers(s, angle, seed)
+    room = _rooms(s, seed)
+    half = 1.0 + room * (2.4 + 0.8 * fractal(along, 9.0, seed + 21).reshape(s.shape))
+    roof = 1.6 + room * (1.2 + 0.9 * fractal(along, 13.0, seed + 22).reshape(s.shape))
+    lean = 0.9 * room * fractal(along, 7.0, seed + 23).reshape(s.shape)
+    chamber = room * _chambers(s, angle, seed)
     d, z = (half + chamber) * np.cos(angle), roof * np.sin(angle)
-    # Metre-scale bumps, which tell one stretch of wall from the next.
+    # Metre-scale bumps, which tell one stretch of wall from the next; a robot fits through.
     places = np.stack(np.broadcast_arrays(s, d, z), axis=-1).reshape(-1, 3)
-    bumps = 0.75 * fractal(places, 3.0, seed + 24, 4).reshape(d.shape)
+    bumps = fractal(places, 2.6, seed + 24, 2).reshape(d.shape) * (0.15 + 0.65 * room)
     return lean + d + bumps * np.cos(angle), z + bumps * np.sin(angle)
 
 
 def _build(tile: Tile) -> list[Mesh]:
-    s = np.linspace(tile.start, tile.stop, max(int((tile.stop - tile.start) / 0.4), 1) + 1)[:, None]
+    s = np.linspace(tile.start, tile.stop, max(int((tile.stop - tile.start) / 0.3), 1) + 1)[:, None]
     angle = np.linspace(-0.35, np.pi + 0.35, 56)[None]
     d, z = _section(s, angle, tile.seed)
     rock = tile.at(s, d)
@@ -61,7 +71,7 @@ def _build(tile: Tile) -> list[Mesh]:
         if used
     )
     meshes.extend(_dripstones(tile))
-    s_rocks, d_rocks = tile.scatter(0.08, 1.8, 4.5)
+    s_rocks, d_rocks = tile.scatter(0.05, 1.8, 4.5)
     boulders = [parts.boulder(v) for v in range(parts.VARIANTS)]
     meshes.append(
         parts.strew(tile, boulders, s_rocks, d_rocks, tile.rng.uniform(0.2, 0.55, len(s_rocks)))
@@ -104,7 +114,22 @@ def _dripstones(tile: Tile) -> list[Mesh]:
     at = tile.at(s, d)
     at[:, 2] = tile.at(s, 0.0)[:, 2] + np.maximum(roof[:, 0], 1.9 + height) + 0.2
     hanging = place(cone, at, 0.0, np.column_stack([radius, radius, -height - 0.2]))
-    return [standing, hanging]
+    return [standing, hanging, *_columns(tile, cone)]
+
+
+def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
+    """Let dripstones grow together to columns, which hide what lies behind."""
+    s, d = tile.scatter(0.10, 1.2, 3.6, margin=2.0)
+    at, n = tile.at(s, d), len(s)
+    radius = tile.rng.uniform(0.25, 0.6, n)
+    lower = place(cone, at, 0.0, np.column_stack([radius, radius, np.full(n, 2.6)]))
+    upper = place(
+        cone,
+        at + np.array([0.0, 0.0, 3.6]),
+        1.0,
+        np.column_stack([radius, radius, np.full(n, -2.6)]),
+    )
+    return [lower, upper]
 
 
 CAVE = Scene(
@@ -112,9 +137,9 @@ CAVE = Scene(
     build=_build,
     relief=_relief,
     surface=paved((np.inf, Material.ROCK)),
-    winding=0.75,
-    bend=17.0,
-    slope=0.05,
-    shake=1.6,
-    pace=0.9,
+    winding=0.4,
+    bend=7.0,
+    slope=0.03,
+    shake=1.2,
+    pace=0.35,
 )

@@ -37,14 +37,14 @@ def _build(tile: Tile) -> list[Mesh]:
             at = tile.at(middle, side * (_HALF + _RECESS / 2))
             meshes.append(place(merge([lintel, handle]), at, tile.heading(middle)))
     # Beams under the ceiling, extinguishers, and a cupboard now and then.
-    for s in np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0:
+    for station in np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0:
         beam = box((0.25, 2 * _HALF, 0.22), Material.PLASTER, (0.0, 0.0, _HEIGHT - 0.22))
-        meshes.append(place(beam, tile.at(s, 0.0), tile.heading(s)))
+        meshes.append(place(beam, tile.at(station, 0.0), tile.heading(station)))
     for size, chance in (((0.18, 0.18, 0.6), 0.6), ((0.9, 0.4, 1.9), 0.5), ((0.4, 0.35, 0.7), 0.5)):
         if rng.random() < chance:
-            s, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
-            at = tile.at(s, side * (_HALF - size[1] / 2))
-            meshes.append(place(box(size, Material.METAL), at, tile.heading(s)))
+            station, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
+            at = tile.at(station, side * (_HALF - size[1] / 2))
+            meshes.append(place(box(size, Material.METAL), at, tile.heading(station)))
     for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes)):
         if used:
             meshes.extend(_front(tile, end))
@@ -55,7 +55,8 @@ def _doors(tile: Tile) -> list[float]:
     """Stations of the doors' nearer jambs, apart from one another and from the tile's ends."""
     slots = np.arange(tile.start + 0.6, tile.stop - 4.0, 4.5)
     slots = slots[tile.rng.random(len(slots)) < 0.75]
-    return (slots + tile.rng.uniform(0.0, 2.4, len(slots))).tolist()
+    doors: list[float] = (slots + tile.rng.uniform(0.0, 2.4, len(slots))).tolist()
+    return doors
 
 
 def _front(tile: Tile, end: float) -> list[Mesh]:

@@ -11,7 +11,7 @@ from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, 
 def _relief(spots: Spots, seed: int) -> Floats:
     clods = fractal_plane(spots.x, spots.y, 6.0, seed + 51, 4)
     swell = fractal_plane(spots.x, spots.y, 28.0, seed + 52, 2)
-    return 0.12 * clods + beyond(spots.d, 1.2, 3.0) * (0.4 * clods + 1.2 * swell)
+    return 0.04 * clods + beyond(spots.d, 1.2, 3.0) * (0.4 * clods + 1.2 * swell)
 
 
 def _build(tile: Tile) -> list[Mesh]:
@@ -25,7 +25,7 @@ def _build(tile: Tile) -> list[Mesh]:
     # An old fence on one side, some of its posts missing.
     stations = np.arange(np.ceil(tile.start / 4.0), tile.stop / 4.0) * 4.0
     stations = stations[rng.random(len(stations)) < 0.75]
-    meshes.append(parts.strew(tile, [post], stations, np.full(len(stations), 17.0), 1.0, 0.3))
+    meshes.append(parts.strew(tile, [post], stations, np.full(len(stations), 17.0), 1.0, sink=0.3))
     return meshes
 
 
@@ -34,9 +34,9 @@ FIELD = Scene(
     build=_build,
     relief=_relief,
     surface=paved((np.inf, Material.GRASS)),
-    winding=0.3,
+    winding=0.15,
     bend=30.0,
     slope=0.04,
-    shake=2.0,
-    pace=0.85,
+    shake=1.6,
+    pace=0.7,
 )

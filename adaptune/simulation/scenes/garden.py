@@ -33,12 +33,12 @@ def _relief(spots: Spots, seed: int) -> Floats:
     river = 2.2 * beyond(np.minimum(spots.d - _BANK, 0.0), 0.0, 4.0)
     brook = 2.0 * _channel(spots, seed)
     rise = 3.0 * beyond(np.maximum(spots.d, 0.0), 6.0, 25.0)
-    return 0.05 * swell + 0.6 * beyond(spots.d, 1.6, 6.0) * swell + rise - np.maximum(river, brook)
+    return 0.03 * swell + 0.6 * beyond(spots.d, 1.6, 6.0) * swell + rise - np.maximum(river, brook)
 
 
 def _trees(tile: Tile, s: Floats, d: Floats, sizes: tuple[float, float]) -> Mesh:
     models = [parts.tree(v) for v in range(parts.VARIANTS)]
-    return parts.strew(tile, models, s, d, tile.rng.uniform(*sizes, len(s)), 0.02)
+    return parts.strew(tile, models, s, d, tile.rng.uniform(*sizes, len(s)), sink=0.02)
 
 
 def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -92,7 +92,7 @@ def _hedges(tile: Tile) -> list[Mesh]:
             n = int(40 * length)
             spread = rng.uniform(-0.5, 0.5, (n, 3)) * [length, 0.9, height + 0.2]
             leaves = foliage(
-                spread + [0.0, 0.0, height / 2.0], 0.15, 0.16, int(rng.integers(2**31))
+                spread + np.array([0.0, 0.0, height / 2.0]), 0.15, 0.16, int(rng.integers(2**31))
             )
             meshes.append(
                 place(merge([heart, leaves]), tile.at(middle, side * 2.3), tile.heading(middle))
@@ -121,10 +121,10 @@ GARDEN = Scene(
     build=_build,
     relief=_relief,
     surface=paved((1.6, Material.SOIL), (np.inf, Material.GRASS)),
-    winding=0.45,
+    winding=0.3,
     bend=22.0,
-    slope=0.07,
+    slope=0.06,
     shake=1.2,
-    pace=0.9,
+    pace=0.6,
     movers=(("walker", 1.1), ("walker", -1.2)),
 )

@@ -12,7 +12,9 @@ def _relief(spots: Spots, seed: int) -> Floats:
     swell = fractal_plane(spots.x, spots.y, 22.0, seed + 41, 3)
     hills = 7.0 + 6.0 * fractal_plane(spots.x, spots.y, 40.0, seed + 42, 3)
     return (
-        0.1 * swell + 0.9 * beyond(spots.d, 3.0, 15.0) * swell + beyond(spots.d, 45.0, 40.0) * hills
+        0.05 * swell
+        + 0.9 * beyond(spots.d, 3.0, 15.0) * swell
+        + beyond(spots.d, 45.0, 40.0) * hills
     )
 
 
@@ -31,14 +33,15 @@ def _build(tile: Tile) -> list[Mesh]:
         s, d = tile.scatter(density, near, far, margin=4.0)
         meshes.append(parts.strew(tile, models, s, d, rng.uniform(*sizes, len(s))))
     if rng.random() < 0.12:
-        s, d = rng.uniform(tile.start, tile.stop), rng.choice([-1, 1]) * rng.uniform(28.0, 45.0)
+        s = rng.uniform(tile.start, tile.stop, 1)
+        d = rng.choice([-1.0, 1.0], 1) * rng.uniform(28.0, 45.0)
         shed = merge(
             [
                 box((12.0, 7.0, 3.6), Material.WOOD),
                 box((12.8, 3.0, 1.2), Material.WOOD, (0.0, 0.0, 3.5)),
             ]
         )
-        meshes.append(parts.strew(tile, [shed], np.array([s]), np.array([d]), 1.0, 0.3))
+        meshes.append(parts.strew(tile, [shed], s, d, 1.0, sink=0.3))
     return meshes
 
 
@@ -47,7 +50,7 @@ OPEN = Scene(
     build=_build,
     relief=_relief,
     surface=paved((np.inf, Material.SOIL)),
-    winding=0.35,
+    winding=0.18,
     bend=30.0,
     slope=0.03,
     shake=1.2,

@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adaptune.simulation import mesh as meshes
 from adaptune.simulation.mesh import Material, Mesh, blob, box, foliage, grid, merge, mesh, tube
 from adaptune.simulation.scenes.base import Floats, Tile
-from adaptune.simulation import mesh as meshes
 
 VARIANTS = 4
 """How many different trees, bushes and boulders there are."""
@@ -145,7 +145,7 @@ def bench() -> Mesh:
 
 
 def strew(
-    tile: Tile, models: list[Mesh], s: Floats, d: Floats, scale: ArrayLike, sink: float = 0.1
+    tile: Tile, models: list[Mesh], s: Floats, d: Floats, scale: ArrayLike, *, sink: float = 0.1
 ) -> Mesh:
     """Put models, in turn and turned at random, at stations and offsets, sunk into the ground."""
     scale = np.broadcast_to(np.asarray(scale, np.float64), len(s))
@@ -162,7 +162,7 @@ def strew(
 
 
 def wall(tile: Tile, s: ArrayLike, d: ArrayLike, height: ArrayLike, material: Material) -> Mesh:
-    """Raise a wall over a line of stations and offsets, from below the ground to `height` metres."""
+    """Raise a wall of some height over a line of stations and offsets, from below the ground."""
     foot = tile.at(s, d, -0.3)
     top = foot.copy()
     top[:, 2] += 0.3 + np.asarray(height)

@@ -7,18 +7,18 @@ from adaptune.simulation.noise import fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
 
-_KERB, _CROSSING = 5.2, 4
+_KERB, _CROSSING = 9.0, 4
 """Metres from the road's middle to the kerb, and tiles from one crossing to the next."""
 
 
 def _relief(spots: Spots, seed: int) -> Floats:
-    uneven = 0.03 * fractal_plane(spots.x, spots.y, 5.0, seed + 61, 2)
+    uneven = 0.01 * fractal_plane(spots.x, spots.y, 5.0, seed + 61, 2)
     return uneven + 0.13 * beyond(spots.d, _KERB, 0.3)
 
 
 def _house(width: float, depth: float, floors: int, rng: np.random.Generator) -> Mesh:
     """Make a house with its front on the x axis, reaching back along y."""
-    storey, inset = rng.uniform(2.8, 3.3), 0.22
+    storey, inset = rng.uniform(2.8, 3.3), 0.15
     height = floors * storey + 0.8
     bays = max(int(width / rng.uniform(2.2, 3.2)), 1)
     pitch, opening = width / bays, rng.uniform(1.0, 1.3)
@@ -44,8 +44,9 @@ def _house(width: float, depth: float, floors: int, rng: np.random.Generator) ->
         box((width + 0.3, 0.5, 0.25), plain, (0.0, 0.1, height)),
     ]
     if rng.random() < 0.4:
-        for m in middle[1::2]:
-            parts_.append(box((opening + 0.8, 1.0, 1.0), Material.METAL, (m, -0.5, storey)))
+        parts_.extend(
+            box((opening + 0.8, 1.0, 1.0), Material.METAL, (m, -0.5, storey)) for m in middle[1::2]
+        )
     return merge(parts_)
 
 
@@ -58,11 +59,11 @@ def _build(tile: Tile) -> list[Mesh]:
         while s < tile.stop - 5.0:
             width = min(rng.uniform(7.0, 13.0), tile.stop - 0.4 - s)
             middle = s + width / 2.0
-            gap = rng.uniform(2.0, 5.0) if rng.random() < 0.35 else 0.3
+            gap = rng.uniform(3.0, 8.0) if rng.random() < 0.75 else 0.3
             away = abs(middle - (tile.index + 0.5) * 20.0)
-            if width >= 4.0 and not (crossing and away < width / 2.0 + 4.5):
+            if width >= 4.0 and not (crossing and away < width / 2.0 + 6.0):
                 house = _house(width, rng.uniform(8.0, 12.0), int(rng.integers(2, 6)), rng)
-                at = tile.at(middle, side * (_KERB + rng.uniform(3.2, 5.5)))
+                at = tile.at(middle, side * (_KERB + rng.uniform(4.0, 10.0)))
                 meshes.append(place(house, at, tile.heading(middle) + turn))
             elif width >= 4.0 and rng.random() < 0.5:
                 hedge = box((width, 0.8, 1.6), Material.LEAVES)
@@ -85,12 +86,12 @@ def _side_street(tile: Tile, side: float) -> list[Mesh]:
     meshes = []
     heading = float(tile.heading(middle))
     for hand in (-1.0, 1.0):
-        for d in (17.0, 30.0, 43.0):
+        for d in (24.0, 37.0, 50.0):
             house = _house(rng.uniform(9.0, 12.0), 8.0, int(rng.integers(2, 5)), rng)
-            at = tile.at(middle + hand * (5.5 + rng.uniform(0.0, 1.0)), side * d)
+            at = tile.at(middle + hand * (7.0 + rng.uniform(0.0, 1.0)), side * d)
             yaw = heading + (-np.pi / 2.0 if hand > 0 else np.pi / 2.0)
             meshes.append(place(house, at, yaw))
-    at = tile.at(middle + 5.0, side * (_KERB + 0.6))
+    at = tile.at(middle + 6.5, side * (_KERB + 0.6))
     return [*meshes, place(parts.sign(), at, heading + np.pi)]
 
 
@@ -99,8 +100,8 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
     rng, meshes = tile.rng, []
     slots = np.arange(tile.start + 3.0, tile.stop - 2.0, 5.6)
     if crossing:
-        slots = slots[np.abs(slots - (tile.index + 0.5) * 20.0) > 7.5]
-    slots = slots[rng.random(len(slots)) < 0.55] + rng.uniform(-0.3, 0.3)
+        slots = slots[np.abs(slots - (tile.index + 0.5) * 20.0) > 9.0]
+    slots = slots[rng.random(len(slots)) < 0.4] + rng.uniform(-0.3, 0.3)
     if len(slots):
         at = tile.at(slots, side * (_KERB - 1.05 + rng.uniform(-0.1, 0.1, len(slots))))
         scale = rng.uniform(0.9, 1.12, (len(slots), 3)) * [1.0, 1.0, rng.choice([1.0, 1.25])]
@@ -115,7 +116,7 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
                     parts.lamp(), tile.at(s, side * (_KERB + 0.5)), tile.heading(s) + turn + np.pi
                 )
             )
-        elif rng.random() < 0.6:
+        elif rng.random() < 0.45:
             model = parts.tree(int(rng.integers(parts.VARIANTS)))
             at = tile.at(s + rng.uniform(-1.5, 1.5), side * (_KERB + 1.2))
             meshes.append(place(model, at, rng.uniform(0.0, 6.28), rng.uniform(0.6, 0.9)))
@@ -131,9 +132,9 @@ STREET = Scene(
     build=_build,
     relief=_relief,
     surface=paved((_KERB, Material.ASPHALT), (np.inf, Material.PAVING)),
-    winding=0.12,
+    winding=0.05,
     bend=45.0,
-    slope=0.02,
-    shake=0.7,
+    slope=0.012,
+    shake=0.6,
     movers=(("car", 1.9), ("walker", _KERB + 2.2), ("walker", -_KERB - 2.0)),
 )
