@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from adaptune import yaml
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.odometry import BOXES, BaseSettings, HealthCheck, Odometry, box_class
+from adaptune.odometry import BaseSettings, HealthCheck, Odometry, OdometryError, box_class
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.simulation import Course
 from adaptune.space import ParameterSet, ParameterSpace, nearest
@@ -337,13 +337,13 @@ def _check_roles(data: dict[str, Any], known: set[Any], problems: list[_Problem]
 
 def _check_odometry(data: dict[str, Any], problems: list[_Problem]) -> None:
     name = data.get("name")
-    if not isinstance(name, str) or name not in BOXES:
-        if isinstance(name, str):
-            problems.append(
-                (("odometry", "name"), f"there is no odometry {name!r}: {nearest(name, BOXES)}")
-            )
+    if not isinstance(name, str):
         return
-    box = box_class(name)
+    try:
+        box = box_class(name)
+    except OdometryError as error:
+        problems.append((("odometry", "name"), str(error)))
+        return
     settings = data.get("settings")
     if isinstance(settings, dict):
         _validated(box.settings_type, settings, ("odometry", "settings"), problems)

@@ -50,6 +50,10 @@ class Odometry(ABC):
         What is set once, as a pydantic model; class attribute.
     live : bool
         Whether `configure` may be called between scans; class attribute.
+    clean : bool
+        Whether a second instance in the same process knows nothing of the first, and cannot take
+        the process down with it; class attribute. One that is not clean runs in a process of its
+        own.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -65,6 +69,7 @@ class Odometry(ABC):
     space: ClassVar[ParameterSpace]
     settings_type: ClassVar[type[BaseSettings]] = BaseSettings
     live: ClassVar[bool]
+    clean: ClassVar[bool] = True
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -116,5 +121,7 @@ class Odometry(ABC):
 
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
+    if isinstance(prepared, tuple):
+        return sum(map(prepared_bytes, prepared))
     size = getattr(prepared, "nbytes", None)
     return int(size) if size is not None else 1_000_000

@@ -18,7 +18,7 @@ MIN_POINTS = 20
 
 
 class Settings(BaseSettings):
-    """Settings of keyframe GICP, in metres."""
+    """Settings of keyframe GICP and VGICP, in metres."""
 
     downsampling: float = Field(0.5, gt=0)
     min_range: float = Field(1.0, ge=0)
@@ -51,12 +51,7 @@ class KeyframeGicp(KeyframeOdometry):
 
     def prepare(self, scan: Scan) -> Prepared:
         """See `Odometry.prepare`."""
-        cloud, tree = small_gicp.preprocess_points(
-            crop(scan, self.settings.min_range),
-            downsampling_resolution=self.settings.downsampling,
-            num_threads=1,
-        )
-        return Prepared(cloud, tree)
+        return prepare(scan, self.settings)
 
     def usable(self, prepared: Prepared) -> bool:
         """See `KeyframeOdometry.usable`."""
@@ -74,6 +69,16 @@ class KeyframeGicp(KeyframeOdometry):
             num_threads=1,
         )
         return Alignment(result.T_target_source, result.num_inliers >= MIN_POINTS)
+
+
+def prepare(scan: Scan, settings: Settings) -> Prepared:
+    """Crop and downsample a scan, and estimate its covariances."""
+    cloud, tree = small_gicp.preprocess_points(
+        crop(scan, settings.min_range),
+        downsampling_resolution=settings.downsampling,
+        num_threads=1,
+    )
+    return Prepared(cloud, tree)
 
 
 def crop(scan: Scan, min_range: float) -> Any:

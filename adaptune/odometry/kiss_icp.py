@@ -5,6 +5,8 @@ from typing import Any, ClassVar
 import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
+from kiss_icp.mapping import get_voxel_hash_map
+from kiss_icp.threshold import get_threshold_estimator
 from pydantic import Field
 
 from adaptune.geometry import Poses
@@ -24,7 +26,11 @@ class Settings(BaseSettings):
 
 
 class Kiss(Odometry):
-    """KISS-ICP (Vizzo et al., RA-L 2023)."""
+    """KISS-ICP (Vizzo et al., RA-L 2023).
+
+    Its parts are made anew between scans where their parameters change: the points of the old
+    local map are put into the new one. With `deskew`, its poses are those at the scans' ends.
+    """
 
     space = ParameterSpace(
         {
@@ -35,7 +41,7 @@ class Kiss(Odometry):
         }
     )
     settings_type: ClassVar[type[BaseSettings]] = Settings
-    live = False
+    live = True
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -55,16 +61,39 @@ class Kiss(Odometry):
         config.adaptive_threshold.min_motion_th = self.parameters["min_motion_th"]
         return config
 
+    def configure(self, parameters: ParameterSet) -> None:
+        """See `Odometry.configure`.
+
+        A new `initial_threshold` is where the adaptive threshold begins again; a new
+        `min_motion_th` alone lets it begin where it is.
+        """
+        before = self.parameters
+        self.parameters = before | parameters
+        changed = {name for name, value in self.parameters.items() if value != before[name]}
+        kiss, config = self._kiss, self._config()
+        kiss.config = config
+        if changed & {"voxel_size", "max_points_per_voxel"}:
+            points = kiss.local_map.point_cloud()
+            kiss.local_map = get_voxel_hash_map(config)
+            kiss.local_map.add_points(points)
+        if changed & {"initial_threshold", "min_motion_th"}:
+            begin = config.model_copy(deep=True)
+            if "initial_threshold" not in changed:
+                begin.adaptive_threshold.initial_threshold = kiss.adaptive_threshold.get_threshold()
+            kiss.adaptive_threshold = get_threshold_estimator(begin)
+
     def prepare(self, scan: Scan) -> tuple[Any, Any]:
         """See `Odometry.prepare`."""
-        points = scan.points.astype(np.float64)
+        squared = np.einsum("ij,ij->i", scan.points, scan.points)
+        low, high = self.settings.min_range, self.settings.max_range
+        near = scan.select((squared >= low * low) & (squared <= high * high))
         times = np.empty(0)
-        if scan.times is not None and len(scan.times):
+        if scan.times is not None and near.times is not None and len(near):
             # KISS-ICP wants the share of the turn.
             first, last = float(scan.times.min()), float(scan.times.max())
             if last > first:
-                times = (scan.times.astype(np.float64) - first) / (last - first)
-        return points, times
+                times = (near.times.astype(np.float64) - first) / (last - first)
+        return near.points.astype(np.float64), times
 
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+import turns
+from conftest import lacking
+
+from adaptune.odometry import OdometryError, box_class
+from adaptune.odometry.evalio import POINT, Loam, MadIcp, Pipeline
+from adaptune.sequence import Scan
+
+try:
+    import evalio  # noqa: F401
+except ImportError:
+    have_evalio = False
+else:
+    have_evalio = True
+
+NAMES = ("ct_icp", "evalio_kiss_icp", "form", "genz_icp", "loam", "mad_icp")
+
+
+@pytest.fixture(autouse=True)
+def _evalio():
+    if not have_evalio:
+        lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_evalio_receives_is_the_scan(name):
+    from adaptune.odometry.evalio import _evalio
+
+    scan = turns.turn(0)
+    prepared = box_class(name)().prepare(scan)
+    _, types, helpers, fields = _evalio()
+    size = prepared.cloud.size
+    layout = helpers.PointCloudMetadata(
+        stamp=types.Stamp.from_nsec(scan.stamp),
+        width=size,
+        height=1,
+        point_step=POINT.itemsize,
+        row_step=size * POINT.itemsize,
+        is_bigendian=0,
+        is_dense=1,
+    )
+    points = helpers.pc2_to_evalio(layout, fields, prepared.cloud.tobytes()).points
+    near = np.linalg.norm(scan.points, axis=1) >= 1.0
+    sent = {
+        (np.float32(p.x), np.float32(p.y), np.float32(p.z), round(p.t.nsec / 1e5), p.row)
+        for p in points
+        if p.x or p.y or p.z
+    }
+    expected = {
+        (*xyz, round(t * 1e4), ring)
+        for xyz, t, ring in zip(
+            scan.points[near], scan.times[near].tolist(), scan.rings[near].tolist(), strict=True
+        )
+    }
+    assert len(sent ^ expected) < 0.01 * len(expected)
+
+
+def test_images_are_complete_whatever_the_phase_of_the_firings():
+    scan = turns.turn(0)
+    for angle in (0.0, 0.25, 0.5, 0.8):
+        turned = angle * 2 * np.pi / turns.COLUMNS
+        R = np.array(
+            [
+                [np.cos(turned), -np.sin(turned), 0],
+                [np.sin(turned), np.cos(turned), 0],
+                [0, 0, 1],
+            ],
+            np.float32,
+        )
+        prepared = Loam().prepare(Scan(0, scan.points @ R.T, scan.times, scan.rings))
+        assert prepared.cloud.shape == (turns.ROWS, turns.COLUMNS)
+        filled = (prepared.cloud["x"] != 0).sum()
+        assert filled > 0.98 * len(scan)
+
+
+@pytest.mark.parametrize("name", ["loam", "form"])
+def test_images_need_the_lasers(name):
+    with pytest.raises(OdometryError, match="record clouds with a `ring` field"):
+        box_class(name)().prepare(Scan(0, turns.turn(0).points))
+
+
+def test_more_lasers_than_rows():
+    settings = Loam.settings_type(rows=16)
+    with pytest.raises(OdometryError, match=r"odometry\.settings\.rows: 16 rows .* number 31"):
+        Loam(settings=settings).prepare(turns.turn(0))
+
+
+def test_an_image_of_another_size_does_not_reach_the_pipeline():
+    box, wide = Loam(), Loam(settings=Loam.settings_type(columns=512))
+    box.start(box.prepare(turns.turn(0)), np.eye(4))
+    with pytest.raises(OdometryError, match="began with scans of 32 x 450"):
+        box.register(wide.prepare(turns.turn(1)))
+
+
+def test_ct_icp_needs_times():
+    with pytest.raises(OdometryError, match="record clouds with a time field"):
+        box_class("ct_icp")().prepare(Scan(0, turns.turn(0).points))
+
+
+def test_a_scan_without_times_among_others_with_them_keeps_the_last_motion():
+    # It would end the process.
+    box = box_class("evalio_kiss_icp")()
+    box.start(box.prepare(turns.turn(0)), np.eye(4))
+    box.register(box.prepare(turns.turn(1)))
+    _, registered = box.register(box.prepare(Scan(0, turns.turn(2).points)))
+    assert not registered
+
+
+def test_parameters_that_are_not_tuned():
+    settings = MadIcp.settings_type(parameters={"b_max": 1, "num_keyframes": 4})
+    # An integer where a float is meant; and what is tuned comes before what is set.
+    box = MadIcp({"num_keyframes": 2}, settings)
+    box.start(box.prepare(turns.turn(0)), np.eye(4))
+    assert box.register(box.prepare(turns.turn(1))).registered
+    assert box.parameters["num_keyframes"] == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"b_mx": 1.0}, r"parameters\.b_mx: mad has no such parameter; did you mean 'b_max'"),
+        ({"num_keyframes": 2.5}, r"parameters\.num_keyframes: mad takes a value like 8, not 2\.5"),
+        ({"realtime": 1}, "takes a value like True, not 1"),
+    ],
+)
+def test_parameters_that_do_not_exist_or_fit(given, message):
+    with pytest.raises(OdometryError, match=message):
+        MadIcp(settings=MadIcp.settings_type(parameters=given))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_tuned_is_the_pipelines_own(name):
+    cls: type[Pipeline] = box_class(name)
+    from evalio.pipelines import all_pipelines
+
+    defaults = all_pipelines()[cls.pipeline].default_params()
+    for parameter, value in cls.space.baseline.items():
+        assert defaults[parameter] == value
+        assert type(defaults[parameter]) is type(value)
+    assert cls.untuned.keys() <= defaults.keys()

@@ -1,0 +1,74 @@
+import sys
+from importlib import metadata
+
+import pytest
+
+from adaptune.odometry import BOXES, OdometryError, box_class
+from adaptune.odometry.gicp import KeyframeGicp
+
+MINE = """
+from adaptune.odometry import Odometry
+from adaptune.space import Float, ParameterSpace
+
+class Mine(Odometry):
+    space = ParameterSpace({"x": Float(low=0, high=1, baseline=0.5)})
+    live = False
+    def prepare(self, scan): ...
+    def start(self, prepared, T_odom_sensor, T_previous_current=None): ...
+    def register(self, prepared): ...
+
+class Lacking(Odometry):
+    pass
+
+other = 3
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    (tmp_path / "my_odometry.py").write_text(MINE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    sys.modules.pop("my_odometry", None)
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_every_odometry_can_be_described_without_running_it(name):
+    # evalio need not be installed for that.
+    cls = box_class(name)
+    cls.space.check(cls.space.baseline)
+    assert cls.settings_type().model_config["extra"] == "forbid"
+
+
+@pytest.mark.usefixtures("mine")
+def test_a_class_of_the_users():
+    assert box_class("my_odometry:Mine").space.names == ("x",)
+
+
+@pytest.mark.usefixtures("mine")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("gipc", "there is no odometry 'gipc': did you mean 'gicp'.*module:Class"),
+        ("no_such_module:Mine", "cannot import no_such_module .*PYTHONPATH"),
+        ("my_odometry:Mime", "my_odometry has no Mime"),
+        ("my_odometry:", "my_odometry has no class"),
+        ("my_odometry:other", "not a class derived from adaptune.odometry.Odometry"),
+        ("my_odometry:Lacking", "has no attribute space and no live"),
+    ],
+)
+def test_names_that_do_not_do(name, message):
+    with pytest.raises(OdometryError, match=message):
+        box_class(name)
+
+
+def test_an_odometry_that_a_package_announces(monkeypatch):
+    point = metadata.EntryPoint(
+        "theirs", "adaptune.odometry.gicp:KeyframeGicp", "adaptune.odometries"
+    )
+    monkeypatch.setattr(
+        "adaptune.odometry.registry.entry_points", lambda group: [point][: "odom" in group]
+    )
+    assert box_class("theirs") is KeyframeGicp
+    with pytest.raises(OdometryError, match="did you mean 'theirs'"):
+        box_class("thiers")
