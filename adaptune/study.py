@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from adaptune import yaml
+from adaptune.cores import available
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.odometry import BaseSettings, HealthCheck, Odometry, OdometryError, box_class
@@ -69,6 +70,26 @@ class OfflineConfig(_Section):
     memory: float = Field(4.0, gt=0)
 
 
+class SwitchingConfig(_Section):
+    """How an odometry comes by other parameters on the way.
+
+    Attributes
+    ----------
+    mechanism : str
+        `live`: by itself. `hand_over`: a new instance takes over. `bank`: instances with a few
+        complementary sets run side by side. `auto`: the first of live, bank (where there is more
+        than one core) and hand-over that can be had.
+    warm_up : float
+        Seconds of scans that a new instance sees before it takes over.
+    size : int
+        Instances in the bank.
+    """
+
+    mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"
+    warm_up: float = Field(8.0, gt=0)
+    size: int = Field(3, ge=2, le=4)
+
+
 class OnlineConfig(_Section):
     """How to replay.
 
@@ -78,10 +99,12 @@ class OnlineConfig(_Section):
         Seconds between selections.
     rules : list of str
         How to select: `paired`, `paper`.
+    switching : SwitchingConfig
     """
 
     period: float = Field(1.0, gt=0)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
+    switching: SwitchingConfig = SwitchingConfig()
 
 
 class StudyConfig(_Section):
@@ -159,6 +182,16 @@ class Study:
     def odometry(self, parameters: ParameterSet | None = None) -> Odometry:
         """A new instance with these parameters; those not given keep their baseline."""
         return self.box(self.space.baseline | (parameters or {}), self.settings)
+
+    @cached_property
+    def mechanism(self) -> Literal["live", "hand_over", "bank"]:
+        """How the odometry comes by other parameters on the way."""
+        asked = self.config.online.switching.mechanism
+        if asked != "auto":
+            return asked
+        if self.box.live:
+            return "live"
+        return "bank" if available() > 1 else "hand_over"
 
     def recording(self, course: str) -> Path:
         """Where a simulated course's bag is kept."""
@@ -305,6 +338,8 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list
     config = _validated(StudyConfig, data, (), problems, {"folder": folder})
     if isinstance(odometry := data.get("odometry"), dict):
         _check_odometry(odometry, problems)
+    if config is not None:
+        _check_switching(config, problems)
     sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
         return None, problems
@@ -358,6 +393,21 @@ def _check_odometry(data: dict[str, Any], problems: list[_Problem]) -> None:
         elif isinstance(given, dict):
             default = box.space.parameters[parameter]
             _validated(type(default), _complete(box.space, parameter, given), key, problems)
+
+
+def _check_switching(config: StudyConfig, problems: list[_Problem]) -> None:
+    try:
+        live = box_class(config.odometry.name).live
+    except OdometryError:
+        return
+    if config.online.switching.mechanism == "live" and not live:
+        problems.append(
+            (
+                ("online", "switching", "mechanism"),
+                f"{config.odometry.name} cannot change its parameters between scans; choose auto, "
+                f"hand_over or bank",
+            )
+        )
 
 
 def _complete(space: ParameterSpace, name: str, given: Mapping[str, Any]) -> dict[str, Any]:

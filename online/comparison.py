@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from adaptune import report
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import sub_trajectory_rte, window_ends
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, Selection, portfolio, restrict
+from adaptune.odometry import Bank, Box, HandOver
 from adaptune.report import Track
+from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
-from online.replay import adaptive, replay, write_replay
+from online.replay import Policy, adaptive, replay, write_replay
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -85,12 +87,12 @@ def run_replays(
                 done += 1
                 progress(what, done, n)
 
-            parameters = model.sets[model.fixed] if mode != "baseline" else None
+            box, policy = driven(study, model, mode)
             result = replay(
                 sequence,
-                study.odometry(parameters),
+                box,
                 study.config.health,
-                adaptive(model, mode) if mode in study.config.online.rules else None,
+                policy,
                 model.sets,
                 study.config.online.period,
                 step,
@@ -101,6 +103,37 @@ def run_replays(
             made_here += 1
         made += made_here
     return made
+
+
+def driven(study: Study, model: ErrorModel, mode: str) -> tuple[Box, Policy | None]:
+    """What a mode drives through a recording, and what chooses its parameters.
+
+    Parameters
+    ----------
+    study
+        The study.
+    model
+        The error model.
+    mode
+        One of `modes`.
+    """
+    fixed = model.sets[model.fixed]
+    if mode not in study.config.online.rules:
+        return study.odometry(fixed if mode == "fixed" else None), None
+    switching = study.config.online.switching
+    if study.mechanism == "live":
+        return study.odometry(fixed), adaptive(model, mode)
+    if study.mechanism == "hand_over":
+        return HandOver(study.odometry, fixed, switching.warm_up), adaptive(model, mode)
+    members = portfolio(model, switching.size)
+    few = restrict(model, members)
+    select = adaptive(few, mode)
+
+    def policy(scan: Scan) -> Selection:
+        selection = select(scan)
+        return selection._replace(set_index=members[selection.set_index])
+
+    return Bank(study.odometry, few.sets, switching.warm_up), policy
 
 
 def check_model(study: Study, model: ErrorModel, path: Path) -> None:
@@ -124,11 +157,6 @@ def check_model(study: Study, model: ErrorModel, path: Path) -> None:
             f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
             f"offline` for this study"
         )
-    if study.config.online.rules and not study.box.live:
-        raise ComparisonError(
-            f"odometry.name: {study.config.odometry.name} cannot change its parameters between "
-            f"scans; set online.rules to [] to compare baseline and fixed"
-        )
 
 
 def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:
@@ -144,12 +172,20 @@ def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -
         "parameters": parameters,
         "model": None if parameters else digest,
         "period": study.config.online.period,
+        "switching": None if parameters else _switching(study),
         "odometry": study.config.odometry.model_dump(mode="json"),
         "health": study.config.health.model_dump(mode="json"),
         "sequence": study.sequence_config(name).model_dump(mode="json"),
         "course": None if course is None else course.model_dump(mode="json"),
     }
     return about
+
+
+def _switching(study: Study) -> dict[str, Any]:
+    """The mechanism and those of its settings that it heeds."""
+    heeded = {"live": set[str](), "hand_over": {"warm_up"}, "bank": {"warm_up", "size"}}
+    settings = study.config.online.switching.model_dump(include=heeded[study.mechanism])
+    return {"mechanism": study.mechanism} | settings
 
 
 def _about_before(folder: Path) -> object:

@@ -16,7 +16,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
 from adaptune.model import RULES, ErrorModel, Selection
-from adaptune.odometry import HealthCheck, Odometry
+from adaptune.odometry import Box, HealthCheck
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory, write_tum
@@ -95,7 +95,7 @@ def adaptive(model: ErrorModel, rule: str) -> Policy:
 
 def replay(
     scans: Iterable[Scan],
-    odometry: Odometry,
+    odometry: Box,
     health: HealthCheck,
     policy: Policy | None = None,
     sets: list[ParameterSet] | None = None,
@@ -112,7 +112,8 @@ def replay(
     scans
         In order of time.
     odometry
-        A new instance; if there is a policy, one that can change its parameters between scans.
+        A new instance; if there is a policy, one that can change its parameters between scans, by
+        itself or by `adaptune.odometry.switching`.
     health
         The odometry is started anew where its motion is not healthy.
     policy

@@ -4,6 +4,7 @@ from adaptune.model.base import Rule, Selection, TrainingData
 from adaptune.model.file import ErrorModel, ModelError
 from adaptune.model.knn import NearestNeighbours
 from adaptune.model.paired import PairedExpectedRatio
+from adaptune.model.portfolio import portfolio, restrict
 
 RULES: dict[str, type[Rule]] = {"paired": PairedExpectedRatio, "paper": NearestNeighbours}
 """Selection rules by name; the first is the default."""
@@ -17,4 +18,6 @@ __all__ = [
     "Rule",
     "Selection",
     "TrainingData",
+    "portfolio",
+    "restrict",
 ]

@@ -1,12 +1,16 @@
 """Odometries as black boxes: scans and parameters in, poses out."""
 
-from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
+from adaptune.odometry.base import BaseSettings, Box, Odometry, OdometryError, Registration
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.registry import BOXES, box_class
+from adaptune.odometry.switching import Bank, HandOver
 
 __all__ = [
     "BOXES",
+    "Bank",
     "BaseSettings",
+    "Box",
+    "HandOver",
     "HealthCheck",
     "Odometry",
     "OdometryError",

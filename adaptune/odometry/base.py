@@ -1,7 +1,7 @@
 """What every odometry must do to be tuned."""
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
@@ -34,6 +34,24 @@ class Registration(NamedTuple):
 
     T_odom_sensor: Poses
     registered: bool = True
+
+
+class Box(Protocol):
+    """What can be driven through a recording, see `Odometry` for what each method does."""
+
+    def prepare(self, scan: Scan) -> Any:
+        """See `Odometry.prepare`."""
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """See `Odometry.start`."""
+
+    def register(self, prepared: Any) -> Registration:
+        """See `Odometry.register`."""
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """See `Odometry.configure`."""
 
 
 class Odometry(ABC):

@@ -9,6 +9,22 @@ def failure(file, *overrides):
     return str(caught.value)
 
 
+def test_switching_that_the_odometry_has_not(study_file):
+    live = "online.switching.mechanism=live"
+    assert load_study(study_file, [live]).mechanism == "live"
+    stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
+    text = failure(study_file, *stiff, live)
+    assert "mad_icp cannot change its parameters between scans" in text
+
+
+def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
+    assert load_study(study_file).mechanism == "live"
+    stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
+    for cores, mechanism in ((1, "hand_over"), (2, "bank")):
+        monkeypatch.setattr("adaptune.study.available", lambda cores=cores: cores)
+        assert load_study(study_file, stiff).mechanism == mechanism
+
+
 def test_reads_a_study(study_file, tmp_path):
     study = load_study(study_file, ["offline.trials=7"], runs=tmp_path)
     assert study.folder == tmp_path / "small"
@@ -49,6 +65,10 @@ def test_reads_a_study(study_file, tmp_path):
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("offline.trials=0", ["offline.trials", "not 0"]),
         ("online.rules=[best]", ["online.rules.0", "best"]),
+        ("online.switching.mechanism=banks", ["online.switching.mechanism", "banks"]),
+        ("online.switching.warm_up=0", ["online.switching.warm_up", "not 0"]),
+        ("online.switching.size=5", ["online.switching.size", "not 5"]),
+        ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
         ("training=[ones]", ["training.0", "did you mean 'one'?"]),
         ("training=[]", ["training"]),
         ("test=[three, three]", ["test.1", "named twice"]),

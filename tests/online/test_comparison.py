@@ -4,7 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, portfolio
 from adaptune.study import load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.campaign import train
@@ -55,6 +55,29 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
         for row in rows:
             chosen = model.sets[int(row["set"])]
             assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
+
+
+@pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
+def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism):
+    model = ErrorModel.load(trained.folder / "model.npz")
+    given = [f"online.switching.mechanism={mechanism}", "online.switching.warm_up=0.5"]
+    study = load_study(study_file, [*given, "online.period=0.5"], trained.folder)
+    assert run_replays(study, trained.folder / "model.npz") == 4
+    row = next(row for row in compare(study) if row["mode"] == "paired")
+    assert row["RTE [%]"] < 3.0
+    folder = study.folder / "replays/three/paired"
+    about = json.loads((folder / "replay.json").read_text())["about"]
+    assert about["switching"]["mechanism"] == mechanism
+    assert about["switching"]["warm_up"] == 0.5
+    with (folder / "selections.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    members = portfolio(model, 3) if mechanism == "bank" else range(len(model.sets))
+    for row in rows:
+        # The numbers are those of the model, not of the bank.
+        assert int(row["set"]) in members
+        chosen = model.sets[int(row["set"])]
+        assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
+    run_replays(trained, trained.folder / "model.npz")
 
 
 def test_replays_are_made_once(replayed, study_file):

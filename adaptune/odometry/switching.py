@@ -1,0 +1,247 @@
+"""Other parameters on the way, for odometries that read them only when they begin.
+
+Both ways are driven like an odometry that is `live`: a replay need not know which it has.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert, rectify
+from adaptune.odometry.base import Box, OdometryError, Registration
+from adaptune.sequence import Scan
+from adaptune.space import ParameterSet
+
+Make = Callable[[ParameterSet], Box]
+"""Makes a new instance with these parameters."""
+
+AGREEMENT = 0.1
+"""Metres between the motions of two instances over one scan that confirm each other."""
+
+
+class Stamped(NamedTuple):
+    """A prepared scan and its stamp in nanoseconds."""
+
+    stamp: int
+    prepared: Any
+
+
+class _Past(NamedTuple):
+    stamp: int
+    prepared: Any
+    T_odom_sensor: Poses
+    T_previous_current: Poses | None
+
+
+class _Recent:
+    """The last seconds of scans, with the poses that were given for them."""
+
+    def __init__(self, seconds: float):
+        self._span = seconds * 1e9
+        self._past: deque[_Past] = deque()
+
+    def __bool__(self) -> bool:
+        return bool(self._past)
+
+    def begin(self, scan: Stamped, T_odom_sensor: Poses, motion: Poses | None) -> None:
+        self._past.clear()
+        self._past.append(_Past(*scan, T_odom_sensor, motion))
+
+    def add(self, scan: Stamped, T_odom_sensor: Poses) -> None:
+        T_previous_current = invert(self._past[-1].T_odom_sensor) @ T_odom_sensor
+        self._past.append(_Past(*scan, T_odom_sensor, T_previous_current))
+        while len(self._past) > 1 and scan.stamp - self._past[0].stamp > self._span:
+            self._past.popleft()
+
+    @property
+    def pose(self) -> Poses:
+        return self._past[-1].T_odom_sensor
+
+    def warm_up(self, box: Box) -> Poses:
+        """Let a new instance see these scans, and tell where it believes to be."""
+        first, *others = self._past
+        box.start(first.prepared, first.T_odom_sensor, first.T_previous_current)
+        T = first.T_odom_sensor
+        for past in others:
+            T = box.register(past.prepared).T_odom_sensor
+            if not np.isfinite(T).all():
+                last = others[-1]
+                box.start(last.prepared, last.T_odom_sensor, last.T_previous_current)
+                return last.T_odom_sensor
+        return T
+
+
+def _between(T_odom_sensor: Poses, T_own_sensor: Poses) -> Poses:
+    """``T_odom_own``, exactly the identity where both are the same."""
+    if np.array_equal(T_odom_sensor, T_own_sensor):
+        return np.eye(4)
+    return rectify(T_odom_sensor @ invert(T_own_sensor))
+
+
+class HandOver:
+    """An odometry that is replaced by a new instance when its parameters change.
+
+    The new instance is warmed up on the last seconds of scans, from the pose and the motion that
+    were given for the first of them. From then on its motions are chained on: no pose jumps. Its
+    map is as old as the warm-up is long.
+
+    Parameters
+    ----------
+    make
+        Makes instances.
+    parameters
+        Those to begin with.
+    warm_up
+        Seconds of scans.
+    """
+
+    def __init__(self, make: Make, parameters: ParameterSet, warm_up: float):
+        self.parameters = dict(parameters)
+        self._make = make
+        self._recent = _Recent(warm_up)
+        # What one instance has learnt from the first scan's layout must serve all.
+        self._first = self._box = make(self.parameters)
+        self._T_odom_own = np.eye(4)
+
+    def prepare(self, scan: Scan) -> Stamped:
+        """See `Odometry.prepare`."""
+        return Stamped(scan.stamp, self._first.prepare(scan))
+
+    def start(
+        self, prepared: Stamped, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """See `Odometry.start`."""
+        self._box.start(prepared.prepared, T_odom_sensor, T_previous_current)
+        self._T_odom_own = np.eye(4)
+        self._recent.begin(prepared, T_odom_sensor, T_previous_current)
+
+    def register(self, prepared: Stamped) -> Registration:
+        """See `Odometry.register`."""
+        T_own_sensor, registered = self._box.register(prepared.prepared)
+        T_odom_sensor = self._T_odom_own @ T_own_sensor
+        if np.isfinite(T_odom_sensor).all():
+            self._recent.add(prepared, T_odom_sensor)
+        return Registration(T_odom_sensor, registered)
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """Replace the instance, unless these are the parameters it has."""
+        wanted = self.parameters | parameters
+        if wanted == self.parameters:
+            return
+        self.parameters = wanted
+        self._box = self._make(wanted)
+        if self._recent:
+            T_own_sensor = self._recent.warm_up(self._box)
+            self._T_odom_own = _between(self._recent.pose, T_own_sensor)
+
+
+class Bank:
+    """Several instances side by side, each with its own parameters and each on every scan.
+
+    The motion of the chosen one is taken if that of another one confirms it; else the medoid of
+    all motions. An instance that disagrees with a confirmed motion has lost track, and is started
+    anew on the last seconds of scans.
+
+    Parameters
+    ----------
+    make
+        Makes instances.
+    sets
+        Their parameters; the first is chosen to begin with.
+    warm_up
+        Seconds of scans that an instance sees when it is started anew.
+
+    Attributes
+    ----------
+    restarts : int
+        How often an instance was started anew.
+    """
+
+    def __init__(self, make: Make, sets: Sequence[ParameterSet], warm_up: float):
+        self.sets = [dict(parameters) for parameters in sets]
+        self.restarts = 0
+        self._boxes = [make(parameters) for parameters in self.sets]
+        self._T_own_sensor = [np.eye(4)] * len(self.sets)
+        self._T_odom_own = np.eye(4)
+        self._chosen = self._taken = 0
+        self._recent = _Recent(warm_up)
+
+    def prepare(self, scan: Scan) -> Stamped:
+        """See `Odometry.prepare`."""
+        return Stamped(scan.stamp, self._boxes[0].prepare(scan))
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """Choose the instance that has these parameters.
+
+        Raises
+        ------
+        OdometryError
+            If none has.
+        """
+        if parameters not in self.sets:
+            raise OdometryError(f"no instance of the bank has the parameters {parameters}")
+        self._chosen = self.sets.index(parameters)
+
+    def start(
+        self, prepared: Stamped, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """See `Odometry.start`."""
+        for box in self._boxes:
+            box.start(prepared.prepared, T_odom_sensor, T_previous_current)
+        self._T_own_sensor = [T_odom_sensor] * len(self._boxes)
+        self._T_odom_own, self._taken = np.eye(4), self._chosen
+        self._recent.begin(prepared, T_odom_sensor, T_previous_current)
+
+    def register(self, prepared: Stamped) -> Registration:
+        """See `Odometry.register`."""
+        T_own_before = self._T_own_sensor
+        registrations = [box.register(prepared.prepared) for box in self._boxes]
+        self._T_own_sensor = [r.T_odom_sensor for r in registrations]
+        moved = [
+            (invert(before) @ now)[:3, 3]
+            for before, now in zip(T_own_before, self._T_own_sensor, strict=True)
+        ]
+        apart = _distances(np.array(moved))
+        taken = _pick(apart, self._chosen)
+        if taken != self._taken:
+            self._T_odom_own = _between(self._recent.pose, T_own_before[taken])
+            self._taken = taken
+        T_odom_sensor = self._T_odom_own @ self._T_own_sensor[taken]
+        if np.isfinite(T_odom_sensor).all():
+            self._recent.add(prepared, T_odom_sensor)
+            self._restart(_lost(apart, taken))
+        return Registration(T_odom_sensor, registrations[taken].registered)
+
+    def _restart(self, lost: Iterable[int]) -> None:
+        for i in lost:
+            self._T_own_sensor[i] = self._recent.warm_up(self._boxes[i])
+            self.restarts += 1
+
+
+def _distances(moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Metres between translations of shape (n, 3), infinite where one is not finite."""
+    apart = np.linalg.norm(moved[:, None] - moved, axis=-1)
+    return np.where(np.isfinite(apart), apart, np.inf)
+
+
+def _pick(apart: NDArray[np.float64], chosen: int) -> int:
+    """Number of the instance whose motion is taken."""
+    others = np.delete(apart[chosen], chosen)
+    if (others <= AGREEMENT).any():
+        return chosen
+    # Where one has no motion at all, those that have one are still compared with each other.
+    sums = np.minimum(apart, 1e6).sum(axis=1)
+    return chosen if sums[chosen] <= sums.min() else int(sums.argmin())
+
+
+def _lost(apart: NDArray[np.float64], taken: int) -> list[int]:
+    """Numbers of the instances that a confirmed motion shows to be lost."""
+    confirmed = (np.delete(apart[taken], taken) <= AGREEMENT).any()
+    return [
+        i
+        for i in range(len(apart))
+        if i != taken and (np.isinf(apart[i, i]) or (confirmed and apart[taken, i] > AGREEMENT))
+    ]

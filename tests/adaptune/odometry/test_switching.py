@@ -1,0 +1,209 @@
+import numpy as np
+import pytest
+import turns
+
+from adaptune.geometry import invert
+from adaptune.odometry import Bank, HandOver, Odometry, OdometryError, Registration
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.sequence import Scan
+from adaptune.space import Float, ParameterSpace
+
+NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+FAR = {"max_correspondence_distance": 1.0, "keyframe_interval": 4.0}
+
+
+class Walker(Odometry):
+    """Moves by `speed` along x with every scan, where no script says otherwise."""
+
+    space = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
+    live = False
+
+    def __init__(self, parameters, script=None):
+        super().__init__(parameters)
+        self.script = script or {}
+        self.seen = []
+        self.starts = []
+
+    def prepare(self, scan):
+        return round(scan.stamp / 1e9)
+
+    def start(self, prepared, T_odom_sensor, T_previous_current=None):
+        self.seen.append(prepared)
+        self.starts.append((prepared, T_odom_sensor[0, 3]))
+        self.motion = T_previous_current
+        self.T = T_odom_sensor.copy()
+
+    def register(self, prepared):
+        self.seen.append(prepared)
+        self.T = self.T.copy()
+        self.T[0, 3] += self.script.get(prepared, self.parameters["speed"])
+        return Registration(self.T, prepared != 4)
+
+
+def at(second):
+    return Scan(round(second * 1e9), np.zeros((0, 3), np.float32))
+
+
+def x_of(box, seconds, switches=()):
+    """Where a box is along x at every scan."""
+    switches = dict(switches)
+    x = []
+    for i, second in enumerate(seconds):
+        if second in switches:
+            box.configure(switches[second])
+        prepared = box.prepare(at(second))
+        if i == 0:
+            box.start(prepared, np.eye(4))
+            x.append(0.0)
+        else:
+            x.append(float(box.register(prepared).T_odom_sensor[0, 3]))
+    return x
+
+
+def makes(scripts=None):
+    """What makes walkers, and the list of those it made."""
+    made = []
+
+    def make(parameters):
+        made.append(Walker(parameters, (scripts or {}).get(parameters["speed"])))
+        return made[-1]
+
+    return make, made
+
+
+def test_hand_over_never_jumps_and_warms_up_on_the_last_seconds():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    x = x_of(box, range(10), {6: {"speed": 2.0}})
+    assert x == [0, 1, 2, 3, 4, 5, 7, 9, 11, 13]
+    old, new = made
+    assert old.seen == [0, 1, 2, 3, 4, 5]
+    # Four scans lie within three seconds; the first of them at the pose it was given.
+    assert new.seen == [2, 3, 4, 5, 6, 7, 8, 9]
+    assert new.starts == [(2, 2.0)]
+
+
+def test_hand_over_makes_nothing_for_the_parameters_it_has():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    x_of(box, range(6), {0: {"speed": 1.0}, 3: {"speed": 1.0}})
+    assert len(made) == 1
+
+
+def test_hand_over_before_the_first_scan():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    assert x_of(box, range(3), {0: {"speed": 3.0}}) == [0, 3, 6]
+    assert made[0].seen == []
+
+
+def test_hand_over_begins_without_warm_up_where_that_fails():
+    make, made = makes({2.0: {4: np.nan}})
+    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    assert x_of(box, range(8), {6: {"speed": 2.0}}) == [0, 1, 2, 3, 4, 5, 7, 9]
+    assert made[1].starts == [(2, 2.0), (5, 5.0)]
+
+
+def test_a_new_start_forgets_what_was_before():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, warm_up=30.0)
+    x_of(box, range(4))
+    T = np.eye(4)
+    T[0, 3] = 100.0
+    box.start(box.prepare(at(4)), T)
+    box.configure({"speed": 2.0})
+    assert box.register(box.prepare(at(5))).T_odom_sensor[0, 3] == 102.0
+    assert made[1].seen == [4, 5]
+
+
+def test_registrations_keep_their_word():
+    make, _ = makes()
+    for box in (HandOver(make, {"speed": 1.0}, 3.0), Bank(make, [{"speed": 1.0}], 3.0)):
+        box.start(box.prepare(at(3)), np.eye(4))
+        assert not box.register(box.prepare(at(4))).registered
+        assert box.register(box.prepare(at(5))).registered
+
+
+def test_the_chosen_motion_is_taken_where_another_confirms_it():
+    make, made = makes()
+    box = Bank(make, [{"speed": 1.0}, {"speed": 1.05}, {"speed": 1.09}], warm_up=3.0)
+    x = x_of(box, range(7), {2: {"speed": 1.09}, 5: {"speed": 1.05}})
+    np.testing.assert_allclose(np.diff(x), [1.0, 1.09, 1.09, 1.09, 1.05, 1.05])
+    assert box.restarts == 0
+    assert len(made) == 3
+
+
+def test_the_medoid_stands_in_for_a_lost_one_which_is_started_anew():
+    make, made = makes({1.0: {5: 4.0}})
+    box = Bank(make, [{"speed": 1.0}, {"speed": 1.02}, {"speed": 1.06}], warm_up=2.0)
+    x = x_of(box, range(9))
+    np.testing.assert_allclose(np.diff(x), [1, 1, 1, 1, 1.06, 1, 1, 1], atol=1e-12)
+    assert box.restarts == 1
+    # Scans 3, 4 and 5 lie within two seconds.
+    assert made[0].starts == [(0, 0.0), (3, 3.0)]
+    assert made[0].seen[-7:] == [5, 3, 4, 5, 6, 7, 8]
+
+
+def test_without_a_majority_the_chosen_one_is_believed():
+    make, _ = makes()
+    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=2.0)
+    assert x_of(box, range(5), {3: {"speed": 3.0}}) == [0, 1, 2, 5, 8]
+    assert box.restarts == 0
+
+
+@pytest.mark.parametrize("chosen", [1.0, 3.0])
+def test_no_pose_is_worse_than_any(chosen):
+    make, _ = makes({1.0: {3: np.nan}})
+    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=2.0)
+    x = x_of(box, range(6), {0: {"speed": chosen}})
+    assert np.diff(x).tolist() == [chosen, chosen, 3.0, chosen, chosen]
+    assert box.restarts == 1
+
+
+def test_no_pose_at_all_is_told():
+    make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
+    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=2.0)
+    x = x_of(box, range(4))
+    assert np.isnan(x[3])
+    # The caller starts it anew.
+    T = np.eye(4)
+    T[0, 3] = 7.0
+    box.start(box.prepare(at(3)), T)
+    assert box.register(box.prepare(at(4))).T_odom_sensor[0, 3] == 8.0
+
+
+def test_a_bank_has_no_other_sets():
+    make, _ = makes()
+    with pytest.raises(OdometryError, match="no instance of the bank has the parameters"):
+        Bank(make, [{"speed": 1.0}], 1.0).configure({"speed": 2.0})
+
+
+def drive(box, switch=None, n=30):
+    poses = [np.eye(4)]
+    for i in range(n):
+        if switch and i and i % 5 == 0:
+            box.configure(switch[i // 5 % len(switch)])
+        prepared = box.prepare(turns.turn(i % 15))
+        if i == 0:
+            box.start(prepared, np.eye(4))
+        else:
+            poses.append(box.register(prepared).T_odom_sensor)
+    return np.array(poses)
+
+
+def test_a_bank_of_equal_instances_is_the_single_run_bit_by_bit():
+    bank = Bank(lambda _: KeyframeGicp(NEAR), [NEAR, FAR], warm_up=1.0)
+    switched = drive(bank, [NEAR, FAR], n=15)
+    np.testing.assert_array_equal(switched, drive(KeyframeGicp(NEAR), n=15))
+
+
+@pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
+def test_real_odometries_go_straight_on(mechanism):
+    if mechanism == "bank":
+        box = Bank(KeyframeGicp, [NEAR, FAR, {**NEAR, "keyframe_interval": 2.0}], warm_up=0.5)
+    else:
+        box = HandOver(KeyframeGicp, NEAR, warm_up=0.5)
+    poses = drive(box, [FAR, NEAR], n=15)
+    steps = invert(poses[:-1]) @ poses[1:]
+    np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
+    np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)
