@@ -58,6 +58,8 @@ class Trial:
         False where the scan was too poor.
     seconds : ndarray of shape (n,)
         What the odometry took for each scan, without preparing it.
+    faults : tuple of str
+        What ended the odometry's process, or was no pose, each with the odometry's last words.
     """
 
     parameters: ParameterSet
@@ -66,6 +68,7 @@ class Trial:
     restarted: NDArray[np.bool_]
     registered: NDArray[np.bool_]
     seconds: NDArray[np.float64]
+    faults: tuple[str, ...] = ()
 
     @property
     def mean_error(self) -> float:
@@ -128,6 +131,7 @@ class Archive:
                 restarted=trial.restarted,
                 registered=trial.registered,
                 seconds=trial.seconds.astype(np.float32),
+                faults=np.frombuffer(json.dumps(trial.faults).encode(), np.uint8),
             )
 
     def read(self, sequence: str, number: int, whole: bool = False) -> Trial:
@@ -147,6 +151,7 @@ class Archive:
                 data["restarted"],
                 data["registered"],
                 data["seconds"].astype(np.float64),
+                tuple(json.loads(data["faults"].tobytes())),
             )
         except (KeyError, ValueError) as error:
             raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error

@@ -15,7 +15,16 @@ from adaptune import yaml
 from adaptune.cores import available
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.odometry import BaseSettings, HealthCheck, Odometry, OdometryError, box_class
+from adaptune.odometry import (
+    BaseSettings,
+    Box,
+    HealthCheck,
+    Isolated,
+    Limits,
+    Odometry,
+    OdometryError,
+    box_class,
+)
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.simulation import Course
 from adaptune.space import ParameterSet, ParameterSpace, nearest
@@ -126,6 +135,8 @@ class StudyConfig(_Section):
     health : HealthCheck
         In a replay, a step that the platform cannot have made; the odometry is started anew at its
         last healthy motion.
+    isolation : Limits
+        What an odometry may take that runs in a process of its own.
     """
 
     odometry: OdometryConfig
@@ -136,6 +147,7 @@ class StudyConfig(_Section):
     sub_trajectory: float = Field(25.0, gt=0)
     lost_track: float = Field(3.0, gt=0)
     health: HealthCheck = HealthCheck()
+    isolation: Limits = Limits()
     offline: OfflineConfig = OfflineConfig()
     online: OnlineConfig = OnlineConfig()
 
@@ -179,9 +191,12 @@ class Study:
             {name: _complete(self.box.space, name, given) for name, given in tuned.items()}
         )
 
-    def odometry(self, parameters: ParameterSet | None = None) -> Odometry:
+    def odometry(self, parameters: ParameterSet | None = None) -> Box:
         """A new instance with these parameters; those not given keep their baseline."""
-        return self.box(self.space.baseline | (parameters or {}), self.settings)
+        given = self.space.baseline | (parameters or {})
+        if self.box.clean:
+            return self.box(given, self.settings)
+        return Isolated(self.config.odometry.name, given, self.settings, self.config.isolation)
 
     @cached_property
     def mechanism(self) -> Literal["live", "hand_over", "bank"]:

@@ -11,7 +11,7 @@ from adaptune.descriptor import ndt_histogram
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import sub_trajectory_rte, window_ends
-from adaptune.odometry import Odometry
+from adaptune.odometry import Box, Isolated
 from adaptune.odometry.base import prepared_bytes
 from adaptune.space import ParameterSet
 from adaptune.study import Study
@@ -109,7 +109,7 @@ def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
 class _Run:
     """An odometry on its way along a sequence."""
 
-    def __init__(self, odometry: Odometry, frames: Frames, lost_track: float | None):
+    def __init__(self, odometry: Box, frames: Frames, lost_track: float | None):
         n = len(frames.stamps)
         self.odometry = odometry
         self.T_odom_sensor = np.empty((n, 4, 4))
@@ -130,18 +130,31 @@ class _Run:
         begin = time.perf_counter()
         T, self.registered[i] = self.odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
+        if not np.isfinite(T).all():
+            self._go_on(i, prepared)
+            return
         if self._lost(i, T):
             T = self._T_ref_sensor[i]
             self.odometry.start(prepared, T, self._T_ref_steps[i - 1])
             self.restarted[i] = True
         self.T_odom_sensor[i] = T
 
+    def _go_on(self, i: int, prepared: Any) -> None:
+        """Start anew where there is no pose: at the reference, else where the last pose was."""
+        known = not np.isnan(self._T_ref_steps[i - 1]).any()
+        T = self._T_ref_sensor[i] if known else self.T_odom_sensor[i - 1]
+        if np.isinf(self._bounds[i - 1]):
+            T = self.T_odom_sensor[i - 1]  # a whole run is not helped by the reference
+        else:
+            self.restarted[i] = True
+        self.odometry.start(prepared, T)
+        self.T_odom_sensor[i] = T
+
     def _lost(self, i: int, T_odom_sensor: Poses) -> bool:
         T_previous_current = invert(self.T_odom_sensor[i - 1]) @ T_odom_sensor
         departure = T_previous_current[:3, 3] - self._T_ref_steps[i - 1, :3, 3]
         if np.isnan(departure).any():
-            # Without a reference nothing can be said, unless the odometry itself talks nonsense.
-            return False
+            return False  # without a reference nothing can be said
         return bool(np.linalg.norm(departure) > self._bounds[i - 1])
 
 
@@ -181,6 +194,7 @@ def run_trials(
             run.restarted,
             run.registered,
             run.seconds,
+            tuple(run.odometry.faults) if isinstance(run.odometry, Isolated) else (),
         )
         for parameters, run in zip(sets, runs, strict=True)
     ]

@@ -2,6 +2,7 @@
 
 from adaptune.odometry.base import BaseSettings, Box, Odometry, OdometryError, Registration
 from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import BOXES, box_class
 from adaptune.odometry.switching import Bank, HandOver
 
@@ -12,6 +13,8 @@ __all__ = [
     "Box",
     "HandOver",
     "HealthCheck",
+    "Isolated",
+    "Limits",
     "Odometry",
     "OdometryError",
     "Registration",

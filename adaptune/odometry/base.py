@@ -69,8 +69,8 @@ class Odometry(ABC):
     live : bool
         Whether `configure` may be called between scans; class attribute.
     clean : bool
-        Whether a second instance in the same process knows nothing of the first, and cannot take
-        the process down with it; class attribute. One that is not clean runs in a process of its
+        Whether a second instance in the same process knows nothing of the first, and no scan ends
+        the process; class attribute. One that is not known to be clean runs in a process of its
         own.
     parameters : dict
         The present value of every parameter in `space`.
@@ -87,7 +87,7 @@ class Odometry(ABC):
     space: ClassVar[ParameterSpace]
     settings_type: ClassVar[type[BaseSettings]] = BaseSettings
     live: ClassVar[bool]
-    clean: ClassVar[bool] = True
+    clean: ClassVar[bool] = False
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -139,7 +139,11 @@ class Odometry(ABC):
 
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
+    if isinstance(prepared, Scan):
+        prepared = (prepared.points, prepared.times, prepared.rings)
     if isinstance(prepared, tuple):
         return sum(map(prepared_bytes, prepared))
+    if prepared is None:
+        return 0
     size = getattr(prepared, "nbytes", None)
     return int(size) if size is not None else 1_000_000

@@ -135,7 +135,7 @@ class Pipeline(Odometry):
 
     settings_type: ClassVar[type[BaseSettings]] = Settings
     live = False
-    # Unexpected scans end the process, and some pipelines keep state that all instances share.
+    # Some end the process at scans they did not expect, some keep what all instances share.
     clean = False
     pipeline: ClassVar[str]
     untuned: ClassVar[ParameterSet]

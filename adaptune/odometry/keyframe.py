@@ -24,6 +24,7 @@ class KeyframeOdometry(Odometry):
     """
 
     live = True
+    clean = True
 
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None

@@ -42,6 +42,7 @@ class Kiss(Odometry):
     )
     settings_type: ClassVar[type[BaseSettings]] = Settings
     live = True
+    clean = True
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None

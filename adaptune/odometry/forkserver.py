@@ -1,0 +1,116 @@
+"""Forks processes in which odometries live, see `adaptune.odometry.isolation`.
+
+Run with the number of a socket and the name of an odometry. It imports the odometry, and for
+every socket that comes forks a watcher, which forks the instance and tells what became of it.
+"""
+
+import contextlib
+import os
+import resource
+import signal
+import socket
+import sys
+import tempfile
+from pathlib import Path
+from typing import BinaryIO, NoReturn
+
+from adaptune.odometry import wire
+from adaptune.odometry.base import OdometryError
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.registry import box_class
+
+_LINES = 5
+
+
+def main(control: socket.socket, name: str) -> None:
+    """Fork an instance for every socket that comes, until none can come any more."""
+    # What cannot be imported is told by the instance that needs it.
+    with contextlib.suppress(OdometryError):
+        box_class(name)
+    while True:
+        limits, sockets, _, _ = socket.recv_fds(control, 1 << 12, 1)
+        if not sockets:
+            return
+        if os.fork() == 0:
+            control.close()
+            with socket.socket(fileno=sockets[0]) as connection:
+                _watch(connection, Limits.model_validate_json(limits))
+            os._exit(0)
+        os.close(sockets[0])
+        # Watchers that have ended are not to stay as zombies.
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG) != (0, 0):
+                pass
+
+
+def _watch(connection: socket.socket, limits: Limits) -> None:
+    """Run an instance in a child, and tell what became of it should it not end well."""
+    with tempfile.TemporaryFile() as output:
+        child = os.fork()
+        if child == 0:
+            _run(connection, output.fileno(), limits)
+        _, status = os.waitpid(child, 0)
+        if status:
+            output.seek(0)
+            last = output.read().decode(errors="replace").strip().splitlines()[-_LINES:]
+            what = _verdict(status, limits) + (": " + " | ".join(last) if last else "")
+            with contextlib.suppress(OSError), connection.makefile("wb") as writer:
+                wire.send(writer, {"type": "fault", "message": what})
+
+
+def _verdict(status: int, limits: Limits) -> str:
+    if not os.WIFSIGNALED(status):
+        return f"its process ended with code {os.waitstatus_to_exitcode(status)}"
+    number = os.WTERMSIG(status)
+    if number == signal.SIGALRM:
+        return f"a scan took longer than isolation.seconds = {limits.seconds:g}"
+    return f"its process was ended by {signal.Signals(number).name}"
+
+
+def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:
+    """Answer messages and end the process."""
+    code = 1
+    try:
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        _bound_memory(limits.memory)
+        with connection.makefile("rb") as reader, connection.makefile("wb") as writer:
+            wire.serve(_Timed(reader, limits.seconds), writer)
+        code = 0
+    except MemoryError:
+        os.write(2, f"\nout of isolation.memory = {limits.memory:g} GB\n".encode())
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        sys.stderr.flush()
+    finally:
+        # What is registered to run at exit is the server's.
+        os._exit(code)
+
+
+def _bound_memory(gigabytes: float) -> None:
+    statm = Path("/proc/self/statm")
+    now = int(statm.read_text().split()[0]) * resource.getpagesize() if statm.exists() else 0
+    bound = now + int(gigabytes * 1e9)
+    resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
+
+
+class _Timed:
+    """A stream behind which a clock runs from every read to the next; at its end the process dies.
+
+    No handler is set, so that the signal works inside compiled code too.
+    """
+
+    def __init__(self, stream: BinaryIO, seconds: float):
+        self._stream = stream
+        self._seconds = seconds
+
+    def read(self, size: int) -> bytes:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        data = self._stream.read(size)
+        signal.setitimer(signal.ITIMER_REAL, self._seconds)
+        return data
+
+
+if __name__ == "__main__":
+    main(socket.socket(fileno=int(sys.argv[1])), sys.argv[2])

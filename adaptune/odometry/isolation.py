@@ -1,0 +1,205 @@
+"""Odometries in processes of their own, which may end without taking anything with them.
+
+A small server that has imported the odometry forks a fresh process for every start: that takes
+milliseconds, and what an odometry keeps beside its instances is gone with its process.
+"""
+
+import contextlib
+import logging
+import os
+import socket
+import subprocess
+import sys
+from functools import cache
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from adaptune.geometry import Poses
+from adaptune.odometry import wire
+from adaptune.odometry.base import BaseSettings, OdometryError, Registration
+from adaptune.odometry.registry import box_class
+from adaptune.sequence import Scan
+from adaptune.space import ParameterSet
+
+MOST_FAULTS = 10
+"""After so many an instance is not started again: what is left of its sequence is lost."""
+
+_SHAKE = 1e-3
+"""By which a rotation times its transpose may depart from the identity."""
+
+_log = logging.getLogger(__name__)
+
+
+class Limits(BaseModel):
+    """What an odometry in a process of its own may take.
+
+    Attributes
+    ----------
+    seconds : float
+        For one scan.
+    memory : float
+        Gigabytes, beside what the process begins with.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    seconds: float = Field(10.0, gt=0)
+    memory: float = Field(4.0, gt=0)
+
+
+class Isolated:
+    """An odometry that lives in another process, a new one with every start.
+
+    What ends that process, or makes no sense as a pose, is a *fault*: the pose of that scan is
+    NaN, and so are all that follow until a new start.
+
+    Parameters
+    ----------
+    name
+        Of the odometry.
+    parameters, settings
+        See `Odometry`.
+    limits
+        What it may take.
+
+    Attributes
+    ----------
+    faults : list of str
+        What went wrong, each with the last lines that the odometry wrote.
+    """
+
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
+        self.name = name
+        self.parameters = box_class(name).space.baseline | parameters
+        self.faults: list[str] = []
+        self._settings = settings
+        self._limits = limits
+        self._stream: BinaryIO | None = None
+
+    def prepare(self, scan: Scan) -> Scan:
+        """See `Odometry.prepare`; the other process prepares."""
+        return scan
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """See `Odometry.start`.
+
+        Raises
+        ------
+        OdometryError
+            If the odometry refuses its parameters or the scan.
+        """
+        self.close()
+        if len(self.faults) >= MOST_FAULTS:
+            return
+        self._stream = _fork(self.name, self._limits)
+        self._ask(
+            {
+                "type": "hello",
+                "version": wire.VERSION,
+                "odometry": self.name,
+                "parameters": self.parameters,
+                "settings": self._settings.model_dump(mode="json"),
+            }
+        )
+        self._ask(
+            {"type": "start", "stamp": prepared.stamp},
+            **wire.scan_arrays(prepared),
+            pose=T_odom_sensor,
+            motion=T_previous_current,
+        )
+
+    def register(self, prepared: Scan) -> Registration:
+        """See `Odometry.register`."""
+        answer = self._ask(
+            {"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared)
+        )
+        if answer is None:
+            return Registration(np.full((4, 4), np.nan), registered=False)
+        T_odom_sensor = answer.arrays["pose"]
+        if nonsense := _nonsense(T_odom_sensor):
+            self._fault(nonsense)
+            return Registration(np.full((4, 4), np.nan), registered=False)
+        return Registration(T_odom_sensor.copy(), answer.header["registered"])
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """See `Odometry.configure`."""
+        self.parameters |= parameters
+        self._ask({"type": "configure", "parameters": parameters})
+
+    def close(self) -> None:
+        """End the other process."""
+        if self._stream is not None:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            self._stream = None
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _ask(self, header: dict[str, Any], **arrays: Any) -> wire.Message | None:
+        """Send a message and wait for the answer; None if there is none any more."""
+        if self._stream is None:
+            return None
+        # One that does not listen any more has told why, or will have ended.
+        with contextlib.suppress(OSError):
+            wire.send(self._stream, header, **arrays)
+        try:
+            answer = wire.receive(self._stream)
+        except (OSError, wire.WireError):
+            answer = None
+        if answer is None or answer.header["type"] == "fault":
+            self._fault("its process ended" if answer is None else answer.header["message"])
+            return None
+        if answer.header["type"] == "refused":
+            raise OdometryError(f"{self.name}: {answer.header['message']}")
+        return answer
+
+    def _fault(self, what: str) -> None:
+        self.close()
+        self.faults.append(what)
+        _log.warning("%s with %s: %s", self.name, self.parameters, what)
+        if len(self.faults) == MOST_FAULTS:
+            _log.warning("%s: that was fault number %d, giving up", self.name, MOST_FAULTS)
+
+
+def _nonsense(T_odom_sensor: Poses) -> str | None:
+    """What is wrong with a pose, if anything."""
+    if T_odom_sensor.shape != (4, 4):
+        return f"it gave a pose of shape {T_odom_sensor.shape}"
+    if not np.isfinite(T_odom_sensor).all():
+        return "it gave a pose that is not finite"
+    R = T_odom_sensor[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _SHAKE or np.linalg.det(R) < 0:
+        return "it gave a pose that is not rigid"
+    return None
+
+
+@cache
+def _server(name: str) -> socket.socket:
+    """The end of this process of a socket to the server that forks instances of an odometry."""
+    here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
+    # The odometries must not start threads of their own.
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    path = os.pathsep.join(filter(None, sys.path))
+    with there:
+        subprocess.Popen(
+            [sys.executable, "-m", "adaptune.odometry.forkserver", str(there.fileno()), name],
+            pass_fds=[there.fileno()],
+            stdin=subprocess.DEVNULL,
+            env=os.environ | threads | {"PYTHONPATH": path},
+            # Ctrl-C is for the process that drives.
+            start_new_session=True,
+        )
+    return here
+
+
+def _fork(name: str, limits: Limits) -> BinaryIO:
+    """A stream to a fresh process."""
+    here, there = socket.socketpair()
+    with here, there:
+        socket.send_fds(_server(name), [limits.model_dump_json().encode()], [there.fileno()])
+        return cast("BinaryIO", here.makefile("rwb"))

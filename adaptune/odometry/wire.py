@@ -1,0 +1,175 @@
+r"""Messages between a program and an odometry in another process, version 1.
+
+Each message is a JSON header and the raw bytes of arrays::
+
+    uint32   bytes of the header, little-endian
+    header   UTF-8 JSON: {"type": ..., "arrays": [[name, dtype, shape], ...], ...}
+    arrays   one after the other, C order, little-endian
+
+The odometry answers each message with one of its own:
+
+=============  =======================================================  =========================
+type           holds                                                    answer
+=============  =======================================================  =========================
+``hello``      version, odometry, parameters, settings                  ``done``: version, live
+``start``      stamp, points, times?, rings?, pose, motion?             ``done``
+``register``   stamp, points, times?, rings?                            ``pose``: registered, pose
+``configure``  parameters                                               ``done``
+=============  =======================================================  =========================
+
+or with ``refused`` and a ``message``, where it cannot do what is asked. Points are float32 of
+shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16, poses and motions
+float64 of shape (4, 4), stamps integer nanoseconds. The other side ends by closing the stream.
+"""
+
+import json
+import struct
+from collections.abc import Mapping
+from typing import Any, BinaryIO, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses
+from adaptune.odometry.base import Odometry, OdometryError
+from adaptune.odometry.registry import box_class
+from adaptune.sequence import Scan
+
+VERSION = 1
+_LENGTH = struct.Struct("<I")
+_LONGEST_HEADER = 1 << 24
+
+
+class Readable(Protocol):
+    """What messages are read from."""
+
+    def read(self, size: int, /) -> bytes:
+        """Read so many bytes, less only at the end."""
+
+
+class WireError(AdaptuneError):
+    """A stream that does not hold messages of this version."""
+
+
+class Message(NamedTuple):
+    """A message.
+
+    Attributes
+    ----------
+    header : dict
+        With its ``type``.
+    arrays : dict of ndarray
+    """
+
+    header: dict[str, Any]
+    arrays: dict[str, NDArray[Any]]
+
+
+def send(stream: BinaryIO, header: Mapping[str, Any], **arrays: NDArray[Any] | None) -> None:
+    """Write a message; arrays that are None are left out."""
+    given = {name: np.ascontiguousarray(a) for name, a in arrays.items() if a is not None}
+    layout = [[name, a.dtype.str, list(a.shape)] for name, a in given.items()]
+    encoded = json.dumps({**header, "arrays": layout}).encode()
+    stream.write(_LENGTH.pack(len(encoded)) + encoded)
+    stream.writelines(a.data.cast("B") for a in given.values() if a.size)
+    stream.flush()
+
+
+def receive(stream: Readable) -> Message | None:
+    """Read a message, or None where the stream has ended.
+
+    Raises
+    ------
+    WireError
+        If the stream holds something else, or ends in the middle.
+    """
+    first = stream.read(_LENGTH.size)
+    if not first:
+        return None
+    try:
+        (length,) = _LENGTH.unpack(first)
+        if length > _LONGEST_HEADER:
+            raise WireError("the stream holds no message of adaptune's: write nothing else to it")
+        header = json.loads(_exactly(stream, length))
+        arrays = {
+            name: np.frombuffer(
+                _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize), kind
+            ).reshape(shape)
+            for name, kind, shape in header.pop("arrays")
+        }
+    except (struct.error, ValueError, KeyError, TypeError) as error:
+        raise WireError(f"the stream holds no message of adaptune's ({error})") from error
+    return Message(header, arrays)
+
+
+def _exactly(stream: Readable, size: int) -> bytes:
+    data = stream.read(size)
+    if len(data) < size:
+        raise WireError("the stream ends in the middle of a message")
+    return data
+
+
+def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
+    """What a message holds of a scan beside its stamp."""
+    return {"points": scan.points, "times": scan.times, "rings": scan.rings}
+
+
+def _scan(message: Message) -> Scan:
+    arrays = message.arrays
+    return Scan(message.header["stamp"], arrays["points"], arrays.get("times"), arrays.get("rings"))
+
+
+def serve(reader: Readable, writer: BinaryIO) -> None:
+    """Answer messages with an odometry until the stream ends.
+
+    Parameters
+    ----------
+    reader, writer
+        Nothing else may read or write them.
+
+    Raises
+    ------
+    WireError
+        If what comes is no message.
+    """
+    box: Odometry | None = None
+    while (message := receive(reader)) is not None:
+        header = message.header
+        try:
+            if header["type"] == "hello":
+                box = _make(header)
+                send(writer, {"type": "done", "version": VERSION, "live": box.live})
+            elif box is None:
+                raise OdometryError("the first message must be a hello")
+            else:
+                _answer(box, message, writer)
+        except AdaptuneError as error:
+            send(writer, {"type": "refused", "message": str(error)})
+
+
+def _make(hello: Mapping[str, Any]) -> Odometry:
+    if hello["version"] != VERSION:
+        raise OdometryError(
+            f"this adaptune speaks version {VERSION} of the protocol, not {hello['version']}"
+        )
+    cls = box_class(hello["odometry"])
+    return cls(hello["parameters"], cls.settings_type.model_validate(hello["settings"]))
+
+
+def _answer(box: Odometry, message: Message, writer: BinaryIO) -> None:
+    header, arrays = message
+    if header["type"] == "register":
+        T_odom_sensor, registered = box.register(box.prepare(_scan(message)))
+        pose: Poses = np.asarray(T_odom_sensor, np.float64)
+        send(writer, {"type": "pose", "registered": bool(registered)}, pose=pose)
+        return
+    if header["type"] == "start":
+        # Arrays from the stream are read-only; poses are an odometry's own to keep.
+        motion = arrays["motion"].copy() if "motion" in arrays else None
+        box.start(box.prepare(_scan(message)), arrays["pose"].copy(), motion)
+    elif header["type"] == "configure":
+        box.configure(header["parameters"])
+    else:
+        raise OdometryError(f"there is no message of type {header['type']!r}")
+    send(writer, {"type": "done"})

@@ -1,0 +1,83 @@
+"""An odometry that goes wrong in the way, and at the scan, that it is told to."""
+
+import ctypes
+import os
+import sys
+import time
+
+import numpy as np
+
+from adaptune.odometry import BaseSettings, Odometry, Registration
+from adaptune.space import Float, ParameterSpace
+
+FAULTS = (
+    "abort",
+    "segmentation fault",
+    "exit",
+    "raise",
+    "hang",
+    "memory",
+    "NaN",
+    "not rigid",
+    "mirrored",
+    "shape",
+)
+n_instances = 0
+
+
+class Settings(BaseSettings):
+    fault: str = "none"
+    at: int = 300_000_000
+
+
+class Faulty(Odometry):
+    """Drives 0.1 m along x with every scan."""
+
+    space = ParameterSpace({"x": Float(low=0.0, high=1.0, baseline=0.5)})
+    settings_type = Settings
+    live = True
+
+    def __init__(self, *args):
+        global n_instances  # noqa: PLW0603
+        super().__init__(*args)
+        n_instances += 1
+
+    def prepare(self, scan):
+        return scan
+
+    def start(self, prepared, T_odom_sensor, T_previous_current=None):
+        self.T, self.began_with = T_odom_sensor, (prepared, T_previous_current)
+        if self.settings.fault == "never begins":
+            os.abort()
+
+    def register(self, prepared):
+        self.T = self.T.copy()
+        self.T[0, 3] += 0.1 if self.parameters["x"] < 0.9 else 0.3
+        T = self.T.copy()
+        if prepared.stamp == self.settings.at:
+            os.write(1, b"about to go wrong\n")
+            self.go_wrong(T)
+        if self.settings.fault == "shape":
+            T = T[:3]
+        return Registration(T, n_instances == 1)
+
+    def go_wrong(self, T):
+        match self.settings.fault:
+            case "abort":
+                os.abort()
+            case "segmentation fault":
+                ctypes.string_at(0)
+            case "exit":
+                sys.exit(0)
+            case "raise":
+                raise RuntimeError("no planes here")
+            case "hang":
+                time.sleep(60)
+            case "memory":
+                np.ones(1 << 30)
+            case "NaN":
+                T[0, 3] = np.nan
+            case "not rigid":
+                T[:3, :3] *= 1.1
+            case "mirrored":
+                T[2, 2] = -1.0

@@ -1,0 +1,208 @@
+import io
+import re
+import time
+
+import drives
+import faulty
+import numpy as np
+import pytest
+import turns
+
+from adaptune.archive import Archive
+from adaptune.odometry import HealthCheck, Isolated, Limits, OdometryError, wire
+from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.sequence import Scan
+from adaptune.study import load_study
+from offline.trial import PreparedSequence, run_trials
+from offline.workers import Task, Workers
+from online.replay import replay
+
+TOLD = {
+    "abort": "ended by SIGABRT: about to go wrong",
+    "segmentation fault": "ended by SIGSEGV: about to go wrong",
+    "exit": "ended",
+    "raise": r"ended with code 1: .*RuntimeError: no planes here",
+    "hang": r"a scan took longer than isolation.seconds = 0\.3: about to go wrong",
+    "memory": r"out of isolation\.memory = 1 GB",
+    "NaN": "a pose that is not finite",
+    "not rigid": "a pose that is not rigid",
+    "mirrored": "a pose that is not rigid",
+    "shape": r"a pose of shape \(3, 4\)",
+}
+
+
+def isolated(fault, **parameters):
+    settings = faulty.Settings(fault=fault)
+    return Isolated("faulty:Faulty", parameters, settings, Limits(seconds=0.3, memory=1.0))
+
+
+def scan(i):
+    return Scan(i * 10**8, np.zeros((5, 3), np.float32))
+
+
+@pytest.mark.parametrize("fault", faulty.FAULTS)
+def test_every_fault_is_told_and_another_start_goes_on(fault):
+    box = isolated(fault)
+    box.start(scan(0), np.eye(4))
+    first = 1 if fault == "shape" else 3
+    for i in range(1, first):
+        assert box.register(scan(i)).T_odom_sensor[0, 3] == pytest.approx(0.1 * i)
+    for i in range(first, 6):
+        T, registered = box.register(scan(i))
+        assert np.isnan(T).all()
+        assert not registered
+    (told,) = box.faults
+
+    assert re.search(TOLD[fault], told), told
+    T = np.eye(4)
+    T[1, 3] = 4.0
+    box.start(scan(6), T)
+    if fault != "shape":
+        T, registered = box.register(scan(7))
+        np.testing.assert_allclose(T[:3, 3], [0.1, 4.0, 0.0])
+        # The class counts its instances in a variable of its module.
+        assert registered
+
+
+def test_one_that_cannot_begin_is_given_up():
+    box = isolated("never begins")
+    begin = time.perf_counter()
+    for _ in range(30):
+        box.start(scan(0), np.eye(4))
+        assert np.isnan(box.register(scan(1)).T_odom_sensor).all()
+    assert len(box.faults) == 10
+    assert time.perf_counter() - begin < 5.0
+
+
+def test_what_it_refuses_is_an_error():
+    box = Isolated("ndt", {}, faulty.Settings(), Limits())
+    box.name = "ntd"
+    with pytest.raises(OdometryError, match="ntd: there is no odometry 'ntd': did you mean 'ndt'"):
+        box.start(scan(0), np.eye(4))
+
+
+def test_parameters_change_between_scans():
+    box = isolated("none", x=0.1)
+    box.start(scan(0), np.eye(4))
+    assert box.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
+    box.configure({"x": 0.95})
+    assert box.register(scan(2)).T_odom_sensor[0, 3] == pytest.approx(0.4)
+    # A process that begins later has them too.
+    box.start(scan(3), np.eye(4))
+    assert box.register(scan(4)).T_odom_sensor[0, 3] == pytest.approx(0.3)
+
+
+def test_it_is_the_same_odometry_in_another_process():
+    here = KeyframeGicp({"keyframe_interval": 1.0})
+    there = Isolated("gicp", {"keyframe_interval": 1.0}, Settings(), Limits())
+    motion = np.eye(4)
+    motion[0, 3] = turns.STEP
+    here.start(here.prepare(turns.turn(0)), np.eye(4), motion)
+    there.start(there.prepare(turns.turn(0)), np.eye(4), motion)
+    for i in range(1, 10):
+        a = here.register(here.prepare(turns.turn(i)))
+        b = there.register(there.prepare(turns.turn(i)))
+        np.testing.assert_array_equal(a.T_odom_sensor, b.T_odom_sensor)
+        assert a.registered == b.registered
+
+
+def faulty_study(study_file, tmp_path, fault):
+    overrides = [
+        "odometry.name=faulty:Faulty",
+        "odometry.parameters=",
+        f"odometry.settings={{fault: {fault}, at: {drives.FIRST_STAMP + 12 * 10**8}}}",
+        "isolation={seconds: 0.3, memory: 1}",
+        "lost_track=100",
+    ]
+    return load_study(study_file, overrides, tmp_path / "study")
+
+
+def test_a_trial_keeps_its_faults_and_goes_on_at_the_reference(study_file, tmp_path):
+    study = faulty_study(study_file, tmp_path, "abort")
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(study, sequence, [{"x": 0.5}])
+    assert np.flatnonzero(trial.restarted).tolist() == [12]
+    np.testing.assert_array_equal(trial.T_odom_sensor[12], sequence.frames.T_ref_sensor[12])
+    assert "SIGABRT" in trial.faults[0]
+    assert np.isinf(trial.errors[5])
+    assert np.isfinite(trial.errors[14])
+    archive = Archive(tmp_path)
+    archive.write("one", 0, trial)
+    assert archive.read("one", 0).faults == trial.faults
+    (whole,) = run_trials(study, sequence, [{"x": 0.5}], whole=True)
+    assert np.isfinite(whole.errors[5])
+    assert whole.faults
+
+
+def test_the_campaign_goes_on(study_file, tmp_path):
+    study = faulty_study(study_file, tmp_path, "segmentation fault")
+    tasks = [Task("one", (n,), ({"x": 0.5},)) for n in range(2)]
+    with Workers(study, 1) as workers:
+        assert len(list(workers.run(tasks))) == 2
+    for n in range(2):
+        assert "SIGSEGV" in Archive(study.folder / "trials").read("one", n).faults[0]
+
+
+def test_a_replay_goes_on_at_the_last_healthy_motion():
+    result = replay([scan(i) for i in range(8)], isolated("hang"), HealthCheck())
+    assert np.flatnonzero(result.restarted).tolist() == [3]
+    np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], 0.1 * np.arange(8))
+
+
+def exchange(*messages):
+    """What a server answers to messages."""
+    sent, answered = io.BytesIO(), io.BytesIO()
+    for header, arrays in messages:
+        wire.send(sent, header, **arrays)
+    sent.seek(0)
+    wire.serve(sent, answered)
+    answered.seek(0)
+    answers = []
+    while (message := wire.receive(answered)) is not None:
+        answers.append(message)
+    return answers
+
+
+HELLO = {
+    "type": "hello",
+    "version": 1,
+    "odometry": "faulty:Faulty",
+    "parameters": {},
+    "settings": {},
+}
+
+
+def test_a_conversation():
+    points = {"points": np.zeros((0, 3), np.float32)}
+    pose = {"pose": np.eye(4)}
+    answers = exchange(
+        (HELLO, {}),
+        ({"type": "start", "stamp": 0}, points | pose),
+        ({"type": "configure", "parameters": {"x": 1.0}}, {}),
+        ({"type": "register", "stamp": 10**8}, points),
+    )
+    assert [a.header["type"] for a in answers] == ["done", "done", "done", "pose"]
+    assert answers[0].header["live"] is True
+    assert answers[3].arrays["pose"][0, 3] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [
+        ({"type": "register", "stamp": 0}, "the first message must be a hello"),
+        (HELLO | {"version": 2}, "speaks version 1 of the protocol, not 2"),
+        (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
+    ],
+)
+def test_what_a_server_refuses(first, message):
+    (answer,) = exchange((first, {}))
+    assert answer.header["type"] == "refused"
+    assert message in answer.header["message"]
+
+
+@pytest.mark.parametrize(
+    "data", [b"Hello, world!", b"\x02\0\0\0{}", b"\x05\0\0\0{}", b"\x01", b"\x03\0\0\0[1]"]
+)
+def test_what_is_no_message(data):
+    with pytest.raises(wire.WireError, match="the stream"):
+        wire.receive(io.BytesIO(data))
