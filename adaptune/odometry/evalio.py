@@ -4,6 +4,7 @@ Points go over as raw bytes, not one Python object each; the conversion is evali
 PointCloud2 messages, which it does not document: hence the pinned version.
 """
 
+import contextlib
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
@@ -116,6 +117,11 @@ def _evalio() -> Any:
         for name in POINT.names
     ]
     return pipelines, types, helpers, fields
+
+
+with contextlib.suppress(OdometryError):
+    # Processes that are forked from one that has this module find it loaded.
+    _evalio()
 
 
 class Pipeline(Odometry):
