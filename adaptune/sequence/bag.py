@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -91,6 +91,7 @@ def _in_folder(folder: Path) -> list[Path]:
     raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
 
 
+@cache
 def _typestore() -> Any:
     """What messages of ROS 2 bags are when the bags themselves do not tell."""
     store = get_typestore(Stores.ROS2_HUMBLE)

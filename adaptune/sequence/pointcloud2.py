@@ -1,7 +1,8 @@
 """sensor_msgs/PointCloud2 to scans."""
 
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -128,32 +129,86 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         If x, y or z are not single numbers, or the times cannot be.
     """
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
-    columns = {
-        "times": next((raw[name] for name in TIME_FIELDS if name in names), None),
-        "rings": next((raw[name] for name in RING_FIELDS if name in names), None),
-    }
-    xyz = [raw[axis] for axis in "xyz"]
-    for column in (*xyz, *columns.values()):
-        if column is not None and (column.ndim != 1 or column.dtype.kind not in "iuf"):
-            raise PointCloudError("a coordinate, time or ring of a point is not a single number")
-    points = np.empty((len(xyz[0]), 3), np.float32)
+    time = next((name for name in TIME_FIELDS if name in names), None)
+    ring = next((name for name in RING_FIELDS if name in names), None)
+    for name in (*"xyz", time, ring):
+        if name and (raw[name].ndim != 1 or raw[name].dtype.kind not in "iuf"):
+            raise PointCloudError(f"field {name!r} is not one number for each point")
     with np.errstate(over="ignore", invalid="ignore"):
-        for i, column in enumerate(xyz):
-            points[:, i] = column
-        # One number tells all: NaN or infinite if any coordinate is, zero if all of them are.
-        squares = np.einsum("ij,ij->i", points, points)
-    valid = (squares > 0) & (squares < np.inf)
-    times, rings = columns["times"], columns["rings"]
-    if times is not None and times.dtype.kind == "f":
-        valid &= np.isfinite(times)
-    if not valid.all():
-        index = np.flatnonzero(valid)
-        points = points.take(index, axis=0)
+        x, y, z = (np.asarray(raw[axis], np.float32) for axis in "xyz")
+        times = None if time is None else _native(raw[time])
+        rings = None if ring is None else np.ascontiguousarray(raw[ring], np.uint16)
+    points = np.empty((len(x), 3), np.float32)
+    gather, compact = _kernels()
+    if invalid := gather(x, y, z, points):
+        index = np.empty(len(points), np.int64)
+        compact(points, index)
+        count = len(points) - invalid
+        points, index = points[:count].copy(), index[:count]
         times = None if times is None else times.take(index)
         rings = None if rings is None else rings.take(index)
+    # The least and the greatest are not numbers if any is not.
+    if times is not None and times.size and not isfinite(times.min() - times.max()):
+        known = np.isfinite(times)
+        points, times = points[known], times[known]
+        rings = None if rings is None else rings[known]
     try:
         start, seconds = timing.resolve(stamp, times)
     except TimingError as error:
         raise PointCloudError(str(error)) from error
-    with np.errstate(invalid="ignore"):
-        return Scan(start, points, seconds, None if rings is None else rings.astype(np.uint16))
+    return Scan(start, points, seconds, rings)
+
+
+def _native(values: NDArray[Any]) -> NDArray[Any]:
+    """Values in the machine's byte order, without gaps."""
+    return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+
+
+# Single precision keeps the loops fast.
+_ZERO, _INFINITE = np.float32(0.0), np.float32(np.inf)
+
+
+def _gather(
+    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], out: NDArray[np.float32]
+) -> int:
+    """Put coordinates side by side, and count the points that are not valid."""
+    count = 0
+    for i in range(len(x)):
+        a, b, c = x[i], y[i], z[i]
+        out[i, 0] = a
+        out[i, 1] = b
+        out[i, 2] = c
+        # Not a number or infinite if any coordinate is, zero if all of them are.
+        square = a * a + b * b + c * c
+        if not (square > _ZERO and square < _INFINITE):
+            count += 1
+    return count
+
+
+def _compact(points: NDArray[np.float32], index: NDArray[np.int64]) -> None:
+    """Move the valid points, and where they were, to the front."""
+    count = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        points[count, 0] = x
+        points[count, 1] = y
+        points[count, 2] = z
+        index[count] = i
+        square = x * x + y * y + z * z
+        # The next point takes the place of one that is not valid.
+        if _ZERO < square < _INFINITE:
+            count += 1
+
+
+@cache
+def _kernels() -> tuple[Callable[..., int], Callable[..., None]]:
+    # Importing numba takes a while, and a bag may never be read.
+    import numba
+
+    # Fields lie at any offset; what is aligned may be taken for what is not.
+    column = numba.types.Array(numba.float32, 1, "A", readonly=True, aligned=False)
+    points = numba.types.Array(numba.float32, 2, "C")
+    index = numba.types.Array(numba.int64, 1, "C")
+    gather: Any = numba.njit(numba.int64(column, column, column, points), nogil=True, cache=True)
+    compact: Any = numba.njit(numba.void(points, index), nogil=True, cache=True)
+    return gather(_gather), compact(_compact)
