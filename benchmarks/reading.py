@@ -8,9 +8,6 @@ every figure is the best of several runs.
 
 import argparse
 import os
-import resource
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable

@@ -14,6 +14,7 @@ from adaptune.sequence.timing import AUTO, TIME_FIELDS, Timing, TimingError
 
 # The numbers of sensor_msgs/PointField's datatypes.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
 
 
@@ -42,6 +43,8 @@ def point_dtype(message: Any) -> np.dtype[Any]:
 def _point_dtype(
     fields: tuple[tuple[str, int, int, int], ...], bigendian: bool, point_step: int
 ) -> np.dtype[Any]:
+    if point_step > _LARGEST_POINT:
+        raise PointCloudError(f"a point of {point_step} bytes is none")
     names, formats, offsets = [], [], []
     for name, datatype, offset, count in fields:
         if datatype not in _DATATYPES:
@@ -148,7 +151,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         times = None if times is None else times.take(index)
         rings = None if rings is None else rings.take(index)
     # The least and the greatest are not numbers if any is not.
-    if times is not None and times.size and not isfinite(times.min() - times.max()):
+    if times is not None and times.size and not isfinite(times.min().item() - times.max().item()):
         known = np.isfinite(times)
         points, times = points[known], times[known]
         rings = None if rings is None else rings[known]

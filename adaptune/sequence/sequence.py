@@ -146,20 +146,33 @@ def in_order(frames: Iterable[Frame], repairs: Repairs) -> Iterator[Frame]:
     one scan, not all that follow.
     """
     last: Frame | None = None
-    held: Frame | None = None
+    doubtful: Frame | None = None
     for frame in frames:
-        if held is None or frame.stamp > held.stamp:
-            if held is not None:
-                yield held
-                last = held
-            held = frame
-        elif (last is None or frame.stamp > last.stamp) and _leap(last, held) > _leap(last, frame):
-            repairs.add(LEAP)
-            held = frame
-        else:
+        if doubtful is not None:
+            if frame.stamp > doubtful.stamp:
+                yield doubtful
+                last = doubtful
+            elif _leap(last, doubtful) > _leap(last, frame):
+                repairs.add(LEAP)
+            else:
+                repairs.add(BACKWARD)
+                continue
+            doubtful = None
+        if last is not None and frame.stamp <= last.stamp:
             repairs.add(BACKWARD)
-    if held is not None:
-        yield held
+        elif last is None or _leap(last, frame) > _DOUBT:
+            # The next one will tell. Others are not held back, so that they are decoded while
+            # their bytes are still in the processor's cache.
+            doubtful = frame
+        else:
+            yield frame
+            last = frame
+    if doubtful is not None:
+        yield doubtful
+
+
+# Nanoseconds; a recorder is seldom later than this.
+_DOUBT = 50_000_000
 
 
 def _leap(last: Frame | None, frame: Frame) -> int:
