@@ -264,6 +264,7 @@ def test_wrong_stamps_cost_the_fewest_scans_and_are_told(
     rec: Any,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
+    *,
     stamps: list[float],
     kept: list[float],
     told: str | None,
@@ -328,11 +329,11 @@ def file_of(folder: Path) -> Path:
 
 
 BROKEN = {
-    "no such file": lambda rec, tmp: tmp / "none.bag",
-    "a text": lambda rec, tmp: _text(tmp / "a.bag"),
-    "a bag of another kind": lambda rec, tmp: _text(tmp / "a.pcap"),
-    "empty file": lambda rec, tmp: _text(tmp / "a.bag", ""),
-    "empty folder": lambda rec, tmp: _folder(tmp / "a"),
+    "no such file": lambda _, tmp: tmp / "none.bag",
+    "a text": lambda _, tmp: _text(tmp / "a.bag"),
+    "a bag of another kind": lambda _, tmp: _text(tmp / "a.pcap"),
+    "empty file": lambda _, tmp: _text(tmp / "a.bag", ""),
+    "empty folder": lambda _, tmp: _folder(tmp / "a"),
     "cut short": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag"), 0.6),
     "cut short, LZ4": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag", compression="LZ4"), 0.5),
     "mcap cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.mcap")), 0.6),

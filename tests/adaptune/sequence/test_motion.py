@@ -74,7 +74,7 @@ def imu_and_trajectory(offset: float, seconds: float = 60.0) -> tuple[Imu, Traje
     imu = Imu(stamps, rates, np.zeros_like(rates))
     some = slice(2000, 8000, 20)
     T = np.tile(np.eye(4), (len(yaw[some]), 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("z", yaw[some]).as_matrix()
+    T[:, :3, :3] = Rotation.from_euler("z", yaw[some][:, None]).as_matrix()
     return imu, Trajectory(stamps[some] - round(offset * 1e9), T)
 
 
@@ -143,5 +143,5 @@ def test_an_imu_comes_in_si_units_with_its_place(rec: Any, tmp_path: Path) -> No
         SequenceConfig(bag=bag, imu={}, compensate="gyro", views=[{"transform": extrinsic}])
     )
     plain = list(open_sequence(SequenceConfig(bag=bag)))
-    assert not np.allclose(list(turned)[1].points, plain[1].points + [1, 2, 3], atol=1e-3)
+    assert not np.allclose(list(turned)[1].points, plain[1].points + np.array([1, 2, 3]), atol=1e-3)
     assert turned.imu() is not None

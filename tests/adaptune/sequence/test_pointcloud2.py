@@ -48,9 +48,15 @@ def layouts(draw: st.DrawFn) -> np.dtype[Any]:
 
 
 @settings(max_examples=150, deadline=None)
-@given(layouts(), st.integers(0, 20), st.integers(1, 3), st.integers(0, 9), st.data())
+@given(
+    dtype=layouts(),
+    width=st.integers(0, 20),
+    height=st.integers(1, 3),
+    padding=st.integers(0, 9),
+    data=st.data(),
+)
 def test_any_layout_gives_the_points_written(
-    rec: Any, dtype: np.dtype[Any], width: int, height: int, padding: int, data: st.DataObject
+    rec: Any, dtype: np.dtype[Any], width: int, *, height: int, padding: int, data: st.DataObject
 ) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
     raw = np.zeros((height, width), dtype)
@@ -137,7 +143,7 @@ DIALECTS = {
     ("field", "kind", "values", "stamp", "times", "shift"), DIALECTS.values(), ids=DIALECTS
 )
 def test_times_count_from_the_start_of_the_scan_in_every_dialect(
-    rec: Any, field: str, kind: str, values: list[float], stamp: int, times: Any, shift: float
+    rec: Any, *, field: str, kind: str, values: list[float], stamp: int, times: Any, shift: float
 ) -> None:
     scan = decode(rec.cloud(raw_of(len(values), **{field: (kind, values)}), stamp))
     expected = np.array(values) - values[0] if times is None else times
@@ -199,7 +205,7 @@ def field(rec: Any, *given: Any) -> Any:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (lambda rec: {"fields": []}, "no field x, y, z; there is none at all"),
+        (lambda _: {"fields": []}, "no field x, y, z; there is none at all"),
         (lambda rec: {"fields": [field(rec, a, 0, 7, 1) for a in "xy"]}, "no field z; there is x"),
         (lambda rec: {"fields": [field(rec, "x", 20, 7, 1)]}, "ends beyond"),
         (lambda rec: {"fields": [field(rec, "x", 2**32 - 1, 7, 1)]}, "ends beyond"),
@@ -207,10 +213,10 @@ def field(rec: Any, *given: Any) -> Any:
         (lambda rec: {"fields": [field(rec, "x", 0, 99, 1)]}, "unknown datatype 99"),
         (lambda rec: {"fields": [field(rec, "x", 0, 7, 1)] * 2}, "appears twice"),
         (lambda rec: {"fields": [field(rec, a, 0, 7, 2) for a in "xyz"]}, "not one number"),
-        (lambda rec: {"width": 2**32 - 1, "height": 2**32 - 1}, "need"),
-        (lambda rec: {"point_step": 0}, "ends beyond"),
-        (lambda rec: {"row_step": 2**32 - 1, "height": 2, "width": 30}, "need"),
-        (lambda rec: {"data": np.empty(0, np.uint8)}, "there are 0"),
+        (lambda _: {"width": 2**32 - 1, "height": 2**32 - 1}, "need"),
+        (lambda _: {"point_step": 0}, "ends beyond"),
+        (lambda _: {"row_step": 2**32 - 1, "height": 2, "width": 30}, "need"),
+        (lambda _: {"data": np.empty(0, np.uint8)}, "there are 0"),
     ],
 )
 def test_a_message_that_is_no_cloud_is_refused(rec: Any, changes: Any, message: str) -> None:

@@ -50,7 +50,7 @@ def test_drop_loses_its_share_by_its_seed_alone(rec: Any, bag: Path) -> None:
     assert tenths(rec, seen(bag, lossy, cut)) == [k for k in kept if 7 <= k < 12]
 
 
-def test_speed_changes_arrival_and_nothing_else(rec: Any, bag: Path) -> None:
+def test_speed_changes_arrival_and_nothing_else(bag: Path) -> None:
     plain = list(seen(bag))
     fast = seen(bag, {"speed": {"factor": 2, "start": 0.5, "stop": 1.0}})
     scans = list(fast)
@@ -62,7 +62,7 @@ def test_speed_changes_arrival_and_nothing_else(rec: Any, bag: Path) -> None:
     assert np.array_equal(seen(bag).played_at(stamps), stamps)
 
 
-def test_reverse_mirrors_scans_times_and_poses(rec: Any, bag: Path) -> None:
+def test_reverse_mirrors_scans_times_and_poses(bag: Path) -> None:
     plain, backward = list(seen(bag)), list(seen(bag, {"reverse": True}))
     assert len(backward) == 20
     assert all(np.diff([s.stamp for s in backward]) == 10**8)
