@@ -1,0 +1,137 @@
+"""What a simulated recording shall be."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from adaptune.errors import AdaptuneError
+from adaptune.simulation.motion import MOTIONS
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.sensors import SENSORS
+from adaptune.simulation.weather import WEATHERS
+
+LONGEST = 20_000.0
+"""Metres; a longer course is a mistake more often than a wish."""
+
+
+class SimulationError(AdaptuneError):
+    """A recording that cannot be made."""
+
+
+def _known(kind: str, name: str, names: object) -> str:
+    known = sorted(names)  # type: ignore[call-overload]
+    if name not in known:
+        raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(known)}")
+    return name
+
+
+class SceneLeg(BaseModel):
+    """One scene of a course.
+
+    Attributes
+    ----------
+    scene
+        A name from `SCENES`.
+    length
+        Metres driven in it; the course's own `length` when not given.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene: str
+    length: Annotated[float, Field(ge=10.0, le=LONGEST)] | None = None
+
+    @field_validator("scene")
+    @classmethod
+    def _scene(cls, name: str) -> str:
+        return _known("scene", name, SCENES)
+
+
+class Course(BaseModel):
+    """A simulated recording: where it leads, what is carried and how.
+
+    Attributes
+    ----------
+    scenes
+        Scenes in driving order, by name or with a length of their own.
+    length
+        Metres driven in every scene that has no length of its own.
+    sensor
+        A name from `SENSORS`.
+    motion
+        A name from `MOTIONS`.
+    seed
+        Another seed is another world, another drive and other noise.
+    rate
+        Turns of the sensor in a second; the sensor's own when not given.
+    columns
+        Firings in a turn; the sensor's own when not given.
+    imu
+        Hz of the inertial measurements; none are made when not given.
+    moving_objects
+        Whether cars and walkers move about.
+    weather
+        A name from `WEATHERS`.
+    stamp
+        Whether a recording's headers mark the start or the end of each scan.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scenes: tuple[str | SceneLeg, ...] = Field(min_length=1)
+    length: float = Field(default=60.0, ge=10.0, le=LONGEST)
+    sensor: str = "hdl32e"
+    motion: str = "robot"
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    rate: float | None = Field(default=None, gt=0.0, le=100.0)
+    columns: int | None = Field(default=None, ge=16, le=8192)
+    imu: Literal[200, 400] | None = None
+    moving_objects: bool = False
+    weather: str = "clear"
+    stamp: Literal["start", "end"] = "start"
+
+    @field_validator("scenes")
+    @classmethod
+    def _scenes(cls, scenes: tuple[str | SceneLeg, ...]) -> tuple[str | SceneLeg, ...]:
+        for scene in scenes:
+            if isinstance(scene, str):
+                _known("scene", scene, SCENES)
+        return scenes
+
+    @field_validator("sensor")
+    @classmethod
+    def _sensor(cls, name: str) -> str:
+        return _known("sensor", name, SENSORS)
+
+    @field_validator("motion")
+    @classmethod
+    def _motion(cls, name: str) -> str:
+        return _known("motion", name, MOTIONS)
+
+    @field_validator("weather")
+    @classmethod
+    def _weather(cls, name: str) -> str:
+        return _known("weather", name, WEATHERS)
+
+    @model_validator(mode="after")
+    def _rate_follows_motion(self) -> Self:
+        least, rate = MOTIONS[self.motion].least_rate, self.turns
+        if rate < least:
+            raise ValueError(
+                f"a {self.motion} moves too fast for {rate:g} scans a second: it needs at least "
+                f"{least:g}"
+            )
+        if sum(length for _, length in self.legs) > LONGEST:
+            raise ValueError(f"a course is at most {LONGEST:g} m long")
+        return self
+
+    @property
+    def legs(self) -> list[tuple[str, float]]:
+        """Name and metres of each scene in driving order."""
+        legs = [SceneLeg(scene=s) if isinstance(s, str) else s for s in self.scenes]
+        return [(leg.scene, self.length if leg.length is None else leg.length) for leg in legs]
+
+    @property
+    def turns(self) -> float:
+        """Scans a second."""
+        return SENSORS[self.sensor].rate if self.rate is None else self.rate

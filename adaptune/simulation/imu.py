@@ -1,0 +1,94 @@
+"""An inertial measurement unit beside the LiDAR."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert
+from adaptune.simulation.motion import Ride
+
+GRAVITY = 9.80665
+"""m/s^2, downwards along the world's z axis."""
+
+T_IMU_LIDAR: Poses = np.array(
+    [
+        [0.9996789, 0.0252866, 0.0015042, 0.058487],
+        [-0.0252723, 0.9996494, -0.0078025, 0.008404],
+        [-0.0017010, 0.0077630, 0.9999700, 0.168916],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
+
+GYRO_NOISE, ACCEL_NOISE = 5.2e-5, 5.9e-4
+"""White noise of an Xsens MTi-680G, in rad/s and m/s^2 for a root hertz."""
+
+GYRO_WALK, ACCEL_WALK = 2.0e-6, 3.0e-5
+"""Random walk of the biases, in rad/s and m/s^2 for a root second."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """Inertial measurements in the IMU's frame.
+
+    Attributes
+    ----------
+    times : ndarray of shape (n,)
+        Seconds since the recording's start.
+    gyro : ndarray of shape (n, 3)
+        Angular velocities in rad/s.
+    accel : ndarray of shape (n, 3)
+        Specific forces in m/s^2: at rest they point up.
+    """
+
+    times: NDArray[np.float64]
+    gyro: NDArray[np.float64]
+    accel: NDArray[np.float64]
+
+
+def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
+    """Measure without any error.
+
+    Parameters
+    ----------
+    ride
+        The LiDAR's trajectory.
+    times
+        Seconds since the recording's start, of shape (n,).
+    """
+    T_lidar_imu = invert(T_IMU_LIDAR)
+    R_lidar_imu, lever = T_lidar_imu[:3, :3], T_lidar_imu[:3, 3]
+    R_world_lidar = ride.poses(times)[:, :3, :3]
+    _, turn = ride.velocities(times)
+    acceleration, turn_rate = ride.accelerations(times)
+    # The IMU goes round the LiDAR as both turn.
+    round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
+    force = acceleration + np.array([0.0, 0.0, GRAVITY])
+    force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_
+    return Inertial(times, turn @ R_lidar_imu, force @ R_lidar_imu)
+
+
+def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
+    """Measure with biases that wander, and white noise.
+
+    Parameters
+    ----------
+    ride
+        The LiDAR's trajectory.
+    times
+        Seconds since the recording's start, `rate` of them a second, of shape (n,).
+    rate
+        Hz.
+    seed
+        Seed of the errors.
+    """
+    rng = np.random.default_rng([seed, 5])
+    truth = ideal(ride, times)
+    errors = []
+    for start, walk, noise in ((2e-3, GYRO_WALK, GYRO_NOISE), (2e-2, ACCEL_WALK, ACCEL_NOISE)):
+        bias = rng.normal(0.0, start, 3) + np.cumsum(
+            rng.normal(0.0, walk / np.sqrt(rate), (len(times), 3)), axis=0
+        )
+        errors.append(bias + rng.normal(0.0, noise * np.sqrt(rate), (len(times), 3)))
+    return Inertial(times, truth.gyro + errors[0], truth.accel + errors[1])

@@ -1,0 +1,164 @@
+"""From rays to echoes: compiled loops over all rays of a scan."""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@numba.njit(cache=True)
+def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
+    """Send every ray from its own column's pose.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3).
+    T_world_sensor
+        Pose at each column, of shape (n_columns, 4, 4).
+    origin
+        What to take as the world's origin, of shape (3,): single precision is a tenth of a
+        millimetre a kilometre away.
+
+    Returns
+    -------
+    ndarray of shape (n_columns * n_rings, 6)
+        Origins and directions of the rays.
+    """
+    columns, rings = directions.shape[:2]
+    rays = np.empty((columns * rings, 6), np.float32)
+    n = 0
+    for c in range(columns):
+        T = T_world_sensor[c]
+        x, y, z = T[0, 3] - origin[0], T[1, 3] - origin[1], T[2, 3] - origin[2]
+        for r in range(rings):
+            u, v, w = directions[c, r]
+            rays[n, 0], rays[n, 1], rays[n, 2] = x, y, z
+            for i in range(3):
+                rays[n, 3 + i] = T[i, 0] * u + T[i, 1] * v + T[i, 2] * w
+            n += 1
+    return rays
+
+
+@numba.njit(cache=True)
+def towards(
+    rays: F32, rings: int, centres: F64, yaw: F64, radius: float
+) -> tuple[NDArray[np.int64], F32]:
+    """Pick the rays that pass a moving thing, seen from that thing.
+
+    Parameters
+    ----------
+    rays
+        Of shape (n_columns * n_rings, 6).
+    rings
+        Rays in a column.
+    centres
+        The thing's origin at each column, of shape (n_columns, 3).
+    yaw
+        Its heading at each column in radians, of shape (n_columns,).
+    radius
+        Metres around its origin within which all of it lies.
+
+    Returns
+    -------
+    picked : ndarray of shape (m,)
+        Indices of the rays.
+    local : ndarray of shape (m, 6)
+        The rays in the thing's frame.
+    """
+    picked = np.empty(len(rays), np.int64)
+    local = np.empty((len(rays), 6), np.float32)
+    m = 0
+    for n in range(len(rays)):
+        c = n // rings
+        x, y = rays[n, 0] - centres[c, 0], rays[n, 1] - centres[c, 1]
+        z = rays[n, 2] - centres[c, 2]
+        u, v, w = rays[n, 3], rays[n, 4], rays[n, 5]
+        along = -(x * u + y * v + z * w)
+        if along < -radius or x * x + y * y + z * z - along * along > radius * radius:
+            continue
+        cos, sin = np.cos(yaw[c]), np.sin(yaw[c])
+        picked[m] = n
+        local[m, 0], local[m, 1], local[m, 2] = cos * x + sin * y, cos * y - sin * x, z
+        local[m, 3], local[m, 4], local[m, 5] = cos * u + sin * v, cos * v - sin * u, w
+        m += 1
+    return picked[:m], local[:m]
+
+
+@numba.njit(cache=True)
+def receive(  # noqa: PLR0917 - compiled functions take no keywords
+    directions: F32,
+    rays: F32,
+    hits: F32,
+    normals: F32,
+    reflectivity: F32,
+    reach: tuple[float, float],
+    noise: float,
+    dropout: float,
+    air: tuple[float, float, float],
+    chance: F32,
+    normal: F32,
+) -> tuple[F32, F32, NDArray[np.int64]]:
+    """Decide which rays come back, and with what range and intensity.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors in the sensor's frame, of shape (n, 3).
+    rays, hits, normals, reflectivity
+        The rays cast, of shape (n, 6); metres to what each hit, infinite where nothing, (n,); its
+        normal, (n, 3); its reflectivity, (n,).
+    reach
+        Least and greatest range in metres.
+    noise
+        Standard deviation of a range in metres.
+    dropout
+        Share of echoes lost.
+    air
+        Extinction, backscatter and its reach: see `adaptune.simulation.weather.Weather`.
+    chance
+        Uniform random numbers of shape (2, n).
+    normal
+        Normal random numbers of shape (n,).
+
+    Returns
+    -------
+    points : ndarray of shape (m, 3)
+        In the sensor's frame at the time of each ray.
+    intensities : ndarray of shape (m,)
+        From 0 to 255.
+    kept : ndarray of shape (m,)
+        Which rays came back.
+    """
+    n = len(rays)
+    points = np.empty((n, 3), np.float32)
+    intensities = np.empty(n, np.float32)
+    kept = np.empty(n, np.int64)
+    extinction, backscatter, air_reach = air
+    m = 0
+    for i in range(n):
+        distance = float(hits[i])
+        power = 0.0
+        if backscatter > 0.0:
+            echo = -np.log(1.0 - chance[1, i]) / backscatter
+            if echo < min(distance, air_reach):
+                distance, power = echo, 0.01
+        if not reach[0] <= distance <= reach[1] or chance[0, i] < dropout:
+            continue
+        if power == 0.0:
+            cosine = abs(
+                normals[i, 0] * rays[i, 3] + normals[i, 1] * rays[i, 4] + normals[i, 2] * rays[i, 5]
+            )
+            power = reflectivity[i] * cosine * np.exp(-2.0 * extinction * distance)
+            # The echo weakens with the square of the distance; a tenth is seen to the full range.
+            if distance * distance > reach[1] * reach[1] * power * 10.0:
+                continue
+        distance += noise * normal[i]
+        for j in range(3):
+            points[m, j] = distance * directions[i, j]
+        intensities[m] = np.rint(255.0 * min(power, 1.0))
+        kept[m] = i
+        m += 1
+    return points[:m], intensities[:m], kept[:m]

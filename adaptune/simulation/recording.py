@@ -1,0 +1,337 @@
+"""Recordings of simulated courses: ROS bags and KITTI odometry folders."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from adaptune import geometry
+from adaptune.files import replacing, write_text
+from adaptune.simulation.course import Course, SimulationError
+from adaptune.simulation.imu import Inertial, measure
+from adaptune.simulation.preview import Preview
+from adaptune.simulation.simulate import Drive, SimulatedScan
+from adaptune.trajectory import Trajectory, write_kitti, write_tum
+
+Layout = Literal["ros1", "ros2", "mcap", "kitti"]
+"""ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
+
+Progress = Callable[[int, int], None]
+
+POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"
+"""Topics, named as BotanicGarden names them."""
+
+CLOUD = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "intensity")),
+        ("ring", "<u2"),
+        ("time", "<f4"),
+    ]
+)
+"""A point as Velodyne's driver writes it: 22 bytes, time in seconds from the header's stamp."""
+
+_MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
+"""What tells a folder that was recorded here, and may be overwritten, from any other."""
+
+
+def record(
+    course: Course,
+    path: Path,
+    *,
+    layout: Layout | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Simulate a course and write it down, with its truth and a preview beside it.
+
+    The truth, in the TUM format, and the preview, a PNG, are named after the recording. All three
+    are there whole or not at all.
+
+    Parameters
+    ----------
+    course
+        What to simulate.
+    path
+        Where the recording shall be.
+    layout
+        What to write. When not given, the name decides: ``.bag`` is ROS 1, ``.mcap`` a ROS 2 file,
+        anything else a ROS 2 folder.
+    overwrite
+        Whether a recording that is there already is replaced.
+    progress
+        Called after every scan with the number of scans done and of all.
+
+    Raises
+    ------
+    SimulationError
+        If there is something at `path` or beside it that is not to be replaced.
+    """
+    path = Path(path)
+    layout = _layout(path) if layout is None else layout
+    stem = path.name if layout in _MARKS else path.stem
+    truth, preview = path.with_name(f"{stem}.tum"), path.with_name(f"{stem}.png")
+    for file in (path, truth, preview):
+        _check(file, overwrite, _MARKS.get(layout) if file is path else None)
+    drive = Drive(course)
+    if not len(drive):
+        raise SimulationError("the course is over before its first scan is: make it longer")
+    with ExitStack() as stack:
+        truth_beside = stack.enter_context(replacing(truth))
+        preview_beside = stack.enter_context(replacing(preview))
+        scans = _watched(drive, picture := Preview(drive), progress)
+        if layout == "kitti":
+            _write_kitti(drive, scans, stack.enter_context(_replacing_folder(path)))
+        elif layout == "ros1":
+            _write_ros1(drive, scans, stack.enter_context(replacing(path)))
+        elif layout == "mcap":
+            _write_mcap(drive, scans, stack.enter_context(replacing(path)))
+        else:
+            folder = stack.enter_context(_replacing_folder(path))
+            _write_ros2(drive, scans, folder, StoragePlugin.SQLITE3)
+        stamps = drive.stamps()
+        write_tum(truth_beside, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
+        picture.save(preview_beside)
+
+
+def _layout(path: Path) -> Layout:
+    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix, "ros2")  # type: ignore[return-value]
+
+
+def _check(path: Path, overwrite: bool, mark: str | None) -> None:
+    """Refuse to touch what is there unless told to, and whatever is not a recording."""
+    if not path.exists():
+        return
+    if not overwrite:
+        raise SimulationError(f"{path} exists already; give --overwrite to replace it")
+    if path.is_dir() and (mark is None or not (path / mark).exists()):
+        raise SimulationError(f"{path} is a folder, and no recording of this kind: it stays")
+    if mark is not None and not path.is_dir():
+        raise SimulationError(f"{path} is a file where a folder shall be written: it stays")
+
+
+def _watched(drive: Drive, preview: Preview, progress: Progress | None) -> Iterator[SimulatedScan]:
+    for number, scan in enumerate(drive.scans(), start=1):
+        preview.add(scan)
+        yield scan
+        if progress is not None:
+            progress(number, len(drive))
+
+
+@contextmanager
+def _replacing_folder(path: Path) -> Iterator[Path]:
+    """Fill a folder beside its place and rename it there when all went well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:
+        beside = Path(name) / "new"
+        yield beside
+        if path.exists():
+            path.rename(Path(name) / "old")
+        beside.rename(path)
+
+
+Message = tuple[str, int, Any]
+"""Topic, nanoseconds at which it is sent, content."""
+
+
+class _Composer:
+    """Makes ROS messages of what a drive yields."""
+
+    def __init__(self, drive: Drive, version: Literal[1, 2]) -> None:
+        store = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
+        self.typestore = get_typestore(store)
+        self._types = self.typestore.types
+        # Only a ROS 1 header counts its messages.
+        self._counts: dict[str, int] | None = (
+            {POINTS: 0, POSES: 0, IMU: 0} if version == 1 else None
+        )
+        self._drive = drive
+        fields = self._types["sensor_msgs/msg/PointField"]
+        offsets: Any = CLOUD.fields
+        kinds = {"<f4": 7, "<u2": 4}
+        self._fields = [
+            fields(
+                name=name,
+                offset=offsets[name][1],
+                datatype=kinds[offsets[name][0].str],
+                count=1,
+            )
+            for name in CLOUD.names or ()
+        ]
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Type of each topic."""
+        topics = {POINTS: "sensor_msgs/msg/PointCloud2", POSES: "geometry_msgs/msg/PoseStamped"}
+        if self._drive.course.imu is not None:
+            topics[IMU] = "sensor_msgs/msg/Imu"
+        return topics
+
+    def messages(self, scans: Iterator[SimulatedScan]) -> Iterator[Message]:
+        """All messages in the order in which they are sent: a cloud when its scan is over."""
+        drive = self._drive
+        stamps = drive.stamps()
+        T_world_sensor = drive.ride.poses(drive.seconds(stamps))
+        quaternions = geometry.to_quaternions(T_world_sensor)
+        inertial, inertial_stamps = self._inertial(int(stamps[-1]))
+        sent = 0
+        yield POSES, int(stamps[0]), self._pose(int(stamps[0]), T_world_sensor[0], quaternions[0])
+        for i, scan in enumerate(scans):
+            end = int(stamps[i + 1])
+            while sent < len(inertial_stamps) and inertial_stamps[sent] <= end:
+                stamp = int(inertial_stamps[sent])
+                yield IMU, stamp, self._imu(stamp, inertial.gyro[sent], inertial.accel[sent])
+                sent += 1
+            yield POSES, end, self._pose(end, T_world_sensor[i + 1], quaternions[i + 1])
+            yield POINTS, end, self._cloud(scan, end)
+
+    def _inertial(self, end: int) -> tuple[Inertial, NDArray[np.int64]]:
+        drive, rate = self._drive, self._drive.course.imu
+        if rate is None:
+            empty = np.empty((0, 3))
+            return Inertial(np.empty(0), empty, empty), np.empty(0, np.int64)
+        start = int(drive.stamps()[0])
+        stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
+        return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
+
+    def _header(self, topic: str, stamp: int, frame: str) -> Any:
+        time = self._types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+        header = self._types["std_msgs/msg/Header"]
+        if self._counts is None:
+            return header(stamp=time, frame_id=frame)
+        self._counts[topic] += 1
+        return header(seq=self._counts[topic] - 1, stamp=time, frame_id=frame)
+
+    def _vector(self, values: NDArray[np.float64]) -> Any:
+        return self._types["geometry_msgs/msg/Vector3"](*values.tolist())
+
+    def _pose(self, stamp: int, T: geometry.Poses, quaternion: NDArray[np.float64]) -> Any:
+        t = self._types
+        pose = t["geometry_msgs/msg/Pose"](
+            position=t["geometry_msgs/msg/Point"](*T[:3, 3].tolist()),
+            orientation=t["geometry_msgs/msg/Quaternion"](*quaternion.tolist()),
+        )
+        header = self._header(POSES, stamp, "map")
+        return t["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
+
+    def _imu(self, stamp: int, gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> Any:
+        t = self._types
+        unknown = np.zeros(9)
+        # As the message's definition has it: no orientation is estimated.
+        unoriented = np.array([-1.0, *np.zeros(8)])
+        return t["sensor_msgs/msg/Imu"](
+            header=self._header(IMU, stamp, "imu"),
+            orientation=t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            orientation_covariance=unoriented,
+            angular_velocity=self._vector(gyro),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=self._vector(accel),
+            linear_acceleration_covariance=unknown,
+        )
+
+    def _cloud(self, scan: SimulatedScan, end: int) -> Any:
+        at_end = self._drive.course.stamp == "end"
+        stamp = end if at_end else scan.stamp
+        cloud = np.empty(len(scan), CLOUD)
+        cloud["x"], cloud["y"], cloud["z"] = scan.points.T
+        cloud["intensity"], cloud["ring"] = scan.intensities, scan.rings
+        cloud["time"] = scan.times
+        if at_end:
+            cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
+        return self._types["sensor_msgs/msg/PointCloud2"](
+            header=self._header(POINTS, stamp, "velodyne"),
+            height=1,
+            width=len(cloud),
+            fields=self._fields,
+            is_bigendian=False,
+            point_step=CLOUD.itemsize,
+            row_step=cloud.nbytes,
+            data=cloud.view(np.uint8),
+            is_dense=True,
+        )
+
+
+def _write_ros1(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
+    composer = _Composer(drive, 1)
+    # The writer wants to make the file itself.
+    path.unlink()
+    with Writer1(path) as writer:
+        types = composer.topics
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=composer.typestore)
+            for topic, kind in types.items()
+        }
+        for topic, stamp, message in composer.messages(scans):
+            data = composer.typestore.serialize_ros1(message, types[topic])
+            writer.write(topics[topic], stamp, data)
+
+
+def _write_ros2(
+    drive: Drive, scans: Iterator[SimulatedScan], folder: Path, storage: StoragePlugin
+) -> None:
+    composer = _Composer(drive, 2)
+    with Writer2(folder, version=9, storage_plugin=storage) as writer:
+        types = composer.topics
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=composer.typestore)
+            for topic, kind in types.items()
+        }
+        for topic, stamp, message in composer.messages(scans):
+            data = composer.typestore.serialize_cdr(message, types[topic])
+            writer.write(topics[topic], stamp, data)
+
+
+def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
+        folder = Path(name) / "bag"
+        _write_ros2(drive, scans, folder, StoragePlugin.MCAP)
+        (file,) = folder.glob("*.mcap")
+        file.replace(path)
+
+
+_TR = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""``T_camera_lidar``: KITTI's poses are those of a camera which looks ahead, z forward."""
+
+
+def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> None:
+    """Write sequence 00: its clouds are undistorted to the scan's start, as KITTI's are."""
+    sequence = folder / "sequences" / "00"
+    (sequence / "velodyne").mkdir(parents=True)
+    T_world_lidar = []
+    for number, scan in enumerate(scans):
+        T_world_lidar.append(scan.T_world_sensor)
+        cloud = np.column_stack([undistort(drive, scan), scan.intensities / np.float32(255.0)])
+        (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.astype("<f4").tobytes())
+    T = np.array(T_world_lidar)
+    write_kitti(folder / "poses" / "00.txt", _TR @ geometry.invert(T[0]) @ T @ geometry.invert(_TR))
+    seconds = drive.seconds(drive.stamps()[:-1])
+    write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
+    rows = " ".join(f"{v:.12e}" for v in _TR[:3].ravel())
+    camera = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
+    lines = [*(f"P{i}: {camera}\n" for i in range(4)), f"Tr: {rows}\n"]
+    write_text(sequence / "calib.txt", "".join(lines))
+
+
+def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:
+    """Points as if all had been measured at the scan's start, by the truth.
+
+    Returns
+    -------
+    ndarray of shape (n, 3)
+        float32 metres in the sensor's frame at the scan's stamp.
+    """
+    assert scan.times is not None
+    times, column = np.unique(scan.times, return_inverse=True)
+    T_world_column = drive.ride.poses((scan.stamp - drive.stamps()[0]) * 1e-9 + times.astype(float))
+    T = (geometry.invert(scan.T_world_sensor) @ T_world_column)[column]
+    points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
+    return np.asarray(points, np.float32)

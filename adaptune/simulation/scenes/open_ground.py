@@ -1,0 +1,57 @@
+"""Open ground with sparse boulders and bushes under far hills and trees."""
+
+import numpy as np
+
+from adaptune.simulation.mesh import Material, Mesh, box, merge
+from adaptune.simulation.noise import fractal_plane
+from adaptune.simulation.scenes import parts
+from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
+
+
+def _relief(spots: Spots, seed: int) -> Floats:
+    swell = fractal_plane(spots.x, spots.y, 22.0, seed + 41, 3)
+    hills = 7.0 + 6.0 * fractal_plane(spots.x, spots.y, 40.0, seed + 42, 3)
+    return (
+        0.05 * swell
+        + 0.9 * beyond(spots.d, 3.0, 15.0) * swell
+        + beyond(spots.d, 45.0, 40.0) * hills
+    )
+
+
+def _build(tile: Tile) -> list[Mesh]:
+    rng = tile.rng
+    boulders = [parts.boulder(v) for v in range(parts.VARIANTS)]
+    bushes = [parts.bush(v) for v in range(parts.VARIANTS)]
+    trees = [parts.tree(v) for v in range(parts.VARIANTS)]
+    meshes = []
+    for models, density, near, far, sizes in (
+        (boulders, 0.006, 4.0, 60.0, (0.3, 1.3)),
+        (bushes, 0.007, 4.0, 60.0, (0.6, 1.6)),
+        (trees, 0.0006, 15.0, 50.0, (0.7, 1.2)),
+        (trees, 0.004, 50.0, 75.0, (0.8, 1.4)),
+    ):
+        s, d = tile.scatter(density, near, far, margin=4.0)
+        meshes.append(parts.strew(tile, models, s, d, rng.uniform(*sizes, len(s))))
+    if rng.random() < 0.12:
+        s = rng.uniform(tile.start, tile.stop, 1)
+        d = rng.choice([-1.0, 1.0], 1) * rng.uniform(28.0, 45.0)
+        shed = merge(
+            [
+                box((12.0, 7.0, 3.6), Material.WOOD),
+                box((12.8, 3.0, 1.2), Material.WOOD, (0.0, 0.0, 3.5)),
+            ]
+        )
+        meshes.append(parts.strew(tile, [shed], s, d, 1.0, sink=0.3))
+    return meshes
+
+
+OPEN = Scene(
+    summary="open ground with sparse boulders and bushes, far hills and trees",
+    build=_build,
+    relief=_relief,
+    surface=paved((np.inf, Material.SOIL)),
+    winding=0.18,
+    bend=30.0,
+    slope=0.03,
+    shake=1.2,
+)

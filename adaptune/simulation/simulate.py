@@ -1,0 +1,207 @@
+"""Drive through a world and scan it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import open3d
+from adaptune.geometry import Poses
+from adaptune.sequence.scan import Scan
+from adaptune.simulation import rays as kernels
+from adaptune.simulation.course import Course
+from adaptune.simulation.mesh import REFLECTIVITY, Mesh
+from adaptune.simulation.motion import MOTIONS, Ride
+from adaptune.simulation.movers import RADIUS, model, populate
+from adaptune.simulation.road import Road
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.scenes.base import TILE
+from adaptune.simulation.sensors import SENSORS, directions
+from adaptune.simulation.weather import WEATHERS
+from adaptune.simulation.world import World
+
+EPOCH = 1_600_000_000_000_000_000
+"""Nanoseconds at which every recording starts."""
+
+_DETOUR = 1.2
+"""Metres of road for a metre of sight, where it winds."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulatedScan(Scan):
+    """A scan with what else the sensor and the truth say.
+
+    Attributes
+    ----------
+    intensities : ndarray of shape (n,)
+        float32, from 0 to 255.
+    rings : ndarray of shape (n,)
+        uint16 laser of each point.
+    T_world_sensor : ndarray of shape (4, 4)
+        True pose at the scan's stamp.
+    """
+
+    intensities: NDArray[np.float32]
+    rings: NDArray[np.uint16]
+    T_world_sensor: Poses
+
+
+class Drive:
+    """A course made ready: its road and the sensor's ride along it.
+
+    Parameters
+    ----------
+    course
+        What to simulate.
+
+    Attributes
+    ----------
+    course : Course
+    road : Road
+    ride : Ride
+        The sensor's trajectory in continuous time.
+    """
+
+    def __init__(self, course: Course) -> None:
+        self.course = course
+        self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
+        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
+
+    def __len__(self) -> int:
+        """Whole scans in the drive."""
+        return int(self.ride.duration * self.course.turns)
+
+    def stamps(self) -> NDArray[np.int64]:
+        """Borders of the scans in nanoseconds, one more than there are scans."""
+        borders = np.arange(len(self) + 1) * (1e9 / self.course.turns)
+        return np.asarray(EPOCH + np.rint(borders).astype(np.int64), np.int64)
+
+    def seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Seconds since the start of stamps in nanoseconds."""
+        return np.asarray((stamps - EPOCH) * 1e-9, np.float64)
+
+    def scans(self) -> Iterator[SimulatedScan]:
+        """Scan the world from one end of the drive to the other."""
+        course, sensor = self.course, SENSORS[self.course.sensor]
+        air = WEATHERS[course.weather]
+        columns = course.columns or sensor.columns
+        rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
+        offsets = np.arange(columns) / (columns * course.turns)
+        times = np.repeat(offsets, sensor.rings).astype(np.float32)
+        caster = _Caster(self, sensor.range[1])
+        for number, stamp in enumerate(self.stamps()[:-1].tolist()):
+            start = (stamp - EPOCH) * 1e-9
+            T_world_sensor = self.ride.poses(start + offsets)
+            looks = directions(course.sensor, columns, start, course.turns)
+            rays, hits, normals, reflectivity = caster.cast(looks, T_world_sensor, start + offsets)
+            rng = np.random.default_rng([course.seed, 6, number])
+            points, intensities, kept = kernels.receive(
+                looks.reshape(-1, 3),
+                rays,
+                hits,
+                normals,
+                reflectivity,
+                sensor.range,
+                sensor.noise,
+                sensor.dropout,
+                (air.extinction, air.backscatter, air.reach),
+                rng.random((2, len(rays)), np.float32),
+                rng.standard_normal(len(rays), np.float32),
+            )
+            yield SimulatedScan(
+                stamp=stamp,
+                points=points,
+                times=times[kept],
+                intensities=intensities,
+                rings=rings[kept],
+                T_world_sensor=T_world_sensor[0],
+            )
+
+
+class _Caster:
+    """Casts rays into what is near, and builds it anew every tile."""
+
+    def __init__(self, drive: Drive, sight: float) -> None:
+        self._road, self._sight = drive.road, sight
+        self._world = World(drive.road)
+        self._here: int | None = None
+        self._movers = populate(drive.road) if drive.course.moving_objects else []
+        self._models = {
+            kind: _Target(model(kind), np.zeros(3)) for kind in {m.kind for m in self._movers}
+        }
+
+    def cast(
+        self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Cast rays from each column's pose: the rays, and what `_Target.cast` gives for them."""
+        station = float(self._road.station(T_world_sensor[0, 0, 3]))
+        tile = int(station // TILE)
+        if tile != self._here:
+            mesh = self._world.around((tile + 0.5) * TILE, self._sight * _DETOUR + TILE / 2.0)
+            self._origin = T_world_sensor[0, :3, 3].copy()
+            self._target = _Target(mesh, self._origin)
+            self._here = tile
+        rays = kernels.aim(looks, T_world_sensor, self._origin)
+        hits, normals, reflectivity = self._target.cast(rays)
+        for mover in self._movers:
+            if abs(mover.middle - station) > mover.swing + self._sight:
+                continue
+            centres, yaw = mover.at(self._road, times)
+            picked, local = kernels.towards(
+                rays, looks.shape[1], centres - self._origin, yaw, RADIUS[mover.kind]
+            )
+            if not len(picked):
+                continue
+            nearer, turned, shine = self._models[mover.kind].cast(local)
+            hit = nearer < hits[picked]
+            picked, turned, heading = picked[hit], turned[hit], yaw[picked[hit] // looks.shape[1]]
+            hits[picked], reflectivity[picked] = nearer[hit], shine[hit]
+            cos, sin = np.cos(heading), np.sin(heading)
+            normals[picked, 0] = cos * turned[:, 0] - sin * turned[:, 1]
+            normals[picked, 1] = sin * turned[:, 0] + cos * turned[:, 1]
+            normals[picked, 2] = turned[:, 2]
+        return rays, hits, normals, reflectivity
+
+
+class _Target:
+    """A mesh that rays can be cast at, relative to an origin."""
+
+    def __init__(self, mesh: Mesh, origin: NDArray[np.float64]) -> None:
+        o3d: Any = open3d.load()
+        self._tensor = o3d.core.Tensor.from_numpy
+        self._scene = o3d.t.geometry.RaycastingScene()
+        vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)
+        triangles = np.ascontiguousarray(mesh.triangles, np.uint32)
+        self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
+        # One more for the rays that hit nothing.
+        self._reflectivity = np.append(REFLECTIVITY[mesh.materials], np.float32(0.0))
+
+    def cast(
+        self, rays: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Cast rays of shape (n, 6): metres to the hit, its normal and its reflectivity."""
+        answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))
+        triangles = np.minimum(answer["primitive_ids"].numpy(), len(self._reflectivity) - 1)
+        return (
+            answer["t_hit"].numpy(),
+            answer["primitive_normals"].numpy(),
+            self._reflectivity[triangles],
+        )
+
+
+def simulate(course: Course) -> Iterator[SimulatedScan]:
+    """Drive a course and scan it, one scan at a time.
+
+    Parameters
+    ----------
+    course
+        What to simulate.
+
+    Yields
+    ------
+    SimulatedScan
+        In order; its stamp marks its start, whatever the course wants of recordings.
+    """
+    return Drive(course).scans()

@@ -1,0 +1,84 @@
+import numpy as np
+
+from adaptune.geometry import from_quaternions
+from adaptune.simulation import rays as kernels
+
+AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)
+CLEAR = (0.0, 0.0, 0.0)
+
+
+def receive(distance, *, cosine=1.0, reflectivity=0.5, air=CLEAR, dropout=0.0, n=2000, noise=0.0):
+    rng = np.random.default_rng(0)
+    looks = np.repeat(AHEAD, n, axis=0)
+    normals = np.repeat([[-cosine, (1.0 - cosine**2) ** 0.5, 0.0]], n, axis=0).astype(np.float32)
+    return kernels.receive(
+        looks,
+        np.column_stack([np.zeros((n, 3), np.float32), looks]),
+        np.full(n, distance, np.float32),
+        normals,
+        np.full(n, reflectivity, np.float32),
+        (1.0, 100.0),
+        noise,
+        dropout,
+        air,
+        rng.random((2, n), np.float32),
+        rng.standard_normal(n, np.float32),
+    )
+
+
+def test_each_column_is_cast_from_its_own_pose():
+    T = from_quaternions([[10.0, 0.0, 1.0], [11.0, 2.0, 1.0]], [[0, 0, 0, 1], [0, 0, 1, 1]])
+    looks = np.array([[[1.0, 0, 0], [0, 0, 1]], [[1.0, 0, 0], [0, 1, 0]]], np.float32)
+    rays = kernels.aim(looks, T, np.array([10.0, 0.0, 0.0]))
+    expected = [
+        [0, 0, 1, 1, 0, 0],
+        [0, 0, 1, 0, 0, 1],
+        [1, 2, 1, 0, 1, 0],
+        [1, 2, 1, -1, 0, 0],
+    ]
+    np.testing.assert_allclose(rays, expected, atol=1e-6)
+
+
+def test_noise_lies_along_the_ray():
+    points, _, kept = receive(20.0, noise=0.02)
+    assert len(kept) == 2000
+    np.testing.assert_allclose(points[:, 0].mean(), 20.0, atol=2e-3)
+    np.testing.assert_allclose(points[:, 0].std(), 0.02, rtol=0.1)
+    assert not points[:, 1:].any()
+
+
+def test_intensity_follows_material_and_incidence():
+    assert receive(5.0)[1][0] == np.rint(255 * 0.5)
+    assert receive(5.0, cosine=0.5)[1][0] == np.rint(255 * 0.25)
+
+
+def test_range_limits_and_weak_echoes():
+    assert len(receive(0.9)[2]) == 0
+    assert len(receive(99.0, reflectivity=0.1)[2]) == 2000
+    assert len(receive(101.0)[2]) == 0
+    # A dark or grazing target is seen half as far for a quarter of the light.
+    assert len(receive(51.0, reflectivity=0.025)[2]) == 0
+    assert len(receive(49.0, reflectivity=0.025)[2]) == 2000
+    assert len(receive(np.inf)[2]) == 0
+
+
+def test_dropouts():
+    assert 0.08 < 1.0 - len(receive(5.0, dropout=0.1)[2]) / 2000 < 0.12
+
+
+def test_fog_sends_echoes_of_its_own_and_hides_what_is_far():
+    fog = (0.03, 0.02, 10.0)
+    points, intensities, _ = receive(40.0, air=fog)
+    early = points[:, 0] < 39.0
+    # Chance of an echo between the sensor and ten metres, less those too near to be seen.
+    np.testing.assert_allclose(early.sum() / 2000, np.exp(-0.02) - np.exp(-0.2), atol=0.03)
+    assert intensities[early].max() < 5.0
+    assert len(receive(80.0, air=(0.03, 0.0, 0.0))[2]) == 0
+
+
+def test_rays_towards_a_moving_thing_are_seen_from_it():
+    rays = np.array([[0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, -1, 0, 0]], np.float32)
+    centres = np.repeat([[5.0, 0.5, 0.0]], 3, axis=0)
+    picked, local = kernels.towards(rays, 1, centres, np.full(3, np.pi / 2), 1.0)
+    assert picked.tolist() == [0]
+    np.testing.assert_allclose(local[0], [-0.5, 5.0, 0.0, 0.0, -1.0, 0.0], atol=1e-6)
