@@ -1,6 +1,8 @@
 """What a recording holds, what is odd about it, and how to name it in a study."""
 
-from collections.abc import Iterator, Sequence as Items
+import datetime
+from collections.abc import Iterator
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from rich.text import Text
 
 from adaptune import geometry, yaml
 from adaptune.errors import AdaptuneError
+from adaptune.files import replacing
 from adaptune.sequence import Scan, SequenceConfig, SequenceError, cache, open_sequence
 from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, POSES, BagSource, bag_paths, header_stamp
 from adaptune.sequence.pointcloud2 import RING_FIELDS
@@ -164,15 +167,13 @@ def inspect(path: Path) -> Inspection:
 
 
 def _kind(path: Path) -> str:
-    if path.is_dir():
-        if any((path / name).is_dir() for name in _KITTI_FOLDERS):
-            return "kitti"
-        if not (path / "metadata.yaml").exists() and not any(
-            path.glob(f"*{suffix}") for suffix in ()
-        ):
-            bags = [p for p in path.iterdir() if p.suffix in (".bag", ".mcap", ".db3")]
-            return "bag" if bags else "folder"
-    return "bag"
+    """Key of a `sequences:` entry that opens it."""
+    if not path.is_dir():
+        return "bag"
+    if any((path / name).is_dir() for name in _KITTI_FOLDERS):
+        return "kitti"
+    suffixes = {p.suffix for p in path.iterdir()}
+    return "bag" if suffixes & {".bag", ".mcap", ".db3"} else "folder"
 
 
 def _any_bag(path: Path) -> BagSource:
@@ -298,9 +299,9 @@ def _layout(source: BagSource) -> tuple[tuple[tuple[str, str, int], ...], int]:
     """Fields of a point of the first cloud, and how many points it holds."""
     message = next(source.messages(source.points), None)
     if message is None or not hasattr(message, "fields"):
-        points = () if message is None else message.points
-        names = tuple(vars(points[0])) if len(points) else ()
-        return tuple((name, "", 0) for name in names if name != "__msgtype__"), len(points)
+        points = [] if message is None else list(message.points)
+        names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
+        return tuple((name, "", 0) for name in names), len(points)
     kinds = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32"}
     kinds |= {7: "float32", 8: "float64"}
     fields = tuple(
@@ -348,9 +349,8 @@ def _missing(
     """What each stage needs and does not find."""
     clouds = () if scan is not None else ("point clouds that can be read",)
     truth = () if reference is not None else ("a reference trajectory",)
-    times = ()
-    if scan is not None and scan.scan.times is None:
-        times = ("a time for each point",)
+    timeless = scan is not None and scan.scan.times is None
+    times = ("a time for each point",) if timeless else ()
     imu = () if "imu" in given else ("an IMU",)
     return {
         "offline": (*clouds, *truth),
@@ -371,7 +371,10 @@ def _entry(path: Path, given: dict[str, Any], reference: Trajectory | None) -> s
 
 def render_inspection(inspection: Inspection) -> RenderableType:
     """The inspection for a terminal."""
-    parts: list[RenderableType] = [Text(str(inspection.path), style="bold"), _topic_table(inspection)]
+    parts: list[RenderableType] = [
+        Text(str(inspection.path), style="bold"),
+        _topic_table(inspection),
+    ]
     if inspection.layout:
         parts.append(Text(f"point: {_layout_text(inspection.layout)}"))
     if inspection.scan is not None:
@@ -427,9 +430,8 @@ def _scan_text(scan: ScanSummary) -> str:
     if scan.recorded > len(scan.scan):
         words[0] += f" of {scan.recorded:,}"
     if scan.ranges is not None:
-        words.append("{:.2f} to {:.2f} m away, half of them within {:.2f} m".format(
-            scan.ranges[0], scan.ranges[2], scan.ranges[1]
-        ))
+        near, middle, far = scan.ranges
+        words.append(f"{near:.2f} to {far:.2f} m away, half of them within {middle:.2f} m")
     words.append("no times" if scan.span is None else f"times spanning {scan.span:.4f} s")
     words.append("no rings" if scan.rings is None else f"{scan.rings} rings")
     return ", ".join(words)
@@ -466,23 +468,19 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
             points[order, i], points[order, j], c=points[order, 2], s=0.4, cmap="viridis"
         )
         axes.set_xlim(-reach, reach)
-        axes.set_aspect("equal", adjustable="box" if axes is above else "datalim")
+        axes.set_aspect("equal")
         axes.set_xlabel(f"{names[0]} (m)")
         axes.set_ylabel(f"{names[1]} (m)")
     above.set_ylim(-reach, reach)
     above.plot(0, 0, "r+", markersize=10)
     figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6)
     figure.suptitle(f"{inspection.path.name}: {_scan_text(inspection.scan)}", fontsize=9)
-    from adaptune.files import replacing
-
     with replacing(path) as beside:
         figure.savefig(beside, format="png", dpi=110)
 
 
 def render_cache() -> RenderableType:
     """The decoded sequences on disk, for a terminal."""
-    import datetime
-
     entries = cache.list_cache()
     table = Table(box=None, pad_edge=False)
     for column in ("sequence", "scans", "size", "last used"):
@@ -491,4 +489,6 @@ def render_cache() -> RenderableType:
         used = datetime.datetime.fromtimestamp(entry.used).strftime("%Y-%m-%d %H:%M")
         table.add_row(entry.name, str(entry.n_scans), f"{entry.size / 1e6:,.1f} MB", used)
     total = sum(entry.size for entry in entries) / 1e9
-    return Group(table, Text(f"{cache.folder()}: {total:.2f} GB of at most {cache.cap() / 1e9:g} GB"))
+    return Group(
+        table, Text(f"{cache.folder()}: {total:.2f} GB of at most {cache.cap() / 1e9:g} GB")
+    )

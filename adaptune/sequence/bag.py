@@ -171,7 +171,7 @@ class BagSource:
         number = 0
         with self.open() as reader:
             decode = self._decoder(reader)
-            for _, recorded, data in self._raw(reader, self.points):
+            for _, recorded, data in self.read(reader, self.points):
                 number += 1
                 stamp = header_stamp(data, reader.is2)
                 if stamp is None:
@@ -295,7 +295,7 @@ class BagSource:
             Naming the message that cannot be read.
         """
         with self.open() as reader:
-            for number, (connection, _, data) in enumerate(self._raw(reader, topic), start=1):
+            for number, (connection, _, data) in enumerate(self.read(reader, topic), start=1):
                 try:
                     yield reader.deserialize(data, connection.msgtype)
                 except Exception as error:
@@ -326,8 +326,17 @@ class BagSource:
         finally:
             reader.close()
 
-    def _raw(self, reader: AnyReader, topic: str) -> Iterator[tuple[Connection, int, bytes]]:
-        messages = reader.messages([c for c in reader.connections if c.topic == topic])
+    def read(
+        self, reader: AnyReader, topic: str | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Serialised messages of a topic, or of all topics.
+
+        Raises
+        ------
+        SequenceError
+            If the bags cannot be read on.
+        """
+        messages = reader.messages([c for c in reader.connections if topic in (None, c.topic)])
         while True:
             try:
                 message = next(messages)
