@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
 from adaptune.sequence.config import to_pose
+from adaptune.study import ConfigurationError, load_study
 from adaptune.trajectory import Trajectory, write_tum
 
 
@@ -115,3 +116,15 @@ def test_missing_files_are_found_at_once(rec: Any, tmp_path: Path) -> None:
         open_sequence(SequenceConfig(bag=bag, reference=str(tmp_path / "none.tum")))
     with pytest.raises(SequenceError, match=r"none\.bag: there is no such bag"):
         open_sequence(SequenceConfig(bag=str(tmp_path / "none.bag")))
+
+
+@pytest.mark.parametrize("name", ["botanic_garden_gicp", "kitti_gicp"])
+def test_shipped_studies_lack_nothing_but_their_data(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("BOTANIC_GARDEN", str(tmp_path))
+    monkeypatch.setenv("KITTI", str(tmp_path))
+    configs = Path(__file__).parents[3] / "configs"
+    with pytest.raises(ConfigurationError) as caught:
+        load_study(configs / f"{name}.yaml")
+    assert all("there is no such" in line for line in str(caught.value).splitlines())
