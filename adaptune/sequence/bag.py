@@ -1,6 +1,7 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
 import struct
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -50,6 +51,8 @@ POSES: dict[str, Callable[[Any], list[_Pose]]] = {
     "tf/msg/tfMessage": lambda m: _transforms(m.transforms),
 }
 """Poses in a message, by its type."""
+# Each repeats all of the one before.
+_PATH = "nav_msgs/msg/Path"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -186,7 +189,7 @@ class BagSource:
         return None if first is None else (first.stamp, first.stamp + self._duration)
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Poses on a topic, those with the same stamp once.
+        """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
 
         Poses that are not finite or whose quaternion has no length are left out and counted.
 
@@ -198,9 +201,8 @@ class BagSource:
         if name is None:
             return None
         name = self.topic(name, POSES, "poses")
-        found = [
-            pose for message in self.messages(name) for pose in POSES[message.__msgtype__](message)
-        ]
+        messages = self.messages(name, last=self.topics[name] == _PATH)
+        found = [pose for message in messages for pose in POSES[message.__msgtype__](message)]
         if self.topics[name] in _TRANSFORMS:
             found = self._of_frame(name, found, child_frame)
         if not found:
@@ -286,8 +288,8 @@ class BagSource:
         topics = sorted(f"{topic} ({kind})" for topic, kind in self.topics.items())
         return f"; it holds {', '.join(topics) or 'nothing'}"
 
-    def messages(self, topic: str) -> Iterator[Any]:
-        """Deserialised messages of a topic.
+    def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
+        """Deserialised messages of a topic, or its last one only.
 
         Raises
         ------
@@ -295,7 +297,10 @@ class BagSource:
             Naming the message that cannot be read.
         """
         with self.open() as reader:
-            for number, (connection, _, data) in enumerate(self.read(reader, topic), start=1):
+            messages: Iterable[Any] = enumerate(self.read(reader, topic), start=1)
+            if last:
+                messages = deque(messages, maxlen=1)
+            for number, (connection, _, data) in messages:
                 try:
                     yield reader.deserialize(data, connection.msgtype)
                 except Exception as error:

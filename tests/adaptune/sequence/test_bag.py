@@ -149,7 +149,7 @@ def poses_of(rec: Any, store: Any) -> dict[str, list[Any]]:
             t["nav_msgs/msg/Odometry"](h, "lidar", p, twist)
             for h, p in zip(headers, with_covariance, strict=True)
         ],
-        "Path": [t["nav_msgs/msg/Path"](headers[1], stamped)],
+        "Path": [t["nav_msgs/msg/Path"](headers[1], stamped[:n]) for n in (1, 2)],
         "TransformStamped": transforms,
         "TFMessage": [t["tf2_msgs/msg/TFMessage"]([x]) for x in transforms],
     }
