@@ -49,9 +49,9 @@ def test_nothing_is_left_where_nothing_was(tmp_path):
     def fail():
         with replacing(tmp_path / "a.txt") as beside:
             beside.write_text("half")
-            raise ValueError
+            raise RuntimeError
 
-    with pytest.raises(ValueError, match=""):
+    with pytest.raises(RuntimeError):
         fail()
     assert list(tmp_path.iterdir()) == []
 

@@ -241,7 +241,7 @@ def test_spaces_are_equal_when_all_is():
     assert ParameterSpace(dict(reversed(parameters.items()))) != SPACE
     wider = parameters | {"angle": Float(low=-10.0, high=31.0, baseline=0.0)}
     assert ParameterSpace(wider) != SPACE
-    assert SPACE != parameters
+    assert parameters != SPACE
 
 
 def test_nearest_name():
