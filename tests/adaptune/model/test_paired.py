@@ -93,7 +93,7 @@ def test_it_follows_its_definition(seed, n_frames, n_sets, n_sequences, constant
 def test_its_constants():
     rule = PairedExpectedRatio()
     assert (rule.n_frames, rule.width, rule.sharpness, rule.threshold) == (30, 0.12, 3.0, -0.1)
-    assert list(RULES)[0] == "paired"
+    assert next(iter(RULES)) == "paired"
     assert RULES["paired"] is PairedExpectedRatio
 
 
