@@ -150,3 +150,30 @@ def test_a_missing_file_is_named(tmp_path):
         Archive(tmp_path).read("cave", 7)
     with pytest.raises(ArchiveError, match=r"cave/frames\.npz: there is no such file"):
         Archive(tmp_path).read_frames("cave")
+
+
+def bare_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.arange(3))
+
+
+def encrypt(path):
+    """Set the bit that says so in the directory's first entry."""
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+
+
+def compress_strangely(path):
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 10] = 77
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("harm", [bare_array, encrypt, compress_strangely])
+def test_damage_that_zip_files_do_not_call_damage(tmp_path, harm):
+    archive = Archive(tmp_path)
+    archive.write("cave", 0, random_trial())
+    harm(archive.trial_path("cave", 0))
+    with pytest.raises(ArchiveError, match=r"cave/00000\.npz"):
+        archive.read("cave", 0)

@@ -259,3 +259,14 @@ def test_cap():
     assert capped.dtype == np.float64
     np.testing.assert_allclose(capped, [0.0, 1.5, 29.9, FAILURE, FAILURE, np.nan], rtol=1e-6)
     assert FAILURE == 30.0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_estimate_that_is_not_finite_is_a_failure(bad):
+    """NaN means that nothing is known, and would be left out of every mean."""
+    T_ref = line(*range(9))
+    T_est = T_ref.copy()
+    T_est[4, :3] = bad
+    errors = sub_trajectory_rte(T_ref, T_est, 1.5)
+    assert np.isinf(errors[[2, 4]]).all()
+    assert np.isnan(errors).tolist() == [False] * 7 + [True] * 2

@@ -253,3 +253,10 @@ def test_nearest_name():
 def test_describe():
     assert describe(SPACE.parameters["angle"]) == "[-10, 30]"
     assert describe(SPACE.parameters["kernel"]) == "{'none', 'huber', 'cauchy'}"
+
+
+@pytest.mark.parametrize("choices", [(1, True), (0.0, 0, False), (2, 2.0)])
+def test_choices_that_only_look_equal_are_told_apart(choices):
+    parameter = Categorical(choices=choices, baseline=choices[0])
+    back = [parameter.from_unit(parameter.to_unit(choice)) for choice in choices]
+    assert list(map(repr, back)) == list(map(repr, choices))

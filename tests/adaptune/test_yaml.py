@@ -174,3 +174,16 @@ def test_what_is_dumped_is_read_back(data):
 
 def test_dump_keeps_the_order_and_the_letters():
     assert dump({"b": 1, "a": [0.5, "grün"]}) == "b: 1\na:\n- 0.5\n- grün\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: !!bool maybe", "a: !!float ''", "a: !!timestamp soon", "a: \x00", "a: '\ud800'"],
+)
+def test_mistakes_that_pyyaml_does_not_report_as_its_own(text):
+    with pytest.raises(YamlError):
+        Document(text)
+
+
+def test_signs_of_older_yaml_are_words():
+    assert Document("a: =\n").data == {"a": "="}

@@ -239,3 +239,17 @@ def test_an_empty_model_is_refused(tmp_path):
         errors=np.zeros((0, 6), np.float32),
     )
     refused(path)
+
+
+def test_a_flipped_bit_in_the_directory_is_refused_or_means_nothing(tmp_path):
+    data = saved(tmp_path).read_bytes()
+    begin = data.index(b"PK\x01\x02")
+    assert flipped(tmp_path, range(8 * begin, 8 * (begin + 46))) > 100
+
+
+@pytest.mark.parametrize("name", ["model", "model.v2", "model.bin"])
+def test_a_model_keeps_the_name_it_is_given(tmp_path, name):
+    path = tmp_path / name
+    random_model().save(path)
+    assert list(tmp_path.iterdir()) == [path]
+    assert_same(ErrorModel.load(path), random_model())

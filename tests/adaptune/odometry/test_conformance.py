@@ -227,6 +227,39 @@ def test_a_poor_first_scan(name, n):
     np.testing.assert_allclose(way[:, 1:], 0.0, atol=0.05)
 
 
+@every_box
+@pytest.mark.parametrize("scale", [0.005, 1e4], ids=["near", "far"])
+def test_points_that_are_all_too_near_or_too_far_make_a_poor_scan(name, scale):
+    box = box_class(name)()
+    T_before, T = drive(box, prepared_drive(name)[:6])[-2:]
+    points = scan(6).points * np.float32(scale)
+    T_next, registered = box.register(box.prepare(Scan(0, points)))
+    assert not registered
+    np.testing.assert_allclose(T_next, T @ invert(T_before) @ T, atol=1e-6)
+
+
+@every_box
+@pytest.mark.parametrize("n", [26, 32, 36])
+def test_a_scan_that_stays_where_it_was_predicted_is_counted(name, n):
+    box = box_class(name)()
+    T_before, T = drive(box, prepared_drive(name)[:6])[-2:]
+    T_next, registered = box.register(box.prepare(poor_scan(n)))
+    if np.allclose(T_next, T @ invert(T_before) @ T, atol=1e-9):
+        assert not registered
+
+
+@every_box
+def test_prepared_scans_say_what_they_take(name):
+    box, points = box_class(name)(), np.random.default_rng(0).uniform(-50, 50, (200_000, 3))
+    times = np.linspace(0, 0.1, len(points), dtype=np.float32)
+    prepared = box.prepare(Scan(0, points.astype(np.float32), times))
+    held = prepared if isinstance(prepared, tuple) else (prepared.cloud,)
+    points_of = [np.asarray(getattr(part, "points", part)) for part in held]
+    if name == "gicp":
+        points_of = [held[0].points()]
+    assert prepared_bytes(prepared) >= 0.9 * sum(p.nbytes for p in points_of)
+
+
 def parameter_cases():
     return [(name, parameter) for name in BOXES for parameter in box_class(name).space.names]
 
