@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -104,7 +103,9 @@ class CachedScans:
         self.path = path
         self.about: dict[str, Any] = json.loads((path / "about.json").read_text("utf-8"))
         self._index = np.load(path / "index.npy")
-        self._ends = self._index["end"].tolist()
+        self._ends: list[int] = self._index["end"].tolist()
+        # All at once: what is mapped stays even if another process removes the entry.
+        self._points, self._times, self._rings = map(self._map, _ARRAYS)
         # Says when the entry was last of use.
         os.utime(path / "about.json")
 
@@ -130,18 +131,6 @@ class CachedScans:
         stamps: NDArray[np.int64] = self._index["stamp"]
         return stamps
 
-    @cached_property
-    def _points(self) -> NDArray[np.float32]:
-        return self._map("points")
-
-    @cached_property
-    def _times(self) -> NDArray[np.float32]:
-        return self._map("times")
-
-    @cached_property
-    def _rings(self) -> NDArray[np.uint16]:
-        return self._map("rings")
-
     def _map(self, name: str) -> NDArray[Any]:
         path = self.path / f"{name}.npy"
         # An empty file cannot be mapped.
@@ -160,7 +149,8 @@ def find(key: str) -> CachedScans | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        _log.warning("%s: is damaged and left aside (%s)", path, error)
+        _log.warning("%s: is damaged and removed (%s)", path, error)
+        shutil.rmtree(path, ignore_errors=True)
         return None
 
 

@@ -442,11 +442,10 @@ def test_the_hilti_scan(recorded_data: Any) -> None:
 
 
 def test_the_hall(recorded_data: Any) -> None:
-    sequence = opened(recorded_data("hall.bag"), reference="/gt_poses", stop=5.1)
-    scans = list(sequence)
-    assert len(scans) == 11
-    assert 30_000 < len(scans[0]) < 40_000
-    assert len(sequence.reference()) == 177
+    scans = list(opened(recorded_data("hall.bag"), stop=2.1))
+    assert len(scans) == 5
+    assert all(30_000 < len(scan) < 40_000 for scan in scans)
+    assert scans[0].times is None
 
 
 def test_the_folder_of_a_copied_bag_does_not_matter(rec: Any, tmp_path: Path) -> None:

@@ -126,6 +126,15 @@ def test_the_least_recently_used_goes_first(monkeypatch: pytest.MonkeyPatch) -> 
     assert sum(entry.size for entry in cache.list_cache()) <= cache.cap()
 
 
+def test_an_entry_that_is_removed_while_it_is_read_can_be_read_on() -> None:
+    list(cache.tee(scans_of(1), "a", {"name": "a"}))
+    kept = cache.find("a")
+    assert kept is not None
+    cache.clear_cache()
+    assert cache.find("a") is None
+    assert [len(scan) for scan in kept] == [len(scan) for scan in scans_of(1)]
+
+
 def test_what_is_larger_than_the_cap_is_passed_on_and_not_kept(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -148,13 +157,14 @@ def test_listing_and_clearing(rec: Any, tmp_path: Path, cache_folder: Path) -> N
     assert entries(cache_folder) == ["notes.txt"]
 
 
-def test_a_damaged_entry_is_left_aside(
+def test_a_damaged_entry_is_made_anew(
     rec: Any, tmp_path: Path, cache_folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")), cache=True)
     whole = list(open_sequence(config))
     (entry,) = cache_folder.iterdir()
-    for name in ("about.json", "index.npy"):
+    for name in ("about.json", "index.npy", "points.npy"):
+        caplog.clear()
         (entry / name).write_bytes(b"{")
         again = list(open_sequence(config))
         assert [s.stamp for s in again] == [s.stamp for s in whole]
