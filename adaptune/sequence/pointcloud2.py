@@ -134,13 +134,14 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
     time = next((name for name in TIME_FIELDS if name in names), None)
     ring = next((name for name in RING_FIELDS if name in names), None)
-    for name in (*"xyz", time, ring):
-        if name and (raw[name].ndim != 1 or raw[name].dtype.kind not in "iuf"):
+    columns = {name: raw[name] for name in (*"xyz", time, ring) if name}
+    for name, column in columns.items():
+        if column.ndim != 1 or column.dtype.kind not in "iuf":
             raise PointCloudError(f"field {name!r} is not one number for each point")
     with np.errstate(over="ignore", invalid="ignore"):
-        x, y, z = (np.asarray(raw[axis], np.float32) for axis in "xyz")
-        times = None if time is None else _native(raw[time])
-        rings = None if ring is None else np.ascontiguousarray(raw[ring], np.uint16)
+        x, y, z = (np.asarray(columns[axis], np.float32) for axis in "xyz")
+        times = None if time is None else _native(columns[time])
+        rings = None if ring is None else np.ascontiguousarray(columns[ring], np.uint16)
     points = np.empty((len(x), 3), np.float32)
     gather, compact = _kernels()
     if invalid := gather(x, y, z, points):
@@ -150,16 +151,25 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         points, index = points[:count].copy(), index[:count]
         times = None if times is None else times.take(index)
         rings = None if rings is None else rings.take(index)
+    extent = _extent(times)
     # The least and the greatest are not numbers if any is not.
-    if times is not None and times.size and not isfinite(times.min().item() - times.max().item()):
+    if times is not None and not isfinite(extent[1] - extent[0]):
         known = np.isfinite(times)
         points, times = points[known], times[known]
         rings = None if rings is None else rings[known]
+        extent = _extent(times)
     try:
-        start, seconds = timing.resolve(stamp, times)
+        start, seconds = timing.resolve(stamp, times, extent)
     except TimingError as error:
         raise PointCloudError(str(error)) from error
     return Scan(start, points, seconds, rings)
+
+
+def _extent(times: NDArray[Any] | None) -> tuple[float, float]:
+    """The least and the greatest, zeros where there is none."""
+    if times is None or not len(times):
+        return 0.0, 0.0
+    return times.min().item(), times.max().item()
 
 
 def _native(values: NDArray[Any]) -> NDArray[Any]:

@@ -46,7 +46,7 @@ class Timing:
     period: float = 0.1
 
     def resolve(
-        self, stamp: int, values: NDArray[Any] | None
+        self, stamp: int, values: NDArray[Any] | None, extent: tuple[float, float]
     ) -> tuple[int, NDArray[np.float32] | None]:
         """Find the start of a scan, and the time of each point since then.
 
@@ -57,6 +57,8 @@ class Timing:
         values
             Times of the valid points as the driver wrote them, of shape (n,): relative to the
             stamp, or absolute. All finite.
+        extent
+            The least and the greatest of them.
 
         Returns
         -------
@@ -73,7 +75,7 @@ class Timing:
         if values is None or not len(values):
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
             return start, None if values is None else np.empty(0, np.float32)
-        low, high = values.min().item(), values.max().item()
+        low, high = extent
         scale, absolute = self._scale(values.dtype, high)
         span = (high - low) * scale
         if not span <= _LONGEST:
