@@ -234,12 +234,13 @@ def _oddities(
 ) -> tuple[str, ...]:
     told = []
     steps = np.diff(stamps)
-    if stamps.max() == 0:
+    if len(stamps) > 1 and stamps.max() == 0:
         return ("all stamps are zero",)
     for what, number in (
         ("stamps repeat the one before", np.count_nonzero(steps == 0)),
         ("stamps go back in time", np.count_nonzero(steps < 0)),
-        ("stamps are zero", np.count_nonzero(stamps == 0)),
+        # Recordings that count from zero begin with it.
+        ("stamps are zero", np.count_nonzero(stamps[1:] == 0)),
     ):
         if number:
             told.append(f"{number} {what}")

@@ -164,6 +164,7 @@ def test_folders_are_inspected_too(tmp_path: Path) -> None:
     inspection = inspect(tmp_path)
     assert inspection.topics[0].count == 4
     assert inspection.topics[0].rate == pytest.approx(10)
+    assert not inspection.problems
     assert len(list(open_sequence(next(iter(entry(inspection).values()))))) == 4
 
 
