@@ -130,31 +130,24 @@ class _Run:
         begin = time.perf_counter()
         T, self.registered[i] = self.odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
-        if not np.isfinite(T).all():
-            self._go_on(i, prepared)
-            return
         if self._lost(i, T):
             T = self._T_ref_sensor[i]
             self.odometry.start(prepared, T, self._T_ref_steps[i - 1])
             self.restarted[i] = True
-        self.T_odom_sensor[i] = T
-
-    def _go_on(self, i: int, prepared: Any) -> None:
-        """Start anew where there is no pose: at the reference, else where the last pose was."""
-        known = not np.isnan(self._T_ref_steps[i - 1]).any()
-        T = self._T_ref_sensor[i] if known else self.T_odom_sensor[i - 1]
-        if np.isinf(self._bounds[i - 1]):
-            T = self.T_odom_sensor[i - 1]  # a whole run is not helped by the reference
-        else:
-            self.restarted[i] = True
-        self.odometry.start(prepared, T)
+        elif not np.isfinite(T).all():
+            # There is no reference to go on at.
+            T = self.T_odom_sensor[i - 1]
+            self.odometry.start(prepared, T)
         self.T_odom_sensor[i] = T
 
     def _lost(self, i: int, T_odom_sensor: Poses) -> bool:
+        T_ref_step = self._T_ref_steps[i - 1]
+        if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
+            return False
+        if not np.isfinite(T_odom_sensor).all():
+            return True
         T_previous_current = invert(self.T_odom_sensor[i - 1]) @ T_odom_sensor
-        departure = T_previous_current[:3, 3] - self._T_ref_steps[i - 1, :3, 3]
-        if np.isnan(departure).any():
-            return False  # without a reference nothing can be said
+        departure = T_previous_current[:3, 3] - T_ref_step[:3, 3]
         return bool(np.linalg.norm(departure) > self._bounds[i - 1])
 
 

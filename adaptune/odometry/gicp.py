@@ -73,10 +73,11 @@ class KeyframeGicp(KeyframeOdometry):
 
 def prepare(scan: Scan, settings: Settings) -> Prepared:
     """Crop and downsample a scan, and estimate its covariances."""
+    points = crop(scan, settings.min_range)
+    if len(points) < MIN_POINTS:
+        return Prepared(small_gicp.PointCloud(points), None)
     cloud, tree = small_gicp.preprocess_points(
-        crop(scan, settings.min_range),
-        downsampling_resolution=settings.downsampling,
-        num_threads=1,
+        points, downsampling_resolution=settings.downsampling, num_threads=1
     )
     return Prepared(cloud, tree)
 

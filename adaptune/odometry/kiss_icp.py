@@ -1,5 +1,6 @@
 """KISS-ICP, through its Python class."""
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -7,6 +8,7 @@ from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 from kiss_icp.mapping import get_voxel_hash_map
 from kiss_icp.threshold import get_threshold_estimator
+from numpy.typing import NDArray
 from pydantic import Field
 
 from adaptune.geometry import Poses
@@ -23,6 +25,20 @@ class Settings(BaseSettings):
     min_range: float = Field(1.0, ge=0)
     max_range: float = Field(100.0, gt=0)
     deskew: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Points, their times as shares of the turn, and whether enough are in range."""
+
+    points: NDArray[np.float64]
+    times: NDArray[np.float64]
+    usable: bool
+
+    @property
+    def nbytes(self) -> int:
+        """What the arrays hold."""
+        return self.points.nbytes + self.times.nbytes
 
 
 class Kiss(Odometry):
@@ -68,8 +84,8 @@ class Kiss(Odometry):
         A new `initial_threshold` is where the adaptive threshold begins again; a new
         `min_motion_th` alone lets it begin where it is.
         """
-        before = self.parameters
-        self.parameters = before | parameters
+        before = dict(self.parameters)
+        super().configure(parameters)
         changed = {name for name, value in self.parameters.items() if value != before[name]}
         kiss, config = self._kiss, self._config()
         kiss.config = config
@@ -83,18 +99,19 @@ class Kiss(Odometry):
                 begin.adaptive_threshold.initial_threshold = kiss.adaptive_threshold.get_threshold()
             kiss.adaptive_threshold = get_threshold_estimator(begin)
 
-    def prepare(self, scan: Scan) -> tuple[Any, Any]:
+    def prepare(self, scan: Scan) -> Prepared:
         """See `Odometry.prepare`."""
-        squared = np.einsum("ij,ij->i", scan.points, scan.points)
-        low, high = self.settings.min_range, self.settings.max_range
-        near = scan.select((squared >= low * low) & (squared <= high * high))
+        points = scan.points.astype(np.float64)
+        squared = np.einsum("ij,ij->i", points, points)
+        near, far = self.settings.min_range, self.settings.max_range
+        n_in_range = np.count_nonzero((squared > near**2) & (squared < far**2))
         times = np.empty(0)
-        if scan.times is not None and near.times is not None and len(near):
+        if scan.times is not None and len(scan.times):
             # KISS-ICP wants the share of the turn.
             first, last = float(scan.times.min()), float(scan.times.max())
             if last > first:
-                times = (near.times.astype(np.float64) - first) / (last - first)
-        return near.points.astype(np.float64), times
+                times = (scan.times.astype(np.float64) - first) / (last - first)
+        return Prepared(points, times, bool(n_in_range >= MIN_POINTS))
 
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
@@ -108,10 +125,9 @@ class Kiss(Odometry):
 
     def register(self, prepared: Any) -> Registration:
         """See `Odometry.register`."""
-        points, times = prepared
         kiss = self._kiss
-        if len(points) < MIN_POINTS:
+        if not prepared.usable:
             kiss.last_pose = kiss.last_pose @ kiss.last_delta
             return Registration(kiss.last_pose, registered=False)
-        kiss.register_frame(points, times)
+        kiss.register_frame(prepared.points, prepared.times)
         return Registration(kiss.last_pose)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A point cloud in the sensor's frame.
+    """A point cloud in the sensor's frame; its arrays cannot be written to.
 
     Attributes
     ----------
@@ -27,6 +27,12 @@ class Scan:
     points: NDArray[np.float32]
     times: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
+
+    def __post_init__(self) -> None:
+        # Decoded scans may be shared by all who use them, as those from the cache are.
+        for array in (self.points, self.times, self.rings):
+            if array is not None:
+                array.flags.writeable = False
 
     def __len__(self) -> int:
         return len(self.points)
