@@ -414,7 +414,7 @@ class Loam(_Grid):
             "planar_feat_threshold": Float(low=0.1, high=10.0, baseline=1.0, log=True),
             "max_edge_neighbor_dist": Float(low=0.5, high=10.0, baseline=2.0, log=True),
             "max_plane_neighbor_dist": Float(low=0.5, high=10.0, baseline=4.0, log=True),
-            "max_avg_point_plane_dist": Float(low=0.05, high=1.0, baseline=0.2, log=True),
+            "max_planar_feats_per_sector": Integer(low=5, high=200, baseline=50, log=True),
             "num_local_map_scans": Integer(low=1, high=20, baseline=3, log=True),
         }
     )

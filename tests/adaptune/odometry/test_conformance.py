@@ -23,7 +23,10 @@ STEP = 0.4
 """Metres between scans."""
 N_SCANS = 16
 
-every_box = pytest.mark.parametrize("name", BOXES)
+CLEAN = [name for name in BOXES if box_class(name).clean]
+"""Those that live in this process; test_evalio.py holds what the others must do."""
+
+every_box = pytest.mark.parametrize("name", CLEAN)
 
 
 @cache
@@ -259,7 +262,7 @@ def test_prepared_scans_say_what_they_take(name):
 
 
 def parameter_cases():
-    return [(name, parameter) for name in BOXES for parameter in box_class(name).space.names]
+    return [(name, parameter) for name in CLEAN for parameter in box_class(name).space.names]
 
 
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())
@@ -345,7 +348,7 @@ def test_settings_that_do_not_exist_are_refused(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "help_"), [("gipc", "did you mean 'gicp'"), ("zzz", "'gicp', 'kiss_icp', 'ndt'")]
+    ("name", "help_"), [("gipc", "did you mean 'gicp'"), ("zzz", "'gicp', 'kiss_icp'.*'ndt'")]
 )
 def test_an_odometry_that_does_not_exist(name, help_):
     with pytest.raises(OdometryError, match=help_):

@@ -1,0 +1,198 @@
+"""What adapters add to their odometries, and what changing parameters on the way costs.
+
+    python benchmarks/odometry.py adapters RECORDING.bag
+    python benchmarks/odometry.py switching RECORDING.bag [ODOMETRY ...]
+
+The recording is a simulated course's, as `adaptune simulate` leaves it. *adapters* runs every
+odometry that can be had with its default parameters and tells what a scan takes, how much of that
+is not spent in the odometry's own code, and how much more a process of its own takes. Limit: 5 %
+of the odometry's time, or 0.3 ms where that is more. *switching* hands over to the same parameters
+every 5 s. RTE over 25 m, one core.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import small_gicp
+
+from adaptune import cores, open3d
+from adaptune.geometry import Poses
+from adaptune.metrics import sub_trajectory_rte
+from adaptune.odometry import BOXES, Box, HandOver, Isolated, Limits, box_class
+from adaptune.sequence import Scan, SequenceConfig, open_sequence
+
+LENGTH = 25.0
+WARM_UPS = (1.0, 2.0, 4.0, 8.0, 12.0)
+EVERY = 5.0
+
+
+class Clock:
+    """Adds up what the wrapped functions take."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def wrap(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function that does the same on the clock."""
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            begin = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.seconds += time.perf_counter() - begin
+
+        return timed
+
+
+class Timed:
+    """An object whose methods run on a clock."""
+
+    def __init__(self, wrapped: Any, clock: Clock):
+        self.__dict__.update(wrapped=wrapped, clock=clock)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self.wrapped, name)
+        return self.clock.wrap(value) if callable(value) else value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self.wrapped, name, value)
+
+
+def read(path: Path) -> tuple[list[Scan], Poses]:
+    """Scans, and the reference at their stamps."""
+    sequence = open_sequence(
+        SequenceConfig(bag=str(path), points="/velodyne_points", reference="/gt_poses")
+    )
+    scans = list(sequence)
+    reference = sequence.reference()
+    if reference is None:
+        sys.exit(f"{path}: has no /gt_poses")
+    return scans, reference.at(np.array([scan.stamp for scan in scans]))
+
+
+def drive(
+    box: Box, scans: list[Scan], before: Callable[[int], None] = lambda _: None
+) -> tuple[Poses, list[float]]:
+    """Poses, and what each scan but the first took in seconds."""
+    box.start(box.prepare(scans[0]), np.eye(4))
+    poses, seconds = [np.eye(4)], []
+    for i, scan in enumerate(scans[1:], start=1):
+        before(i)
+        begin = time.perf_counter()
+        poses.append(box.register(box.prepare(scan)).T_odom_sensor)
+        seconds.append(time.perf_counter() - begin)
+    return np.array(poses), seconds
+
+
+def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
+    """Poses, milliseconds a scan, and those of them in the odometry's own code."""
+    clock = Clock()
+    box: Any = box_class(name)()
+    box.start(box.prepare(scans[0]), np.eye(4))
+    originals = small_gicp.align, small_gicp.preprocess_points
+    registration = open3d.load().pipelines.registration
+    ndt = registration.registration_ndt
+    small_gicp.align, small_gicp.preprocess_points = map(clock.wrap, originals)
+    registration.registration_ndt = clock.wrap(ndt)
+    for attribute in ("_kiss", "_pipeline"):
+        if hasattr(box, attribute):
+            setattr(box, attribute, Timed(getattr(box, attribute), clock))
+    poses, own = [np.eye(4)], []
+    begin = time.perf_counter()
+    for scan in scans[1:]:
+        at = clock.seconds
+        poses.append(box.register(box.prepare(scan)).T_odom_sensor)
+        own.append(clock.seconds - at)
+    whole = (time.perf_counter() - begin) / len(own)
+    small_gicp.align, small_gicp.preprocess_points = originals
+    registration.registration_ndt = ndt
+    return np.array(poses), 1e3 * whole, 1e3 * float(np.mean(own))
+
+
+def adapters(path: Path) -> None:
+    """Print a row for every odometry."""
+    scans, T_ref = read(path)
+    print("odometry          RTE %   ms   adapter ms    +process ms   changes by")
+    for name in BOXES:
+        cls = box_class(name)
+        try:
+            poses, whole, own = own_time(name, scans)
+        except Exception as error:
+            print(f"{name:16} {error}")
+            continue
+        isolated = ""
+        if not cls.clean:
+            some = scans[:60]
+            box: Any = cls()
+            here = drive(box, some)[1]
+            there = drive(Isolated(name, {}, cls.settings_type(), Limits()), some)[1]
+            isolated = f"{1e3 * np.median(np.subtract(there, here)):.2f}"
+        rte = np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH))
+        print(
+            f"{name:16} {rte:6.3f} {whole:6.1f} {whole - own:6.2f} ({(whole - own) / own:4.0%})"
+            f"  {isolated:>8}       {'itself' if cls.live else 'bank, hand-over'}",
+            flush=True,
+        )
+
+
+def switching(path: Path, names: list[str]) -> None:
+    """Print the RTE of hand-overs to the same parameters, for every length of warm-up."""
+    scans, T_ref = read(path)
+    first = scans[0].stamp
+    print("odometry           alone " + "".join(f"{w:8.0f} s" for w in WARM_UPS) + "   itself")
+    for name in names:
+        cls = box_class(name)
+
+        def make(_: Any, name: str = name, cls: Any = cls) -> Box:
+            return cls() if cls.clean else Isolated(name, {}, cls.settings_type(), Limits())
+
+        def rte(box: Box, before: Callable[[int], None] = lambda _: None) -> float:
+            poses, _ = drive(box, scans, before)
+            return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
+
+        def due(i: int) -> int | None:
+            """How many switches there were before, if there is one at this scan."""
+            now, before = ((scans[k].stamp - first) // int(EVERY * 1e9) for k in (i, i - 1))
+            return now if now > before else None
+
+        row = [rte(make({}))]
+        for warm_up in WARM_UPS:
+            box = HandOver(make, {"number": 0}, warm_up)
+
+            def before(i: int, box: HandOver = box) -> None:
+                if (number := due(i)) is not None:
+                    box.configure({"number": number})
+
+            row.append(rte(box, before))
+        itself = ""
+        if cls.live:
+            live: Any = cls()
+
+            def again(i: int, live: Any = live) -> None:
+                if due(i) is not None:
+                    # Another value first, so that it has to do what a change takes.
+                    there = live.parameters
+                    for value in (1.0 + 1e-9, 1.0):
+                        live.configure(
+                            {k: v * value for k, v in there.items() if isinstance(v, float)}
+                        )
+
+            itself = f"{rte(live, again):8.3f}"
+        print(
+            f"{name:16} {row[0]:7.3f} " + "".join(f"{r:10.3f}" for r in row[1:]), itself, flush=True
+        )
+
+
+if __name__ == "__main__":
+    cores.pin(1)
+    if len(sys.argv) == 3 and sys.argv[1] == "adapters":
+        adapters(Path(sys.argv[2]))
+    elif len(sys.argv) > 2 and sys.argv[1] == "switching":
+        switching(Path(sys.argv[2]), sys.argv[3:] or ["gicp", "vgicp", "kiss_icp", "mad_icp"])
+    else:
+        sys.exit(__doc__)
