@@ -1,6 +1,8 @@
 """The command line: the one place that knows both stages."""
 
 import logging
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -156,6 +158,20 @@ def cache(
         console.print(f"Freed {clear_cache() / 1e9:.2f} GB.", highlight=False)
     else:
         console.print(render_cache())
+
+
+@app.command()
+def serve() -> None:
+    """Answer another program's messages with an odometry, over standard input and output.
+
+    The first message names the odometry. What the odometry itself writes goes to standard error.
+    `docs/odometry.md` describes the messages.
+    """
+    from adaptune.odometry.wire import serve as answer
+
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        answer(sys.stdin.buffer, writer)
 
 
 @app.command()

@@ -140,10 +140,31 @@ def adapters(path: Path) -> None:
         )
 
 
+def rte_of(
+    box: Box, scans: list[Scan], T_ref: Poses, switch: Callable[[int], None] | None = None
+) -> float:
+    """RTE in percent of a box that is made to switch every so often."""
+    first = scans[0].stamp
+
+    def before(i: int) -> None:
+        now, last = ((scans[k].stamp - first) // int(EVERY * 1e9) for k in (i, i - 1))
+        if switch is not None and now > last:
+            switch(now)
+
+    poses, _ = drive(box, scans, before)
+    return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
+
+
+def there_and_back(box: Any) -> None:
+    """Change all real numbers a little and back, so that a box does what a change takes."""
+    real = {name: v for name, v in box.parameters.items() if isinstance(v, float)}
+    box.configure({name: v * (1.0 + 1e-9) for name, v in real.items()})
+    box.configure(real)
+
+
 def switching(path: Path, names: list[str]) -> None:
     """Print the RTE of hand-overs to the same parameters, for every length of warm-up."""
     scans, T_ref = read(path)
-    first = scans[0].stamp
     print("odometry           alone " + "".join(f"{w:8.0f} s" for w in WARM_UPS) + "   itself")
     for name in names:
         cls = box_class(name)
@@ -151,38 +172,14 @@ def switching(path: Path, names: list[str]) -> None:
         def make(_: Any, name: str = name, cls: Any = cls) -> Box:
             return cls() if cls.clean else Isolated(name, {}, cls.settings_type(), Limits())
 
-        def rte(box: Box, before: Callable[[int], None] = lambda _: None) -> float:
-            poses, _ = drive(box, scans, before)
-            return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
-
-        def due(i: int) -> int | None:
-            """How many switches there were before, if there is one at this scan."""
-            now, before = ((scans[k].stamp - first) // int(EVERY * 1e9) for k in (i, i - 1))
-            return now if now > before else None
-
-        row = [rte(make({}))]
+        row = [rte_of(make({}), scans, T_ref)]
         for warm_up in WARM_UPS:
             box = HandOver(make, {"number": 0}, warm_up)
-
-            def before(i: int, box: HandOver = box) -> None:
-                if (number := due(i)) is not None:
-                    box.configure({"number": number})
-
-            row.append(rte(box, before))
+            row.append(rte_of(box, scans, T_ref, lambda n, box=box: box.configure({"number": n})))
         itself = ""
         if cls.live:
             live: Any = cls()
-
-            def again(i: int, live: Any = live) -> None:
-                if due(i) is not None:
-                    # Another value first, so that it has to do what a change takes.
-                    there = live.parameters
-                    for value in (1.0 + 1e-9, 1.0):
-                        live.configure(
-                            {k: v * value for k, v in there.items() if isinstance(v, float)}
-                        )
-
-            itself = f"{rte(live, again):8.3f}"
+            itself = f"{rte_of(live, scans, T_ref, lambda _, live=live: there_and_back(live)):8.3f}"
         print(
             f"{name:16} {row[0]:7.3f} " + "".join(f"{r:10.3f}" for r in row[1:]), itself, flush=True
         )

@@ -1,5 +1,8 @@
 import io
+import os
 import re
+import subprocess
+import sys
 import time
 
 import drives
@@ -184,6 +187,29 @@ def test_a_conversation():
     assert [a.header["type"] for a in answers] == ["done", "done", "done", "pose"]
     assert answers[0].header["live"] is True
     assert answers[3].arrays["pose"][0, 3] == pytest.approx(0.3)
+
+
+def test_a_conversation_with_the_command_line():
+    process = subprocess.Popen(
+        [sys.executable, "-m", "adaptune.cli", "serve"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    settings = {"fault": "words", "at": 0}
+    points = np.zeros((5, 3), np.float32)
+    with process:
+        wire.send(process.stdin, HELLO | {"settings": settings})
+        assert wire.receive(process.stdout).header["version"] == 1
+        wire.send(process.stdin, {"type": "start", "stamp": -1}, points=points, pose=np.eye(4))
+        assert wire.receive(process.stdout).header["type"] == "done"
+        # What the odometry writes does not come between the messages.
+        wire.send(process.stdin, {"type": "register", "stamp": 0}, points=points)
+        assert wire.receive(process.stdout).arrays["pose"][0, 3] == pytest.approx(0.1)
+        process.stdin.close()
+        assert b"about to go wrong" in process.stderr.read()
+    assert process.returncode == 0
 
 
 @pytest.mark.parametrize(
