@@ -114,9 +114,16 @@ class Isolated:
 
     def register(self, prepared: Scan) -> Registration:
         """See `Odometry.register`."""
-        answer = self._ask(
-            {"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared)
-        )
+        self.request(prepared)
+        return self.result()
+
+    def request(self, prepared: Scan) -> None:
+        """Begin to `register`: several instances may be at work at once."""
+        self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
+
+    def result(self) -> Registration:
+        """What became of the `request`."""
+        answer = self._receive()
         if answer is None:
             return Registration(np.full((4, 4), np.nan), registered=False)
         T_odom_sensor = answer.arrays["pose"]
@@ -140,13 +147,20 @@ class Isolated:
     def __del__(self) -> None:
         self.close()
 
-    def _ask(self, header: dict[str, Any], **arrays: Any) -> wire.Message | None:
-        """Send a message and wait for the answer; None if there is none any more."""
+    def _ask(self, header: dict[str, Any], **arrays: Any) -> None:
+        self._send(header, **arrays)
+        self._receive()
+
+    def _send(self, header: dict[str, Any], **arrays: Any) -> None:
+        if self._stream is not None:
+            # One that does not listen any more has told why, or will have ended.
+            with contextlib.suppress(OSError):
+                wire.send(self._stream, header, **arrays)
+
+    def _receive(self) -> wire.Message | None:
+        """Wait for the answer; None if there is none any more."""
         if self._stream is None:
             return None
-        # One that does not listen any more has told why, or will have ended.
-        with contextlib.suppress(OSError):
-            wire.send(self._stream, header, **arrays)
         try:
             answer = wire.receive(self._stream)
         except (OSError, wire.WireError):

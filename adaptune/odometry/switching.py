@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import Box, OdometryError, Registration
+from adaptune.odometry.isolation import Isolated
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 
@@ -198,7 +199,7 @@ class Bank:
     def register(self, prepared: Stamped) -> Registration:
         """See `Odometry.register`."""
         T_own_before = self._T_own_sensor
-        registrations = [box.register(prepared.prepared) for box in self._boxes]
+        registrations = _register_all(self._boxes, prepared.prepared)
         self._T_own_sensor = [r.T_odom_sensor for r in registrations]
         moved = [
             (invert(before) @ now)[:3, 3]
@@ -219,6 +220,14 @@ class Bank:
         for i in lost:
             self._T_own_sensor[i] = self._recent.warm_up(self._boxes[i])
             self.restarts += 1
+
+
+def _register_all(boxes: Sequence[Box], prepared: Any) -> list[Registration]:
+    """Register a scan with every instance; those in processes of their own work side by side."""
+    for box in boxes:
+        if isinstance(box, Isolated):
+            box.request(prepared)
+    return [box.result() if isinstance(box, Isolated) else box.register(prepared) for box in boxes]
 
 
 def _distances(moved: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,8 +3,16 @@ import pytest
 import turns
 
 from adaptune.geometry import invert
-from adaptune.odometry import Bank, HandOver, Odometry, OdometryError, Registration
-from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry import (
+    Bank,
+    HandOver,
+    Isolated,
+    Limits,
+    Odometry,
+    OdometryError,
+    Registration,
+)
+from adaptune.odometry.gicp import KeyframeGicp, Settings
 from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
 
@@ -195,6 +203,16 @@ def test_a_bank_of_equal_instances_is_the_single_run_bit_by_bit():
     bank = Bank(lambda _: KeyframeGicp(NEAR), [NEAR, FAR], warm_up=1.0)
     switched = drive(bank, [NEAR, FAR], n=15)
     np.testing.assert_array_equal(switched, drive(KeyframeGicp(NEAR), n=15))
+
+
+def test_a_bank_in_other_processes_is_the_same():
+    def elsewhere(parameters):
+        return Isolated("gicp", parameters, Settings(), Limits())
+
+    a, b = (
+        drive(Bank(make, [NEAR, FAR], 0.5), [NEAR, FAR], 15) for make in (KeyframeGicp, elsewhere)
+    )
+    np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
