@@ -25,8 +25,8 @@ def _build(tile: Tile) -> list[Mesh]:
     trees = [parts.tree(v) for v in range(parts.VARIANTS)]
     meshes = []
     for models, density, near, far, sizes in (
-        (boulders, 0.006, 4.0, 60.0, (0.3, 1.3)),
-        (bushes, 0.007, 4.0, 60.0, (0.6, 1.6)),
+        (boulders, 0.010, 4.0, 60.0, (0.3, 1.3)),
+        (bushes, 0.010, 4.0, 60.0, (0.6, 1.6)),
         (trees, 0.0006, 15.0, 50.0, (0.7, 1.2)),
         (trees, 0.004, 50.0, 75.0, (0.8, 1.4)),
     ):
