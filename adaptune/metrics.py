@@ -153,3 +153,15 @@ def kitti_error(
         float(np.degrees(np.mean(np.concatenate(rotations)))),
         tuple(used),
     )
+
+
+FAILURE = 30.0
+"""Percent. A lost track and any error beyond count as this much."""
+
+
+def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Bound errors in percent by `FAILURE`, so that one lost track does not drown all others.
+
+    NaN, for what is not known, stays.
+    """
+    return np.minimum(errors.astype(np.float64), FAILURE)

@@ -38,7 +38,7 @@ class HealthCheck(BaseModel):
         elapsed
             Seconds since `last_velocity`.
         """
-        if not np.isfinite(velocity).all() or np.linalg.norm(velocity) > self.max_speed:
+        if np.linalg.norm(velocity) > self.max_speed:
             return False
         if last_velocity is None:
             return True

@@ -1,0 +1,47 @@
+# `make demo` and `make test` need Python 3.11 or newer, and nothing else.
+
+PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python3)
+VENV ?= .venv
+BIN := $(VENV)/bin
+STUDY := configs/demo.yaml
+
+.PHONY: help demo test lint types pytest format clean
+
+help:
+	@echo "make demo    simulate, train, replay and compare: the whole way, in a few minutes"
+	@echo "make test    linters, type checker, import contract and tests"
+	@echo "make format  format the code"
+	@echo "make clean   remove the virtual environment, caches and runs"
+
+demo: $(VENV)/.installed
+	$(BIN)/adaptune simulate $(STUDY)
+	$(BIN)/adaptune offline $(STUDY)
+	$(BIN)/adaptune online $(STUDY)
+	$(BIN)/adaptune compare $(STUDY)
+
+test: lint types pytest
+
+lint: $(VENV)/.installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+
+types: $(VENV)/.installed
+	$(BIN)/mypy
+
+pytest: $(VENV)/.installed
+	$(BIN)/pytest -n auto
+
+format: $(VENV)/.installed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "adaptune needs Python 3.11 or newer; set PYTHON, as in: make demo PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) build runs *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,328 @@
+"""The command line: the one place that knows both stages."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from typer.core import TyperGroup
+
+import adaptune
+from adaptune.errors import AdaptuneError
+from adaptune.study import load_study
+
+console = Console()
+errors = Console(stderr=True)
+
+
+class _Commands(TyperGroup):
+    """Ends with code 2 for what the user can mend, and with 130 for Ctrl-C."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (AdaptuneError, OSError) as error:
+            if isinstance(error, BrokenPipeError):
+                raise  # whoever read our output has gone
+            errors.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+            raise typer.Exit(2) from error
+        except KeyboardInterrupt as error:
+            errors.print("interrupted; run the same command again to resume", style="yellow")
+            raise typer.Exit(130) from error
+
+
+app = typer.Typer(
+    name="adaptune",
+    cls=_Commands,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help=(
+        "Tune the parameters of a LiDAR odometry, and keep tuning them while the robot drives.\n\n"
+        "A study is a YAML file: an odometry, its parameters, sequences to train and to test on. "
+        "Everything about it is kept in a folder, and the same command run again goes on where "
+        "the last one stopped.\n\n"
+        "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
+        "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
+        "    adaptune validate configs/demo.yaml    # would adapting pay elsewhere?\n\n"
+        "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
+        "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive"
+    ),
+)
+
+LOG_EVERY = 5.0
+"""Seconds between lines of progress where there is no terminal to draw a bar on."""
+
+StudyFile = Annotated[
+    Path, typer.Argument(metavar="STUDY", help="The study's YAML.", show_default=False)
+]
+Override = Annotated[
+    list[str],
+    typer.Option(
+        "-o",
+        "--override",
+        metavar="KEY=VALUE",
+        help="Replace a value of the YAML, as in `-o offline.trials=128`. May be repeated.",
+        show_default=False,
+    ),
+]
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        help="The study's folder.", show_default="the YAML's name, under runs/", file_okay=False
+    ),
+]
+
+
+def _version(show: bool) -> None:
+    if show:
+        console.print(f"adaptune {adaptune.__version__}", highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")] = False,
+    _: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version.")
+    ] = False,
+) -> None:
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(message)s",
+        datefmt="[%X]",
+        handlers=[RichHandler(console=errors, show_path=False, show_level=False, markup=False)],
+    )
+    for chatty in ("matplotlib", "numba", "asyncio"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+@app.command()
+def simulate(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    overwrite: Annotated[bool, typer.Option(help="Record again what is there.")] = False,
+) -> None:
+    """Record the study's simulated courses, as bags with ground truth.
+
+    Each course under `courses:` becomes a bag in the BotanicGarden layout, with its truth in a TUM
+    file and a picture beside it.
+    """
+    from adaptune.simulation import record
+
+    loaded = load_study(study, override, folder)
+    if not loaded.config.courses:
+        raise AdaptuneError(f"{study}: courses: there is none to simulate")
+    loaded.open()
+    with _progress() as progress:
+        for name, course in loaded.config.courses.items():
+            path = loaded.recording(name)
+            if path.exists() and not overwrite:
+                continue
+
+            def step(done: int, total: int, name: str = name) -> None:
+                progress(name, done, total)
+
+            record(course, path, overwrite=overwrite, progress=step)
+    console.print(f"Recordings are in {loaded.recording('*').parent}/", highlight=False)
+
+
+@app.command()
+def offline(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+) -> None:
+    """Run trials on the training sequences, and fit the error model.
+
+    Each trial runs one parameter set on every training sequence. The table shows the *baseline*
+    (the odometry's own parameters), the *fixed* set (the best one over all training sequences),
+    and each sequence's own best. Stop it with Ctrl-C and run it again to resume.
+    """
+    from adaptune import report
+    from offline.campaign import train
+
+    loaded = load_study(study, override, folder)
+    console.print(f"Seed {loaded.config.offline.seed}.", highlight=False)
+    with _progress() as progress:
+        training = train(loaded, progress)
+    model = training.model
+    rows: list[dict[str, Any]] = []
+    for name, means in training.means.items():
+        best = min(range(len(means)), key=means.__getitem__)
+        rows.append(
+            {
+                "sequence": name,
+                "baseline": means[0],
+                "fixed": means[model.fixed],
+                "own best": means[best],
+                "_own best set": _short(model.sets[best]),
+                "baseline, whole run": training.whole[name][0],
+                "fixed, whole run": training.whole[name][1],
+            }
+        )
+    report.write_rows(loaded.folder, "training", rows)
+    console.print(
+        report.table(
+            f"RTE [%] over {model.length:g} m in training, {len(model.sets)} parameter sets",
+            rows,
+            "Trials start anew at the reference after a lost track, which counts as 30 %; whole "
+            "runs do not.",
+        )
+    )
+    console.print(f"Baseline: {_short(model.sets[0])}", highlight=False)
+    console.print(f"Fixed: {_short(model.sets[model.fixed])}", highlight=False)
+    console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)
+
+
+@app.command()
+def validate(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+) -> None:
+    """Tell whether adapting would pay in places that were not trained on.
+
+    Leaves out one training sequence after the other, fits on the rest, and looks up the errors of
+    the sets that would have been chosen, second by second: no odometry is run. Numbers are ratios
+    to the error of the fixed set, which is chosen without that sequence too.
+    """
+    from adaptune import report
+    from offline.validation import validate as validate_study
+
+    loaded = load_study(study, override, folder)
+    with _progress() as progress:
+        validation, rows = validate_study(loaded, lambda i, n: progress("sequences", i, n))
+    console.print(
+        report.table(
+            "Error as a ratio to the fixed set's, each sequence left out in turn",
+            rows,
+            "Oracles know the errors: the best set of the sequence, and of every second.",
+        )
+    )
+    for rule in loaded.config.online.rules:
+        console.print(validation.verdict(rule), highlight=False)
+
+
+@app.command()
+def online(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
+    ] = None,
+    again: Annotated[bool, typer.Option(help="Replay what has been replayed.")] = False,
+) -> None:
+    """Replay the test sequences: baseline, fixed, and adaptive by every rule.
+
+    Once a second, the adaptive replays describe the newest scan and take the parameter set that
+    the error model prefers. Each replay writes its trajectory (TUM), every selection with its
+    predicted error, and what each scan took (CSV).
+    """
+    from adaptune.cores import pin
+    from online.comparison import run_replays
+
+    loaded = load_study(study, override, folder)
+    loaded.open()
+    unpin = pin(0)
+    try:
+        with _progress() as progress:
+            made = run_replays(loaded, model or loaded.folder / "model.npz", again, progress)
+    finally:
+        unpin()
+    console.print(f"{made} replays made; all are in {loaded.folder / 'replays'}/", highlight=False)
+
+
+@app.command()
+def compare(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+) -> None:
+    """Compare the replays: a table, CSV, JSON, and a picture for every test sequence.
+
+    *RTE* is the mean sub-trajectory error; *vs fixed* its ratio to the fixed set's, below 1 where
+    adapting won. Intervals are of a block bootstrap over time: they speak of these drives, not of
+    other places.
+    """
+    from adaptune import report
+    from online.comparison import compare as compare_replays
+
+    loaded = load_study(study, override, folder)
+    rows = compare_replays(loaded)
+    console.print(
+        report.table(
+            f"RTE over {loaded.config.sub_trajectory:g} m on test sequences",
+            rows,
+            "Intervals: block bootstrap over time, 2000 resamples, seed 0. All: mean RTE, "
+            "geometric mean of the ratios.",
+        )
+    )
+    console.print(f"Tables and pictures: {loaded.folder / 'comparison'}/", highlight=False)
+
+
+def _short(parameters: dict[str, Any]) -> str:
+    return ", ".join(
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in parameters.items()
+    )
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar for each thing that is done; where there is no terminal, a line now and then."""
+    if not errors.is_terminal:
+        log = logging.getLogger("adaptune")
+        last = time.monotonic()
+
+        def say(what: str, done: int, total: int) -> None:
+            nonlocal last
+            if done >= total or time.monotonic() - last > LOG_EVERY:
+                last = time.monotonic()
+                log.info("%s: %d of %d", what, done, total)
+
+        yield say
+        return
+    bars = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=errors,
+    )
+    tasks: dict[str, TaskID] = {}
+    with bars:
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=total)
+            bars.update(tasks[what], completed=done, total=total)
+
+        yield show
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

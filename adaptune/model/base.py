@@ -1,0 +1,101 @@
+"""What selection rules learn from, and what they answer."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.metrics import cap
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Errors of the same parameter sets on the frames of several sequences.
+
+    Attributes
+    ----------
+    features : ndarray of shape (n_frames, n_features)
+        What the scan of each frame looks like, scaled.
+    sequence : ndarray of shape (n_frames,)
+        Number of the sequence that each frame belongs to.
+    errors : ndarray of shape (n_frames, n_sets)
+        Sub-trajectory RTE in percent, infinite where the track was lost. Frames without a
+        sub-trajectory are left out.
+    sets : ndarray of shape (n_sets, n_parameters)
+        The parameter sets in the unit cube.
+    fixed : int
+        The one set that is best over all sequences.
+    """
+
+    features: NDArray[np.float64]
+    sequence: NDArray[np.intp]
+    errors: NDArray[np.float32]
+    sets: NDArray[np.float64]
+    fixed: int
+
+
+def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Mean capped error of every set, each sequence weighing the same.
+
+    Parameters
+    ----------
+    errors
+        Percent, of shape (n_frames, n_sets).
+    sequence
+        Number of the sequence of each frame, of shape (n_frames,).
+
+    Returns
+    -------
+    ndarray of shape (n_sets,)
+        Percent. The *fixed* set is where this is least; of equal ones, the first.
+    """
+    capped = cap(errors)
+    means = [capped[sequence == s].mean(axis=0) for s in np.unique(sequence)]
+    return np.asarray(np.mean(means, axis=0))
+
+
+class Selection(NamedTuple):
+    """The set chosen for a scan.
+
+    Attributes
+    ----------
+    set_index : int
+        Of the parameter set.
+    predicted_error : float
+        Percent.
+    predicted_fixed : float
+        Percent, what the fixed set is predicted to have here.
+    """
+
+    set_index: int
+    predicted_error: float
+    predicted_fixed: float
+
+
+class Rule(ABC):
+    """A way to choose a parameter set for a scan."""
+
+    @abstractmethod
+    def fit(self, data: TrainingData) -> Self:
+        """Learn; whatever does not depend on the scan is computed here."""
+
+    @abstractmethod
+    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Predict the error of every set for one scan.
+
+        Parameters
+        ----------
+        feature
+            What the scan looks like, of shape (n_features,).
+
+        Returns
+        -------
+        ndarray of shape (n_sets,)
+            Percent.
+        """
+
+    @abstractmethod
+    def select(self, feature: NDArray[np.float64]) -> Selection:
+        """Choose a set for one scan described by `feature`, of shape (n_features,)."""

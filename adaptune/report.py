@@ -1,0 +1,156 @@
+"""What people look at: tables on the terminal, CSV and JSON beside them, and pictures."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import rich.box
+from numpy.typing import NDArray
+from rich.table import Table
+
+from adaptune.files import replacing, write_text
+
+COLOURS = {"baseline": "#7f7f7f", "fixed": "#1f77b4", "paper": "#ff7f0e", "paired": "#2ca02c"}
+STYLES: dict[str, dict[str, Any]] = {"fixed": {"lw": 4.0, "alpha": 0.35}}
+"""Adaptive modes often take the fixed set, and must not hide it."""
+_FEW = 10
+
+
+class Track(NamedTuple):
+    """One mode's way through a sequence, for the picture.
+
+    Attributes
+    ----------
+    seconds : ndarray of shape (n,)
+        Since the first scan.
+    errors : ndarray of shape (n,)
+        Sub-trajectory RTE in percent.
+    restarted : ndarray of shape (n,)
+    choice_seconds : ndarray of shape (m,)
+    choices : dict
+        For every parameter its values, of shape (m,).
+    """
+
+    seconds: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    restarted: NDArray[np.bool_]
+    choice_seconds: NDArray[np.float64]
+    choices: Mapping[str, Sequence[Any]]
+
+
+def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
+    """Rows of equal keys as a table that fits 80 columns where it can.
+
+    Numbers stand to the right, and a gap where the first column changes. Keys that start with an
+    underscore are for files only.
+    """
+    made = Table(
+        title=title,
+        title_justify="left",
+        caption=caption,
+        caption_justify="left",
+        box=rich.box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    keys = [key for key in (rows[0] if rows else {}) if not key.startswith("_")]
+    for key in keys:
+        numbers = all(isinstance(row[key], int | float | None) for row in rows)
+        made.add_column(
+            key, justify="right" if numbers else "left", no_wrap=key == keys[0], overflow="fold"
+        )
+    for i, row in enumerate(rows):
+        if i and len(rows) > 1 and rows[i - 1][keys[0]] != row[keys[0]] and _grouped(rows, keys[0]):
+            made.add_row()
+        made.add_row(*(_cell(row[key]) for key in keys))
+    return made
+
+
+def _grouped(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
+    return len({row[key] for row in rows}) < len(rows)
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3f}" if abs(value) < _FEW else f"{value:.1f}"
+    return str(value)
+
+
+def write_rows(folder: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of equal keys as ``<name>.csv`` and ``<name>.json``."""
+    plain = [{key.lstrip("_"): value for key, value in row.items()} for row in rows]
+    with (
+        replacing(folder / f"{name}.csv") as beside,
+        beside.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.DictWriter(file, list(plain[0]) if plain else [])
+        writer.writeheader()
+        writer.writerows(plain)
+    # JSON knows no NaN.
+    finite = [
+        {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
+        for row in plain
+    ]
+    write_text(folder / f"{name}.json", json.dumps(finite, indent=2) + "\n")
+
+
+def draw_tracks(path: Path, title: str, length: float, tracks: Mapping[str, Track]) -> None:
+    """Draw errors and chosen parameters over time, as PNG.
+
+    Parameters
+    ----------
+    path
+        The picture.
+    title
+        What it shows.
+    length
+        Metres of a sub-trajectory.
+    tracks
+        By mode.
+    """
+    from matplotlib.figure import Figure
+
+    names = list(next(iter(tracks.values())).choices)
+    heights = [2.4] + [1.0] * len(names)
+    figure = Figure(figsize=(10, 1.0 + 1.6 * sum(heights)), layout="constrained")
+    axes = figure.subplots(
+        1 + len(names), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
+    )[:, 0]
+    for mode, track in tracks.items():
+        colour = COLOURS.get(mode, "#9467bd")
+        known = np.isfinite(track.errors)
+        mean = f"{track.errors[known].mean():.2f} %" if known.any() else "no reference"
+        style = {"color": colour} | STYLES.get(mode, {"lw": 1.3})
+        axes[0].plot(track.seconds, track.errors, label=f"{mode} ({mean})", **style)
+        restarts = track.seconds[track.restarted]
+        if len(restarts):
+            axes[0].plot(
+                restarts,
+                np.full(len(restarts), 1.02),
+                "v",
+                color=colour,
+                ms=4,
+                clip_on=False,
+                transform=axes[0].get_xaxis_transform(),
+            )
+        for axis, name in zip(axes[1:], names, strict=True):
+            values = list(track.choices[name])
+            # The last choice holds until the end.
+            x = np.append(track.choice_seconds, track.seconds[-1])
+            axis.step(x, [*values, values[-1]], where="post", **style)
+            axis.set_ylabel(name.replace("_", "\n"), fontsize=8)
+    axes[0].set_ylabel(f"RTE over {length:g} m [%]")
+    if any(np.isfinite(t.errors).any() for t in tracks.values()):
+        axes[0].set_yscale("log")
+    axes[0].set_title(title, loc="left")
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
+    axes[-1].set_xlabel("time [s]      (triangles: the health check started the odometry anew)")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    with replacing(path) as beside:
+        figure.savefig(beside, dpi=110)

@@ -1,0 +1,409 @@
+"""A study: what to tune, on what, and the folder in which everything about it is kept."""
+
+import json
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from adaptune import yaml
+from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
+from adaptune.odometry import BOXES, BaseSettings, HealthCheck, Odometry, box_class
+from adaptune.sequence import SequenceConfig, open_sequence
+from adaptune.simulation import Course
+from adaptune.space import ParameterSet, ParameterSpace, nearest
+
+Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
+"""Becomes a file's name."""
+
+
+class ConfigurationError(AdaptuneError):
+    """One or more mistakes in a study's YAML, a line each."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class OdometryConfig(_Section):
+    """Which odometry, what is set once, and what is tuned in which range.
+
+    Without `parameters`, all of them are tuned in their usual ranges; those not named in it keep
+    their baseline.
+    """
+
+    name: str
+    settings: dict[str, Any] = {}
+    parameters: dict[str, dict[str, Any]] | None = None
+
+
+class OfflineConfig(_Section):
+    """How to search for parameter sets.
+
+    Attributes
+    ----------
+    sampler : str
+        `tpe` begins with `initial` points of a Sobol sequence.
+    trials : int
+        Parameter sets, each run on every training sequence; the first is the baseline.
+    batch : int
+        A trial is proposed from the results of the batches before its own.
+    workers : int, optional
+        Processes; one a core when left out.
+    memory : float
+        Gigabytes that prepared scans may take, in all workers together.
+    """
+
+    sampler: Literal["tpe", "sobol", "random"] = "tpe"
+    trials: int = Field(64, ge=1)
+    initial: int = Field(32, ge=1)
+    batch: int = Field(16, ge=1)
+    seed: int = Field(0, ge=0)
+    workers: int | None = Field(None, ge=1)
+    memory: float = Field(4.0, gt=0)
+
+
+class OnlineConfig(_Section):
+    """How to replay.
+
+    Attributes
+    ----------
+    period : float
+        Seconds between selections.
+    rules : list of str
+        How to select: `paired`, `paper`.
+    """
+
+    period: float = Field(1.0, gt=0)
+    rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
+
+
+class StudyConfig(_Section):
+    """The YAML of a study.
+
+    Attributes
+    ----------
+    sequences : dict
+        Recordings by name.
+    courses : dict
+        Simulated sequences by name; `adaptune simulate` records them.
+    training, test : list of str
+        Names of sequences and courses.
+    sub_trajectory : float
+        Metres over which errors are measured.
+    lost_track : float
+        Metres a second: in a trial, a step that departs from the reference by more is a failure,
+        and the odometry is started anew at the reference.
+    health : HealthCheck
+        In a replay, a step that the platform cannot have made; the odometry is started anew at its
+        last healthy motion.
+    """
+
+    odometry: OdometryConfig
+    sequences: dict[Name, SequenceConfig] = {}
+    courses: dict[Name, Course] = {}
+    training: tuple[str, ...] = Field(min_length=1)
+    test: tuple[str, ...] = ()
+    sub_trajectory: float = Field(25.0, gt=0)
+    lost_track: float = Field(3.0, gt=0)
+    health: HealthCheck = HealthCheck()
+    offline: OfflineConfig = OfflineConfig()
+    online: OnlineConfig = OnlineConfig()
+
+
+@dataclass(frozen=True)
+class Study:
+    """A checked configuration and its folder.
+
+    Attributes
+    ----------
+    config : StudyConfig
+    folder : Path
+        Where trials, model, replays and comparison are kept.
+    """
+
+    config: StudyConfig
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the study, which is the folder's."""
+        return self.folder.name
+
+    @cached_property
+    def box(self) -> type[Odometry]:
+        """Class of the odometry."""
+        return box_class(self.config.odometry.name)
+
+    @cached_property
+    def settings(self) -> BaseSettings:
+        """Settings of the odometry."""
+        return self.box.settings_type.model_validate(self.config.odometry.settings)
+
+    @cached_property
+    def space(self) -> ParameterSpace:
+        """The parameters that are tuned."""
+        tuned = self.config.odometry.parameters
+        if tuned is None:
+            return self.box.space
+        return ParameterSpace.load(
+            {name: _complete(self.box.space, name, given) for name, given in tuned.items()}
+        )
+
+    def odometry(self, parameters: ParameterSet | None = None) -> Odometry:
+        """A new instance with these parameters; those not given keep their baseline."""
+        return self.box(self.space.baseline | (parameters or {}), self.settings)
+
+    def recording(self, course: str) -> Path:
+        """Where a simulated course's bag is kept."""
+        return self.folder / "recordings" / f"{course}.bag"
+
+    def sequence_config(self, name: str) -> SequenceConfig:
+        """What is known of a sequence or a course."""
+        if name in self.config.sequences:
+            return self.config.sequences[name]
+        return SequenceConfig(
+            bag=str(self.recording(name)), points="/velodyne_points", reference="/gt_poses"
+        )
+
+    def sequence(self, name: str) -> Any:
+        """Open a sequence or a recorded course.
+
+        Raises
+        ------
+        SequenceError
+            If it cannot be opened.
+        ConfigurationError
+            If the course has not been recorded.
+        """
+        if name in self.config.courses and not self.recording(name).exists():
+            raise ConfigurationError(
+                f"{self.recording(name)}: the course {name} is not recorded yet; run "
+                f"`adaptune simulate` with this study first"
+            )
+        return open_sequence(self.sequence_config(name))
+
+    def open(self) -> None:
+        """Make the folder, or make sure that what it holds is of this very study.
+
+        The number of trials, the number of workers and the replays may change between runs.
+
+        Raises
+        ------
+        ConfigurationError
+            Naming the keys that differ from those the folder was begun with.
+        """
+        path = self.folder / "study.yaml"
+        now = self.config.model_dump(mode="json")
+        if path.exists():
+            before: Any = yaml.Document(path.read_text(encoding="utf-8")).data
+            if differing := sorted(_differences(_lasting(before), _lasting(now))):
+                raise ConfigurationError(
+                    f"{self.folder} was begun with other values of {', '.join(differing)}; give "
+                    f"this study another folder (--folder), or remove that one"
+                )
+        write_text(path, yaml.dump(now))
+
+
+def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What trials depend on: all but what may be changed and added to later."""
+    lasting = {key: config.get(key) for key in ("odometry", "sub_trajectory", "lost_track")}
+    lasting["training"] = config["training"]
+    for name in config["training"]:
+        for kind in ("sequences", "courses"):
+            lasting[f"{kind}.{name}"] = config.get(kind, {}).get(name)
+    offline = config.get("offline", {})
+    lasting["offline"] = {k: offline.get(k) for k in ("sampler", "initial", "batch", "seed")}
+    return lasting
+
+
+def _differences(a: Any, b: Any, path: str = "") -> Iterable[str]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in a.keys() | b.keys():
+            yield from _differences(a.get(key), b.get(key), f"{path}.{key}" if path else str(key))
+    elif a != b:
+        yield path
+
+
+def load_study(
+    path: Path, overrides: Sequence[str] = (), folder: Path | None = None, runs: Path = Path("runs")
+) -> Study:
+    """Read and check a study's YAML.
+
+    Parameters
+    ----------
+    path
+        The YAML.
+    overrides
+        ``key.of.a.key=value``, the value in YAML.
+    folder
+        The study's folder; the YAML's name under `runs` when left out.
+    runs
+        Folder of all studies.
+
+    Raises
+    ------
+    ConfigurationError
+        Telling all mistakes at once, each with its line, its key and what to do.
+    """
+    try:
+        document = yaml.Document(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"{path}: there is no such file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: cannot be read as text ({error})") from error
+    except yaml.YamlError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
+    if not isinstance(document.data, dict):
+        raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
+    data = document.data
+    overridden = [_override(data, text) for text in overrides]
+    config, problems = _check(data, path.parent)
+    if problems or config is None:
+        lines = []
+        for key, message in sorted(problems, key=lambda p: document.line(p[0]) or 0):
+            # A mistake told of a whole section may be that of a value in it.
+            by_option = any(key[: len(o)] == o[: len(key)] for o in overridden)
+            line = None if by_option else document.line(key)
+            where = "-o" if by_option else f"{path}" + (f", line {line}" if line else "")
+            dotted = ".".join(map(str, key))
+            lines.append(f"{where}: {dotted + ': ' if dotted else ''}{message}")
+        raise ConfigurationError("\n".join(dict.fromkeys(lines)))
+    return Study(config, folder or runs / path.stem)
+
+
+def _override(data: dict[str, Any], text: str) -> tuple[str, ...]:
+    """Set one key of nested mappings, and tell its path."""
+    dotted, equals, value = text.partition("=")
+    if not equals or not dotted:
+        raise ConfigurationError(f"-o {text}: give a key and a value, as in -o offline.trials=32")
+    *parents, last = path = tuple(dotted.split("."))
+    for part in parents:
+        data = data.setdefault(part, {})
+        if not isinstance(data, dict):
+            raise ConfigurationError(f"-o {text}: {part} has no keys below it")
+    try:
+        data[last] = yaml.scalar(value)
+    except yaml.YamlError as error:
+        raise ConfigurationError(f"-o {text}: {error}") from error
+    return path
+
+
+_M = TypeVar("_M", bound=BaseModel)
+_Problem = tuple[tuple[str | int, ...], str]
+
+
+def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list[_Problem]]:
+    """Validate what pydantic can, and beside it what only the odometry and the files can tell."""
+    problems: list[_Problem] = []
+    config = _validated(StudyConfig, data, (), problems, {"folder": folder})
+    if isinstance(odometry := data.get("odometry"), dict):
+        _check_odometry(odometry, problems)
+    sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
+    if not isinstance(sequences, dict) or not isinstance(courses, dict):
+        return None, problems
+    for name, entry in sequences.items():
+        # Mistakes in the entry itself are among those of the whole: only open what can be.
+        found = _validated(SequenceConfig, entry, (), [], {"folder": folder})
+        if name in courses:
+            problems.append((("courses", name), "there is a sequence of the same name"))
+        if found is not None:
+            try:
+                open_sequence(found)
+            except AdaptuneError as error:
+                problems.append((("sequences", name), str(error)))
+    _check_roles(data, {*sequences, *courses}, problems)
+    return config, problems
+
+
+def _check_roles(data: dict[str, Any], known: set[Any], problems: list[_Problem]) -> None:
+    for role in ("training", "test"):
+        names = data.get(role)
+        if not isinstance(names, list):
+            continue
+        for i, name in enumerate(names):
+            if name not in known:
+                help_ = nearest(str(name), map(str, known))
+                problems.append(((role, i), f"there is no sequence {name!r}: {help_}"))
+            elif name in names[:i]:
+                problems.append(((role, i), f"{name!r} is named twice"))
+
+
+def _check_odometry(data: dict[str, Any], problems: list[_Problem]) -> None:
+    name = data.get("name")
+    if not isinstance(name, str) or name not in BOXES:
+        if isinstance(name, str):
+            problems.append(
+                (("odometry", "name"), f"there is no odometry {name!r}: {nearest(name, BOXES)}")
+            )
+        return
+    box = box_class(name)
+    settings = data.get("settings")
+    if isinstance(settings, dict):
+        _validated(box.settings_type, settings, ("odometry", "settings"), problems)
+    parameters = data.get("parameters")
+    if not isinstance(parameters, dict):
+        return
+    for parameter, given in parameters.items():
+        key = ("odometry", "parameters", parameter)
+        if parameter not in box.space.names:
+            help_ = nearest(str(parameter), box.space.names)
+            problems.append((key, f"{name} has no parameter {parameter!r}: {help_}"))
+        elif isinstance(given, dict):
+            default = box.space.parameters[parameter]
+            _validated(type(default), _complete(box.space, parameter, given), key, problems)
+
+
+def _complete(space: ParameterSpace, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What is given of a parameter, and for the rest what the odometry says of it."""
+    return space.parameters[name].model_dump() | dict(given)
+
+
+def _validated(
+    model: type[_M],
+    data: Any,
+    prefix: tuple[str, ...],
+    problems: list[_Problem],
+    context: dict[str, Any] | None = None,
+) -> _M | None:
+    try:
+        return model.model_validate(data, context=context)
+    except ValidationError as error:
+        for detail in error.errors(include_url=False):
+            path = tuple(detail["loc"])
+            message = detail["msg"].removeprefix("Value error, ")
+            if detail["type"] == "extra_forbidden":
+                message = f"unknown key; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
+            elif detail["type"] == "missing":
+                message = "this key is missing"
+            elif (
+                not isinstance(detail["input"], dict | list) and "Value error" not in detail["msg"]
+            ):
+                message = f"{message}, not {json.dumps(detail['input'], default=str)}"
+            problems.append((prefix + path, message))
+        return None
+
+
+def _keys(annotation: Any, path: Sequence[str | int]) -> list[str]:
+    """Keys that a model has at a path below it."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if not path:
+            return list(annotation.model_fields)
+        field = annotation.model_fields.get(str(path[0]))
+        return _keys(field.annotation, path[1:]) if field else []
+    arguments = typing.get_args(annotation)
+    if typing.get_origin(annotation) in (dict, list, tuple) and path:
+        # The part of the path is a key or an index; the last argument is the values' type.
+        return _keys(next(a for a in reversed(arguments) if a is not Ellipsis), path[1:])
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) in (
+        typing.Union,
+        Annotated,
+    ):
+        return [key for a in arguments for key in _keys(a, path)]
+    return []

@@ -1,0 +1,130 @@
+"""YAML as people mean it: PyYAML's safe loader without YAML 1.1's surprises."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from adaptune.errors import AdaptuneError
+
+
+class YamlError(AdaptuneError):
+    """Text that is not YAML, or says a key twice."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 - that is how PyYAML keeps them
+        first: [
+            (tag, regexp)
+            for tag, regexp in resolvers
+            if tag.rpartition(":")[2] not in ("bool", "int", "float", "timestamp")
+        ]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping, refusing a key that comes twice."""
+        seen: dict[Any, int] = {}
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            line = key_node.start_mark.line + 1
+            if not isinstance(key, str | int | float | bool):
+                raise YamlError(f"line {line}: a key must be a word or a number")
+            if key in seen:
+                raise YamlError(f"line {line}: {key!r} was given before, in line {seen[key]}")
+            seen[key] = line
+        return super().construct_mapping(node, deep)
+
+
+_PREFIX = "tag:yaml.org,2002:"
+_INT = re.compile(r"^[-+]?[0-9]+$")
+_FLOAT = re.compile(
+    r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+_BOOL = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
+_Loader.add_implicit_resolver(_PREFIX + "int", _INT, list("-+0123456789"))
+_Loader.add_implicit_resolver(_PREFIX + "float", _FLOAT, list("-+0123456789."))
+_Loader.add_implicit_resolver(_PREFIX + "bool", _BOOL, list("tTfF"))
+
+
+def _int(loader: Any, node: Any) -> int:
+    return int(loader.construct_scalar(node))
+
+
+_Loader.add_constructor(_PREFIX + "int", _int)
+
+
+class Document:
+    """A YAML text as plain data, and where in the text each part of it stands.
+
+    Parameters
+    ----------
+    text
+        One YAML document.
+
+    Attributes
+    ----------
+    data
+        Mappings, lists and scalars.
+
+    Raises
+    ------
+    YamlError
+        Naming the line.
+    """
+
+    def __init__(self, text: str):
+        try:
+            loader = _Loader(text)
+            self._node = loader.get_single_node()
+            self.data = None if self._node is None else loader.construct_document(self._node)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            where = f"line {mark.line + 1}: " if mark else ""
+            raise YamlError(f"{where}{error.problem or error.context}") from error
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            raise YamlError(str(error)) from error
+
+    def line(self, path: Sequence[str | int]) -> int | None:
+        """Line of the deepest part of `path` that is there; none for an empty document."""
+        node = self._node
+        line = None
+        for part in path:
+            if isinstance(node, yaml.MappingNode):
+                for key, value in node.value:
+                    if key.value == str(part):
+                        line, node = key.start_mark.line + 1, value
+                        break
+                else:
+                    return line
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+                if part >= len(node.value):
+                    return line
+                node = node.value[part]
+                line = node.start_mark.line + 1
+            else:
+                return line
+        return line
+
+
+def scalar(text: str) -> Any:
+    """Value of one line of YAML, as given on a command line."""
+    return Document(text).data
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what either version of YAML would not read back as a string."""
+
+
+for _tag, _regexp, _first in (("int", _INT, "-+0123456789"), ("float", _FLOAT, "-+0123456789.")):
+    _Dumper.add_implicit_resolver(_PREFIX + _tag, _regexp, list(_first))
+
+
+def dump(data: Any) -> str:
+    """Plain data as YAML, keys in their order."""
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return text

@@ -1,0 +1,158 @@
+"""What adaptune adds to the work that any program would have to do.
+
+    python benchmarks/stages.py FOLDER_OF_RECORDED_DATA
+
+Each figure is a ratio against a bare loop over the same clouds in the same run: the median over
+alternating repetitions, each on one core. Limits: trial 1.15, replay 1.15, descriptor of 100,000
+points 3 ms, RTE of 4541 poses over 100 m 10 ms.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import small_gicp
+
+from adaptune import cores
+from adaptune.descriptor import ndt_histogram
+from adaptune.geometry import Poses
+from adaptune.metrics import sub_trajectory_rte
+from adaptune.model import ErrorModel, Selection
+from adaptune.odometry import HealthCheck
+from adaptune.odometry.gicp import crop
+from adaptune.sequence import BagSequence, Scan
+from adaptune.study import Study, load_study
+from adaptune.trajectory import read_kitti
+from offline.campaign import train
+from offline.trial import PreparedSequence, run_trials
+from online.replay import adaptive, replay
+
+REPETITIONS = 5
+
+
+def seconds(function: Callable[[], object]) -> float:
+    """Time one call."""
+    begin = time.perf_counter()
+    function()
+    return time.perf_counter() - begin
+
+
+def compare(name: str, ours: Callable[[], object], bare: Callable[[], object]) -> None:
+    """Print the median of the ratios of alternating runs."""
+    pairs = [(seconds(ours), seconds(bare)) for _ in range(REPETITIONS)]
+    ratios = [a / b for a, b in pairs]
+    a, b = np.median(pairs, axis=0)
+    print(f"{name:34} {a:8.3f} s   bare {b:8.3f} s   ratio {np.median(ratios):.3f}")
+
+
+def bare_gicp(
+    prepared: list[tuple[small_gicp.PointCloud, small_gicp.KdTree]],
+    distance: float,
+    interval: float,
+    iterations: int,
+) -> Poses:
+    """Keyframe GICP with nothing around it."""
+    keyframe, tree = prepared[0]
+    T_odom_keyframe, T_keyframe_sensor, T_step = np.eye(4), np.eye(4), np.eye(4)
+    poses = [T_odom_keyframe]
+    for cloud, its_tree in prepared[1:]:
+        result = small_gicp.align(
+            keyframe,
+            cloud,
+            tree,
+            init_T_target_source=T_keyframe_sensor @ T_step,
+            max_correspondence_distance=distance,
+            max_iterations=iterations,
+        )
+        T_step = np.linalg.inv(T_keyframe_sensor) @ result.T_target_source
+        T_keyframe_sensor = result.T_target_source
+        poses.append(T_odom_keyframe @ T_keyframe_sensor)
+        if np.linalg.norm(T_keyframe_sensor[:3, 3]) >= interval:
+            keyframe, tree = cloud, its_tree
+            T_odom_keyframe, T_keyframe_sensor = poses[-1], np.eye(4)
+    return np.array(poses)
+
+
+def trial(study: Study) -> None:
+    """One trial over prepared scans."""
+    sequence = PreparedSequence(study, "hall_begin", 8e9)
+    prepared = [(scan.cloud, scan.tree) for scan in sequence]
+    parameters = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+    iterations = study.settings.iterations  # type: ignore[attr-defined]
+    compare(
+        f"trial, {len(prepared)} scans",
+        lambda: run_trials(study, sequence, [parameters], whole=True),
+        lambda: bare_gicp(prepared, 2.0, 1.0, iterations),
+    )
+
+
+def adaptive_replay(study: Study, model: ErrorModel) -> None:
+    """Replay from the bag, selecting once a second, against read, prepare and align."""
+    fixed = model.sets[model.fixed]
+    street = study.sequence("street")
+    box = study.odometry()
+    settings = study.settings
+
+    select = adaptive(model, "paired")
+
+    def fixed_after_all(scan: Scan) -> Selection:
+        # All the work of a selection, but the same parameters as the bare loop's.
+        return select(scan)._replace(set_index=model.fixed)
+
+    def ours() -> object:
+        return replay(street, study.odometry(fixed), HealthCheck(), fixed_after_all, model.sets)
+
+    def bare() -> object:
+        prepared = [
+            small_gicp.preprocess_points(
+                crop(scan, settings.min_range),  # type: ignore[attr-defined]
+                downsampling_resolution=settings.downsampling,  # type: ignore[attr-defined]
+            )
+            for scan in BagSequence(street.path, "/velodyne_points")
+        ]
+        return bare_gicp(
+            prepared,
+            fixed["max_correspondence_distance"],  # type: ignore[arg-type]
+            fixed["keyframe_interval"],  # type: ignore[arg-type]
+            box.settings.iterations,
+        )
+
+    result = replay(street, study.odometry(fixed), HealthCheck(), select, model.sets)
+    stamps = result.trajectory.stamps
+    duration = (stamps[-1] - stamps[0]) * 1e-9
+    print(
+        f"replay: {duration / result.seconds:.2f} times real time; selections take "
+        f"{1e3 * np.median([c.seconds for c in result.choices]):.2f} ms"
+    )
+    compare("adaptive replay of street.bag", ours, bare)
+
+
+def main(folder: Path) -> None:
+    """Measure everything."""
+    cores.pin(0)
+    points = next(iter(BagSequence(folder / "hilti_2022_scan.bag"))).points
+    rng = np.random.default_rng(0)
+    more = points[: 100_000 - len(points)]
+    noise = rng.normal(0.0, 0.02, more.shape).astype(np.float32)
+    cloud = np.concatenate([points, more + noise])
+    ndt_histogram(cloud)
+    times = [seconds(lambda: ndt_histogram(cloud)) for _ in range(50)]
+    print(f"descriptor, {len(cloud)} points: {1e3 * np.median(times):.2f} ms")
+    T_ref = read_kitti(folder / "kitti_00/ground_truth_kitti.txt")
+    T_est = read_kitti(folder / "kitti_00/kiss_icp_kitti.txt")
+    times = [seconds(lambda: sub_trajectory_rte(T_ref, T_est, 100.0)) for _ in range(50)]
+    print(f"RTE of {len(T_ref)} poses over 100 m: {1e3 * np.median(times):.2f} ms")
+    with tempfile.TemporaryDirectory() as runs:
+        config = Path(__file__).parent.parent / "configs/hall.yaml"
+        study = load_study(config, ["offline.trials=32", "offline.workers=1"], Path(runs) / "hall")
+        trial(study)
+        adaptive_replay(study, train(study).model)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    main(Path(sys.argv[1]))

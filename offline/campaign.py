@@ -1,0 +1,182 @@
+"""The offline stage: run trials batch by batch, then fit the error model."""
+
+import logging
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from adaptune import __version__
+from adaptune.archive import Archive
+from adaptune.cores import available
+from adaptune.model import ErrorModel
+from adaptune.model.base import mean_errors
+from adaptune.space import ParameterSet
+from adaptune.study import Study
+from offline.samplers import propose
+from offline.workers import Task, Workers
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is."""
+
+_log = logging.getLogger(__name__)
+
+
+class Training(NamedTuple):
+    """What the offline stage found.
+
+    Attributes
+    ----------
+    model : ErrorModel
+    means : dict
+        For every training sequence the mean capped error of each set in percent, of shape
+        (n_sets,).
+    whole : dict
+        For every training sequence the mean RTE in percent of the whole run, without new starts at
+        the reference, of the baseline and of the fixed set.
+    """
+
+    model: ErrorModel
+    means: dict[str, list[float]]
+    whole: dict[str, tuple[float, float]]
+
+
+def train(study: Study, progress: Progress = lambda *_: None) -> Training:
+    """Run all trials that are not in the archive yet, and fit the model.
+
+    Parameters
+    ----------
+    study
+        The study; its folder holds the archive and receives ``model.npz``.
+    progress
+        Told about every finished trial.
+
+    Raises
+    ------
+    AdaptuneError
+        If a sequence cannot be used.
+    """
+    study.open()
+    archive = Archive(study.folder / "trials")
+    archive.tidy()
+    n_workers = study.config.offline.workers or available()
+    with Workers(study, n_workers) as workers:
+        sets = _run_batches(study, archive, workers, progress)
+        model = fit(study, archive, sets)
+        whole = _run_whole(archive, workers, model, progress)
+    model.save(study.folder / "model.npz")
+    means = {
+        name: mean_errors(model.errors[model.sequence == s], np.zeros((model.sequence == s).sum()))
+        for s, name in enumerate(model.sequences)
+    }
+    return Training(model, {name: m.tolist() for name, m in means.items()}, whole)
+
+
+def _run_batches(
+    study: Study, archive: Archive, workers: Workers, progress: Progress
+) -> list[ParameterSet]:
+    config = study.config.offline
+    names = study.config.training
+    history: list[tuple[ParameterSet, float]] = []
+    total = config.trials * len(names)
+    done = 0
+    progress("trials", 0, total)
+    for batch in range(-(-config.trials // config.batch)):
+        first = batch * config.batch
+        numbers = range(first, min(first + config.batch, config.trials))
+        missing = {
+            name: [n for n in numbers if not archive.trial_path(name, n).exists()] for name in names
+        }
+        n_missing = sum(map(len, missing.values()))
+        done += len(numbers) * len(names) - n_missing
+        progress("trials", done, total)
+        if n_missing:
+            sets = propose(study.space, config, batch, history)
+            for task in workers.run(_tasks(missing, sets, first, workers.n)):
+                done += len(task.numbers)
+                progress("trials", done, total)
+        for n in numbers:
+            trials = [archive.read(name, n) for name in names]
+            error = float(np.mean([trial.mean_error for trial in trials]))
+            history.append((trials[0].parameters, error))
+        best = min(range(len(history)), key=lambda i: history[i][1])
+        _log.info(
+            "trials %d to %d done; best so far: trial %d with %.3f %%",
+            numbers[0],
+            numbers[-1],
+            best,
+            history[best][1],
+        )
+    return [parameters for parameters, _ in history]
+
+
+def _tasks(
+    missing: dict[str, list[int]], sets: list[ParameterSet], first: int, n_workers: int
+) -> list[Task]:
+    """Share every sequence's trials between the workers."""
+    return [
+        Task(name, tuple(some), tuple(sets[n - first] for n in some))
+        for name, numbers in missing.items()
+        for share in range(n_workers)
+        if (some := numbers[share::n_workers])
+    ]
+
+
+def _run_whole(
+    archive: Archive, workers: Workers, model: ErrorModel, progress: Progress
+) -> dict[str, tuple[float, float]]:
+    """Mean RTE of baseline and fixed set on the training sequences, in one go from end to end."""
+    numbers = (0, model.fixed)
+    tasks = [
+        Task(name, (n,), (model.sets[n],), whole=True)
+        for name in model.sequences
+        for n in sorted(set(numbers))
+        if not archive.trial_path(name, n, whole=True).exists()
+    ]
+    for done, _ in enumerate(workers.run(tasks), start=1):
+        progress("whole runs", done, len(tasks))
+    means = {
+        (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))
+        for name in model.sequences
+        for n in numbers
+    }
+    return {name: (means[name, 0], means[name, model.fixed]) for name in model.sequences}
+
+
+def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
+    """Make the error model of all trials.
+
+    Parameters
+    ----------
+    study
+        The study.
+    archive
+        Its trials, numbered as `sets`.
+    sets
+        The parameter sets.
+    """
+    histograms, sequence, errors = [], [], []
+    for s, name in enumerate(study.config.training):
+        of_sequence = archive.read_errors(name, range(len(sets)))
+        # Whether there is a sub-trajectory depends on the reference alone.
+        labelled = ~np.isnan(of_sequence).any(axis=1)
+        histograms.append(archive.read_frames(name).histograms[labelled])
+        sequence.append(np.full(labelled.sum(), s))
+        errors.append(of_sequence[labelled])
+    all_errors, all_sequences = np.concatenate(errors), np.concatenate(sequence)
+    return ErrorModel(
+        odometry={
+            "name": study.config.odometry.name,
+            "settings": study.settings.model_dump(mode="json"),
+        },
+        space=study.space,
+        sets=sets,
+        fixed=int(np.argmin(mean_errors(all_errors, all_sequences))),
+        length=study.config.sub_trajectory,
+        sequences=list(study.config.training),
+        histograms=np.concatenate(histograms),
+        sequence=all_sequences,
+        errors=all_errors,
+        provenance={"adaptune": __version__, "study": study.name}
+        | study.config.offline.model_dump(mode="json", exclude={"workers", "memory"}),
+    )

@@ -1,0 +1,186 @@
+"""One parameter set on one sequence, or several at once on one pass over it."""
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from adaptune.archive import Frames, Trial
+from adaptune.descriptor import ndt_histogram
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses, invert, steps
+from adaptune.metrics import sub_trajectory_rte, window_ends
+from adaptune.odometry import Odometry
+from adaptune.odometry.base import prepared_bytes
+from adaptune.space import ParameterSet
+from adaptune.study import Study
+
+
+class PreparedSequence:
+    """A sequence read, prepared and described once, for all trials of a worker.
+
+    Parameters
+    ----------
+    study
+        The study.
+    name
+        The sequence.
+    memory
+        Bytes that prepared scans may take. What does not fit is read again on every pass.
+
+    Attributes
+    ----------
+    frames : Frames
+    nbytes : int
+        What the prepared scans take.
+
+    Raises
+    ------
+    AdaptuneError
+        If the sequence cannot be read, or holds nothing to learn from.
+    """
+
+    def __init__(self, study: Study, name: str, memory: float):
+        self._sequence = study.sequence(name)
+        self._box = study.odometry()
+        self._kept: list[Any] = []
+        self.nbytes = 0
+        stamps, histograms, full = [], [], False
+        for scan in self._sequence:
+            stamps.append(scan.stamp)
+            histograms.append(ndt_histogram(scan.points))
+            if full:
+                continue
+            prepared = self._box.prepare(scan)
+            full = self.nbytes + prepared_bytes(prepared) > memory
+            if not full:
+                self._kept.append(prepared)
+                self.nbytes += prepared_bytes(prepared)
+        reference = self._sequence.reference()
+        if reference is None:
+            raise AdaptuneError(
+                f"sequences.{name}: training needs a reference trajectory; name its topic or file "
+                f"(reference: ...)"
+            )
+        at = np.array(stamps, np.int64)
+        T_ref_sensor = reference.at(at)
+        check_reference(study, name, T_ref_sensor)
+        self.frames = Frames(at, T_ref_sensor, np.array(histograms))
+
+    def __iter__(self) -> Iterator[Any]:
+        yield from self._kept
+        if len(self._kept) < len(self.frames.stamps):
+            for i, scan in enumerate(self._sequence):
+                if i >= len(self._kept):
+                    yield self._box.prepare(scan)
+
+
+def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
+    """Refuse a sequence in which no sub-trajectory can be measured.
+
+    Parameters
+    ----------
+    study
+        The study.
+    name
+        The sequence.
+    T_ref_sensor
+        Reference poses at the scans' stamps, NaN where there is none.
+
+    Raises
+    ------
+    AdaptuneError
+    """
+    if np.isnan(T_ref_sensor).all():
+        raise AdaptuneError(
+            f"sequences.{name}: the reference does not overlap the scans in time; check that both "
+            f"are of the same recording and clock"
+        )
+    if not (window_ends(T_ref_sensor, study.config.sub_trajectory) >= 0).any():
+        known = T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])]
+        path = np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1).sum()
+        raise AdaptuneError(
+            f"sequences.{name}: its path of {path:.1f} m holds no sub-trajectory of "
+            f"{study.config.sub_trajectory:g} m; make sub_trajectory shorter or the sequence longer"
+        )
+
+
+class _Run:
+    """An odometry on its way along a sequence."""
+
+    def __init__(self, odometry: Odometry, frames: Frames, lost_track: float | None):
+        n = len(frames.stamps)
+        self.odometry = odometry
+        self.T_odom_sensor = np.empty((n, 4, 4))
+        self.restarted = np.zeros(n, bool)
+        self.registered = np.ones(n, bool)
+        self.seconds = np.zeros(n)
+        self._T_ref_sensor = frames.T_ref_sensor
+        self._T_ref_steps = steps(frames.T_ref_sensor)
+        self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
+
+    def step(self, i: int, prepared: Any) -> None:
+        if i == 0:
+            T = self._T_ref_sensor[0]
+            T = np.eye(4) if np.isnan(T[0, 0]) else T
+            self.odometry.start(prepared, T)
+            self.T_odom_sensor[0] = T
+            return
+        begin = time.perf_counter()
+        T, self.registered[i] = self.odometry.register(prepared)
+        self.seconds[i] = time.perf_counter() - begin
+        if self._lost(i, T):
+            T = self._T_ref_sensor[i]
+            self.odometry.start(prepared, T, self._T_ref_steps[i - 1])
+            self.restarted[i] = True
+        self.T_odom_sensor[i] = T
+
+    def _lost(self, i: int, T_odom_sensor: Poses) -> bool:
+        T_previous_current = invert(self.T_odom_sensor[i - 1]) @ T_odom_sensor
+        departure = T_previous_current[:3, 3] - self._T_ref_steps[i - 1, :3, 3]
+        if np.isnan(departure).any():
+            # Without a reference nothing can be said, unless the odometry itself talks nonsense.
+            return False
+        return bool(np.linalg.norm(departure) > self._bounds[i - 1])
+
+
+def run_trials(
+    study: Study, sequence: PreparedSequence, sets: Sequence[ParameterSet], whole: bool = False
+) -> list[Trial]:
+    """Run an odometry with several parameter sets on one pass over a sequence.
+
+    Where the odometry loses track, it is started anew at the reference with that scan, and the
+    sub-trajectories across that frame are labelled as failures: what comes after is judged for
+    itself.
+
+    Parameters
+    ----------
+    study
+        The study.
+    sequence
+        The sequence.
+    sets
+        The parameter sets.
+    whole
+        Do not start anew at the reference.
+    """
+    frames = sequence.frames
+    lost_track = None if whole else study.config.lost_track
+    runs = [_Run(study.odometry(s), frames, lost_track) for s in sets]
+    for i, prepared in enumerate(sequence):
+        for run in runs:
+            run.step(i, prepared)
+    return [
+        Trial(
+            parameters,
+            run.T_odom_sensor,
+            sub_trajectory_rte(
+                frames.T_ref_sensor, run.T_odom_sensor, study.config.sub_trajectory, run.restarted
+            ),
+            run.restarted,
+            run.registered,
+            run.seconds,
+        )
+        for parameters, run in zip(sets, runs, strict=True)
+    ]

@@ -1,0 +1,247 @@
+"""Does adapting pay in a place that was not trained on? Told from the archive, without a run.
+
+Each training sequence is left out in turn. A fixed set and the selection rules are fitted on the
+others; on the one left out they are given the errors that were recorded for the sets they choose,
+second by second.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import report
+from adaptune.archive import Archive
+from adaptune.descriptor import ScaledPCA
+from adaptune.errors import AdaptuneError
+from adaptune.metrics import cap
+from adaptune.model import RULES, ErrorModel, Rule, TrainingData
+from adaptune.model.base import mean_errors
+from adaptune.study import Study
+
+RESAMPLES = 2000
+NO_WORSE = 1.05
+"""A rule may not have more than this much of the fixed set's error on any sequence left out."""
+
+
+class ValidationError(AdaptuneError):
+    """A study that cannot be validated."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledSequence:
+    """The frames of a sequence that have a sub-trajectory.
+
+    Attributes
+    ----------
+    name : str
+    seconds : ndarray of shape (n,)
+        Whole seconds since the first scan: in each, one selection holds.
+    histograms : ndarray of shape (n, 90)
+    errors : ndarray of shape (n, n_sets)
+        Percent, infinite where the track was lost.
+    """
+
+    name: str
+    seconds: NDArray[np.int64]
+    histograms: NDArray[np.float64]
+    errors: NDArray[np.float32]
+
+
+class LeftOut(NamedTuple):
+    """What happened on one sequence that was left out.
+
+    Attributes
+    ----------
+    name : str
+    errors : dict
+        For every mode the capped error in percent at each frame, of shape (n,).
+    switches : dict
+        For every rule the share of seconds in which it did not choose the fixed set.
+    """
+
+    name: str
+    errors: dict[str, NDArray[np.float64]]
+    switches: dict[str, float]
+
+
+@dataclass
+class Validation:
+    """All sequences left out, and what to make of it.
+
+    Attributes
+    ----------
+    left_out : list of LeftOut
+    ratios : dict
+        For every mode its mean error over the fixed set's, a number for each sequence.
+    """
+
+    left_out: list[LeftOut]
+    ratios: dict[str, NDArray[np.float64]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        modes = list(self.left_out[0].errors)
+        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out])
+        self.ratios = {
+            mode: np.array([s.errors[mode].mean() for s in self.left_out]) / fixed for mode in modes
+        }
+
+    def summary(self, mode: str, seed: int = 0) -> dict[str, float]:
+        """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
+
+        The interval is of a bootstrap over sequences: it speaks of other sequences like these.
+        """
+        logs = np.log(self.ratios[mode])
+        drawn = np.random.default_rng(seed).integers(0, len(logs), (RESAMPLES, len(logs)))
+        low, high = np.percentile(logs[drawn].mean(axis=1), [2.5, 97.5])
+        mean, fixed = (
+            np.mean([s.errors[m].mean() for s in self.left_out]) for m in (mode, "fixed")
+        )
+        return {
+            "geometric": float(np.exp(logs.mean())),
+            "low": float(np.exp(low)),
+            "high": float(np.exp(high)),
+            "worst": float(self.ratios[mode].max()),
+            "arithmetic": float(mean / fixed),
+        }
+
+    def verdict(self, rule: str) -> str:
+        """What to do, in a sentence or two."""
+        s = self.summary(rule)
+        worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
+        ratio = (
+            f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
+            f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f})"
+        )
+        if s["worst"] > NO_WORSE:
+            return f"Do not adapt by `{rule}`: {s['worst']:.2f} times on {worst}; {ratio}."
+        if s["high"] >= 1.0:
+            return f"Nothing shows that `{rule}` pays, nor that it harms: {ratio}."
+        return f"Adapt by `{rule}`: {ratio}, and on none more than {s['worst']:.2f} times."
+
+
+def validate(
+    study: Study, progress: Callable[[int, int], None] = lambda *_: None
+) -> tuple[Validation, list[dict[str, Any]]]:
+    """Validate the selection rules on a study's training sequences.
+
+    Parameters
+    ----------
+    study
+        A study that the offline stage has finished; its folder receives ``validation.csv`` and
+        ``validation.json``.
+    progress
+        Told about every sequence.
+
+    Returns
+    -------
+    validation : Validation
+    rows : list of dict
+        Ratio to the fixed set's error of every mode on every sequence left out.
+
+    Raises
+    ------
+    ModelError
+        If there is no model yet.
+    ValidationError
+        If there is but one training sequence.
+    """
+    model = ErrorModel.load(study.folder / "model.npz")
+    archive = Archive(study.folder / "trials")
+    sequences = []
+    for name in model.sequences:
+        frames = archive.read_frames(name)
+        errors = archive.read_errors(name, range(len(model.sets)))
+        labelled = ~np.isnan(errors).any(axis=1)
+        seconds = (frames.stamps[labelled] - frames.stamps[0]) // 10**9
+        sequences.append(
+            LabelledSequence(name, seconds, frames.histograms[labelled], errors[labelled])
+        )
+    validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
+    rows: list[dict[str, Any]] = []
+    for i, sequence in enumerate(validation.left_out):
+        rows.append({"left out": sequence.name, "fixed [%]": sequence.errors["fixed"].mean()})
+        rows[-1] |= {m: float(r[i]) for m, r in validation.ratios.items() if m != "fixed"}
+    for key in ("geometric", "arithmetic", "worst"):
+        row: dict[str, Any] = {"left out": f"{key}", "fixed [%]": None}
+        row |= {m: validation.summary(m)[key] for m in validation.ratios if m != "fixed"}
+        rows.append(row)
+    report.write_rows(study.folder, "validation", rows)
+    return validation, rows
+
+
+def leave_one_out(
+    sequences: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    rules: dict[str, Callable[[], Rule]] | None = None,
+    progress: Callable[[int, int], None] = lambda *_: None,
+) -> Validation:
+    """Leave each sequence out in turn.
+
+    Parameters
+    ----------
+    sequences
+        All with errors of the same sets.
+    sets
+        The parameter sets in the unit cube, of shape (n_sets, n_parameters).
+    rules
+        By name, how to make each; those of `adaptune.model.RULES` when left out.
+    progress
+        Told about every sequence.
+
+    Raises
+    ------
+    ValidationError
+        If there are fewer than two sequences.
+    """
+    if len(sequences) < 2:
+        raise ValidationError(
+            "training: one sequence cannot be validated, for nothing remains to train on when it "
+            "is left out; add sequences"
+        )
+    left_out = []
+    for i, sequence in enumerate(sequences):
+        progress(i, len(sequences))
+        others = [s for s in sequences if s is not sequence]
+        left_out.append(_leave_out(sequence, others, sets, rules or RULES))
+    progress(len(sequences), len(sequences))
+    return Validation(left_out)
+
+
+def training_data(
+    sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]
+) -> tuple[TrainingData, ScaledPCA]:
+    """What rules learn from these sequences, and how to describe a scan for them."""
+    histograms = np.concatenate([s.histograms for s in sequences])
+    errors = np.concatenate([s.errors for s in sequences])
+    number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
+    pca = ScaledPCA().fit(histograms)
+    fixed = int(np.argmin(mean_errors(errors, number)))
+    return TrainingData(pca.transform(histograms), number, errors, sets, fixed), pca
+
+
+def _leave_out(
+    sequence: LabelledSequence,
+    others: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    rules: dict[str, Callable[[], Rule]] | dict[str, type[Rule]],
+) -> LeftOut:
+    data, pca = training_data(others, sets)
+    features = pca.transform(sequence.histograms)
+    capped = cap(sequence.errors)
+    seconds, first = np.unique(sequence.seconds, return_index=True)
+    second = np.searchsorted(seconds, sequence.seconds)
+    frames = np.arange(len(capped))
+    errors = {"baseline": capped[:, 0], "fixed": capped[:, data.fixed]}
+    switches = {}
+    for name, make in rules.items():
+        rule = make().fit(data)
+        chosen = np.array([rule.select(features[i]).set_index for i in first])
+        errors[name] = capped[frames, chosen[second]]
+        switches[name] = float(np.mean(chosen != data.fixed))
+    errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
+    per_second = np.array([capped[second == s].mean(axis=0) for s in range(len(seconds))])
+    errors["oracle, second"] = capped[frames, per_second.argmin(axis=1)[second]]
+    return LeftOut(sequence.name, errors, switches)

@@ -1,0 +1,270 @@
+"""Replay a recording in lockstep, selecting parameters on the way."""
+
+import csv
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.descriptor import ndt_histogram
+from adaptune.errors import AdaptuneError
+from adaptune.files import replacing, write_text
+from adaptune.geometry import Poses, invert
+from adaptune.model import RULES, ErrorModel, Selection
+from adaptune.odometry import HealthCheck, Odometry
+from adaptune.sequence import Scan
+from adaptune.space import ParameterSet
+from adaptune.trajectory import Trajectory, write_tum
+
+Policy = Callable[[Scan], Selection]
+"""Chooses a parameter set for a scan."""
+
+
+class Choice(NamedTuple):
+    """A selection that was made.
+
+    Attributes
+    ----------
+    stamp : int
+        Nanoseconds, of the scan it was made from and first applied to.
+    selection : Selection
+    parameters : dict
+    seconds : float
+        What describing the scan and choosing took.
+    """
+
+    stamp: int
+    selection: Selection
+    parameters: ParameterSet
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One way through a recording.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+        The odometry's.
+    restarted : ndarray of shape (n,)
+        Frames at which the health check started the odometry anew.
+    registered : ndarray of shape (n,)
+        False where the scan was too poor to register and the last motion went on.
+    prepare_seconds, register_seconds : ndarray of shape (n,)
+    choices : list of Choice
+    seconds : float
+        The whole replay, reading included.
+    """
+
+    trajectory: Trajectory
+    restarted: NDArray[np.bool_]
+    registered: NDArray[np.bool_]
+    prepare_seconds: NDArray[np.float64]
+    register_seconds: NDArray[np.float64]
+    choices: list[Choice]
+    seconds: float
+
+
+def adaptive(model: ErrorModel, rule: str) -> Policy:
+    """A policy that asks an error model.
+
+    Parameters
+    ----------
+    model
+        Fitted offline.
+    rule
+        One of `adaptune.model.RULES`.
+    """
+    pca = model.describe()
+    fitted = RULES[rule]().fit(model.training_data(pca))
+    # The first call loads compiled code; the robot should not wait for that.
+    ndt_histogram(np.zeros((0, 3), np.float32))
+
+    def select(scan: Scan) -> Selection:
+        histogram = ndt_histogram(scan.points)
+        return fitted.select(pca.transform(histogram[None])[0])
+
+    return select
+
+
+def replay(
+    scans: Iterable[Scan],
+    odometry: Odometry,
+    health: HealthCheck,
+    policy: Policy | None = None,
+    sets: list[ParameterSet] | None = None,
+    period: float = 1.0,
+    progress: Callable[[], None] = lambda: None,
+) -> Replay:
+    """Drive an odometry through a recording, as fast as it goes and always the same way.
+
+    A selection is made at the first scan and then at the first scan of every further period, from
+    that scan and before it is registered.
+
+    Parameters
+    ----------
+    scans
+        In order of time.
+    odometry
+        A new instance; if there is a policy, one that can change its parameters between scans.
+    health
+        The odometry is started anew where its motion is not healthy.
+    policy
+        Chooses the parameters; none leaves them as they are.
+    sets
+        The parameter sets that the policy chooses among.
+    period
+        Seconds between selections.
+    progress
+        Called after every scan.
+
+    Raises
+    ------
+    AdaptuneError
+        If there are no scans.
+    OdometryError
+        If the odometry cannot change its parameters.
+    """
+    begin = time.perf_counter()
+    stamps: list[int] = []
+    poses: list[Poses] = []
+    restarted: list[bool] = []
+    registered: list[bool] = []
+    timings: list[tuple[float, float]] = []
+    choices: list[Choice] = []
+    guard = _Guard(health)
+    n_periods = 0
+    for scan in scans:
+        first = stamps[0] if stamps else scan.stamp
+        if (
+            policy is not None
+            and sets is not None
+            and (scan.stamp - first >= n_periods * period * 1e9)
+        ):
+            t = time.perf_counter()
+            selection = policy(scan)
+            parameters = sets[selection.set_index]
+            seconds = time.perf_counter() - t
+            odometry.configure(parameters)
+            choices.append(Choice(scan.stamp, selection, parameters, seconds))
+            n_periods = int((scan.stamp - first) // (period * 1e9)) + 1
+        t_prepare = time.perf_counter()
+        prepared = odometry.prepare(scan)
+        t_register = time.perf_counter()
+        if not stamps:
+            T_odom_sensor = np.eye(4)
+            odometry.start(prepared, T_odom_sensor)
+            registered.append(True)
+            restarted.append(False)
+        else:
+            T_odom_sensor, ok = odometry.register(prepared)
+            elapsed = (scan.stamp - stamps[-1]) * 1e-9
+            T_healthy = guard.check(poses[-1], T_odom_sensor, elapsed)
+            restarted.append(T_healthy is not None)
+            registered.append(ok)
+            if T_healthy is not None:
+                T_odom_sensor = poses[-1] @ T_healthy
+                odometry.start(prepared, T_odom_sensor, T_healthy)
+        timings.append((t_register - t_prepare, time.perf_counter() - t_register))
+        stamps.append(scan.stamp)
+        poses.append(T_odom_sensor)
+        progress()
+    if not stamps:
+        raise AdaptuneError("there is no scan to replay")
+    prepare_seconds, register_seconds = np.array(timings).T
+    return Replay(
+        Trajectory(np.array(stamps, np.int64), np.array(poses)),
+        np.array(restarted),
+        np.array(registered),
+        prepare_seconds,
+        register_seconds,
+        choices,
+        time.perf_counter() - begin,
+    )
+
+
+class _Guard:
+    """Remembers the last healthy motion."""
+
+    def __init__(self, health: HealthCheck):
+        self._health = health
+        self._T_previous_current = np.eye(4)
+        self._velocity: NDArray[np.float64] | None = None
+        self._since = 0.0
+
+    def check(self, T_odom_previous: Poses, T_odom_current: Poses, elapsed: float) -> Poses | None:
+        """The motion to go on with instead, or None if this one is healthy."""
+        self._since += elapsed
+        if not np.isfinite(T_odom_current).all():
+            return self._T_previous_current
+        T_previous_current = invert(T_odom_previous) @ T_odom_current
+        velocity = T_previous_current[:3, 3] / elapsed
+        if self._health.healthy(velocity, self._velocity, self._since):
+            self._T_previous_current = T_previous_current
+            self._velocity = velocity
+            self._since = 0.0
+            return None
+        return self._T_previous_current
+
+
+def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None:
+    """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    result
+        The replay.
+    about
+        What it was made from; kept in ``replay.json``.
+    """
+    write_tum(folder / "trajectory.tum", result.trajectory)
+    names = list(result.choices[0].parameters) if result.choices else []
+    with (
+        replacing(folder / "selections.csv") as beside,
+        beside.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(
+            ["stamp_ns", "set", "predicted_error_percent", "predicted_fixed_percent", "ms", *names]
+        )
+        for choice in result.choices:
+            index, error, fixed = choice.selection
+            writer.writerow(
+                [choice.stamp, index, f"{error:.4f}", f"{fixed:.4f}", f"{1e3 * choice.seconds:.3f}"]
+                + [choice.parameters[name] for name in names]
+            )
+    with (
+        replacing(folder / "frames.csv") as beside,
+        beside.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(["stamp_ns", "registered", "restarted", "prepare_ms", "register_ms"])
+        writer.writerows(
+            zip(
+                result.trajectory.stamps.tolist(),
+                result.registered.astype(int).tolist(),
+                result.restarted.astype(int).tolist(),
+                np.round(1e3 * result.prepare_seconds, 3).tolist(),
+                np.round(1e3 * result.register_seconds, 3).tolist(),
+                strict=True,
+            )
+        )
+    duration = float(result.trajectory.stamps[-1] - result.trajectory.stamps[0]) * 1e-9
+    summary = {
+        "scans": len(result.trajectory),
+        "duration_s": round(duration, 3),
+        "replay_s": round(result.seconds, 3),
+        "restarts": int(result.restarted.sum()),
+        "poor_scans": int((~result.registered).sum()),
+        "selections": len(result.choices),
+        "about": about,
+    }
+    write_text(folder / "replay.json", json.dumps(summary, indent=2) + "\n")

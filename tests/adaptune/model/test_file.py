@@ -1,0 +1,255 @@
+"""The error model as a file."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from adaptune.model import RULES, ErrorModel, ModelError
+from adaptune.space import Categorical, Float, Integer, ParameterSpace
+
+SPACE = ParameterSpace(
+    {
+        "distance": Float(low=1.0, high=10.0, baseline=4.0, log=True),
+        "points": Integer(low=1, high=50, baseline=20),
+        "kernel": Categorical(choices=("none", 1, True), baseline="none"),
+    }
+)
+
+
+def random_model(seed=0, n_frames=50, n_sets=6):
+    rng = np.random.default_rng(seed)
+    errors = rng.gamma(1.0, 2.0, (n_frames, n_sets)).astype(np.float32)
+    errors[rng.random(errors.shape) < 0.05] = np.inf
+    return ErrorModel(
+        odometry={"name": "gicp", "settings": {"downsampling": 0.1 + 0.2}},
+        space=SPACE,
+        sets=SPACE.from_unit(rng.random((n_sets, 3))),
+        fixed=2,
+        length=25.0,
+        sequences=["cave", "Straße"],
+        histograms=rng.integers(0, 500, (n_frames, 90)).astype(float),
+        sequence=rng.integers(0, 2, n_frames),
+        errors=errors,
+        provenance={"trials": n_sets, "note": None},
+    )
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(ErrorModel):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        elif field.name == "space":
+            assert x == y
+        else:
+            assert repr(x) == repr(y)
+
+
+def saved(folder, **changes):
+    path = folder / "model.npz"
+    dataclasses.replace(random_model(), **changes).save(path)
+    return path
+
+
+def rewrite(path, arrays=None, **header):
+    """Change parts of a file as somebody could who knows the format."""
+    parts = dict(np.load(path))
+    changed = json.loads(parts["header"].tobytes()) | header
+    parts["header"] = np.frombuffer(json.dumps(changed).encode(), np.uint8)
+    np.savez(path, **parts | (arrays or {}))
+
+
+def refused(path):
+    """The message, which must name the file."""
+    with pytest.raises(ModelError) as caught:
+        ErrorModel.load(path)
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_model_survives_bit_for_bit(tmp_path):
+    model = random_model()
+    path = saved(tmp_path)
+    loaded = ErrorModel.load(path)
+    assert_same(loaded, model)
+    assert list(tmp_path.iterdir()) == [path]
+    loaded.save(tmp_path / "again.npz")
+    assert_same(ErrorModel.load(tmp_path / "again.npz"), model)
+
+
+def test_a_loaded_model_chooses_as_the_saved_one_did(tmp_path):
+    model, loaded = random_model(), ErrorModel.load(saved(tmp_path))
+    np.testing.assert_array_equal(loaded.describe().components_, model.describe().components_)
+    for rule in RULES.values():
+        a, b = (rule().fit(m.training_data(m.describe())) for m in (model, loaded))
+        for feature in np.random.default_rng(1).normal(size=(5, 10)):
+            np.testing.assert_array_equal(a.predict(feature), b.predict(feature))
+            assert a.select(feature) == b.select(feature)
+
+
+def test_training_data_is_the_model_in_numbers():
+    model = random_model()
+    pca = model.describe()
+    data = model.training_data(pca)
+    np.testing.assert_array_equal(data.features, pca.transform(model.histograms))
+    np.testing.assert_array_equal(data.sets, SPACE.to_unit(model.sets))
+    np.testing.assert_array_equal(data.errors, model.errors)
+    np.testing.assert_array_equal(data.sequence, model.sequence)
+    assert data.fixed == 2
+
+
+def test_a_missing_model(tmp_path):
+    assert "there is no such model" in refused(tmp_path / "model.npz")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.99, 0.9999])
+def test_a_file_cut_short_is_refused(tmp_path, share):
+    path = saved(tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    refused(path)
+
+
+def flipped(tmp_path, places):
+    """Flip the bits at `places`, one after the other; how many of them were refused."""
+    path, model = saved(tmp_path), random_model()
+    data = path.read_bytes()
+    count = 0
+    for place in places:
+        byte, bit = divmod(place % (8 * len(data)), 8)
+        harmed = bytearray(data)
+        harmed[byte] ^= 1 << bit
+        path.write_bytes(harmed)
+        try:
+            loaded = ErrorModel.load(path)
+        except ModelError:
+            count += 1
+        else:
+            # Not everything in a zip file has a meaning.
+            assert_same(loaded, model)
+    return count
+
+
+def test_a_flipped_bit_is_refused_or_means_nothing(tmp_path):
+    # All but the directory at the file's end, which is another test's.
+    size = 8 * (saved(tmp_path).stat().st_size - 400)
+    places = np.random.default_rng(0).integers(0, size, 300).tolist()
+    assert flipped(tmp_path, places) > 250
+
+
+@pytest.mark.parametrize("content", [b"", b"distance: 3\n", b"PK\x03\x04", bytes(1000)])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "model.npz"
+    path.write_bytes(content)
+    refused(path)
+
+
+def test_other_archives_and_arrays_are_refused(tmp_path):
+    path = tmp_path / "model.npz"
+    np.savez(path, stamps=np.arange(3))
+    refused(path)
+    np.save(tmp_path / "array.npy", np.arange(3))
+    refused(tmp_path / "array.npy")
+    refused(tmp_path)
+
+
+class Trap:
+    """Says so when it is unpickled."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was loaded",))
+
+
+@pytest.mark.parametrize("name", ["header", "histograms", "sequence", "errors"])
+def test_a_pickle_inside_is_refused(tmp_path, name):
+    path = saved(tmp_path)
+    rewrite(path, {name: np.array([Trap()], object)})
+    refused(path)
+
+
+def test_a_pickle_is_refused(tmp_path):
+    path = tmp_path / "model.npz"
+    np.save(path.with_suffix(".npy"), np.array([Trap()], object), allow_pickle=True)
+    path.with_suffix(".npy").rename(path)
+    refused(path)
+
+
+def test_a_newer_format_is_refused_by_name(tmp_path):
+    path = saved(tmp_path)
+    rewrite(path, adaptune="7.8.9", format=2)
+    message = refused(path)
+    assert "7.8.9" in message
+    assert "newer" in message
+
+
+def test_what_a_newer_file_adds_does_not_hurt_while_the_format_is_the_same(tmp_path):
+    path = saved(tmp_path)
+    rewrite(path, {"extra": np.arange(3)}, remark="hello")
+    assert_same(ErrorModel.load(path), random_model())
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"fixed": 6},
+        {"fixed": -1},
+        {"fixed": None},
+        {"format": "one"},
+        {"sequences": ["cave"]},
+        {"sets": [{"distance": 4.0, "points": 3, "kernel": "none"}] * 5},
+        {"sets": [{"distance": 4.0, "points": 3, "kernel": "none"}] * 5 + [{"distance": 4.0}]},
+        {"sets": [{"distance": 99.0, "points": 3, "kernel": "none"}] * 6},
+        {"space": {"distance": {"type": "float", "low": 3}}},
+        {"space": {}},
+    ],
+)
+def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
+    path = saved(tmp_path)
+    rewrite(path, **header)
+    refused(path)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"histograms": np.zeros((49, 90), np.uint16)},
+        {"histograms": np.zeros((50, 80), np.uint16)},
+        {"sequence": np.zeros(49, np.uint32)},
+        {"sequence": np.full(50, 2, np.uint32)},
+        {"errors": np.zeros((50, 5), np.float32)},
+        {"errors": np.zeros(50, np.float32)},
+        {"errors": np.full((50, 6), np.nan, np.float32)},
+        {"errors": np.full((50, 6), "x")},
+    ],
+)
+def test_arrays_that_do_not_go_together_are_refused(tmp_path, arrays):
+    path = saved(tmp_path)
+    rewrite(path, arrays)
+    refused(path)
+
+
+def test_an_empty_model_is_refused(tmp_path):
+    path = saved(
+        tmp_path,
+        histograms=np.zeros((0, 90)),
+        sequence=np.zeros(0, int),
+        errors=np.zeros((0, 6), np.float32),
+    )
+    refused(path)
+
+
+def test_a_flipped_bit_in_the_directory_is_refused_or_means_nothing(tmp_path):
+    data = saved(tmp_path).read_bytes()
+    begin = data.index(b"PK\x01\x02")
+    assert flipped(tmp_path, range(8 * begin, 8 * (begin + 46))) > 100
+
+
+@pytest.mark.parametrize("name", ["model", "model.v2", "model.bin"])
+def test_a_model_keeps_the_name_it_is_given(tmp_path, name):
+    path = tmp_path / name
+    random_model().save(path)
+    assert list(tmp_path.iterdir()) == [path]
+    assert_same(ErrorModel.load(path), random_model())

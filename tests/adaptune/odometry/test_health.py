@@ -1,0 +1,52 @@
+"""The check of an odometry's poses."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from adaptune.odometry import HealthCheck
+
+CHECK = HealthCheck(max_speed=10.0, max_acceleration=5.0)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "last", "elapsed", "healthy"),
+    [
+        ((0, 0, 0), None, 0.1, True),
+        ((9.9, 0, 0), None, 0.1, True),
+        ((0, 0, -10.1), None, 0.1, False),
+        ((6, 6, 6), None, 0.1, False),
+        # At once from rest to full speed: nothing is known of how fast it was.
+        ((10, 0, 0), None, 0.001, True),
+        ((5, 0, 0), (5, 0, 0), 0.1, True),
+        ((5.4, 0, 0), (5, 0, 0), 0.1, True),
+        ((5.6, 0, 0), (5, 0, 0), 0.1, False),
+        ((4.4, 0, 0), (5, 0, 0), 0.1, False),
+        ((5, 0.6, 0), (5, 0, 0), 0.1, False),
+        ((-5, 0, 0), (5, 0, 0), 1.0, False),
+        ((-5, 0, 0), (5, 0, 0), 2.1, True),
+        # However long ago the last one was.
+        ((10.5, 0, 0), (9, 0, 0), 100.0, False),
+        ((np.nan, 0, 0), None, 0.1, False),
+        ((0, np.inf, 0), (0, 0, 0), 0.1, False),
+        ((0, 0, np.nan), (0, 0, 0), 0.1, False),
+    ],
+)
+def test_healthy(velocity, last, elapsed, healthy):
+    last = None if last is None else np.array(last, float)
+    assert CHECK.healthy(np.array(velocity, float), last, elapsed) is healthy
+
+
+def test_a_vehicle_in_a_town_is_healthy():
+    check = HealthCheck()
+    assert check.healthy(np.array([16.7, 0.2, 0.0]), np.array([16.2, 0.0, 0.1]), 0.1)
+    assert not check.healthy(np.array([16.7, 5.0, 0.0]), np.array([16.7, 0.0, 0.0]), 0.1)
+    assert not check.healthy(np.array([60.0, 0.0, 0.0]), None, 0.1)
+
+
+@pytest.mark.parametrize(
+    "bounds", [{"max_speed": 0}, {"max_acceleration": -1}, {"max_jerk": 1}, {"max_speed": "fast"}]
+)
+def test_bounds_that_make_no_sense(bounds):
+    with pytest.raises(ValidationError):
+        HealthCheck(**bounds)

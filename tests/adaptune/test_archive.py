@@ -1,0 +1,179 @@
+"""Trials on disk."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from adaptune.archive import Archive, ArchiveError, Frames, Trial
+
+N = 40
+PARAMETERS = {"distance": 0.1 + 0.2, "points": 7, "kernel": "Huber", "deskew": True}
+
+
+def random_trial(seed=0, parameters=PARAMETERS):
+    rng = np.random.default_rng(seed)
+    errors = rng.gamma(1.0, size=N).astype(np.float32).astype(float)
+    errors[3], errors[-5:] = np.inf, np.nan
+    return Trial(
+        dict(parameters),
+        rng.normal(size=(N, 4, 4)),
+        errors,
+        rng.random(N) < 0.1,
+        rng.random(N) < 0.9,
+        rng.random(N).astype(np.float32).astype(float),
+    )
+
+
+def random_frames(seed=0):
+    rng = np.random.default_rng(seed)
+    T_ref_sensor = rng.normal(size=(N, 4, 4))
+    T_ref_sensor[2] = np.nan
+    stamps = 1_700_000_000_123_456_789 + np.arange(N) * 100_000_001
+    return Frames(stamps, T_ref_sensor, rng.integers(0, 1000, (N, 90)).astype(float))
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        else:
+            assert repr(x) == repr(y)
+
+
+def test_trials_survive(tmp_path):
+    archive, trial, whole = Archive(tmp_path / "trials"), random_trial(1), random_trial(2)
+    archive.write("cave", 12, trial)
+    archive.write("cave", 12, whole, whole=True)
+    again = Archive(tmp_path / "trials")
+    assert_same(again.read("cave", 12), trial)
+    assert_same(again.read("cave", 12, whole=True), whole)
+    assert again.trial_path("cave", 12).is_file()
+    assert again.trial_path("cave", 12) != again.trial_path("cave", 12, whole=True)
+    assert len(list((tmp_path / "trials" / "cave").iterdir())) == 2
+
+
+def test_frames_survive(tmp_path):
+    frames = random_frames()
+    Archive(tmp_path).write_frames("street", frames)
+    assert_same(Archive(tmp_path).read_frames("street"), frames)
+
+
+def test_a_trial_is_replaced(tmp_path):
+    archive = Archive(tmp_path)
+    archive.write("cave", 0, random_trial(1))
+    archive.write("cave", 0, random_trial(2))
+    assert_same(archive.read("cave", 0), random_trial(2))
+
+
+def test_errors_of_several_trials(tmp_path):
+    archive = Archive(tmp_path)
+    for number in range(4):
+        archive.write("cave", number, random_trial(number))
+    errors = archive.read_errors("cave", [3, 1])
+    assert errors.dtype == np.float32
+    np.testing.assert_array_equal(errors, np.stack([random_trial(n).errors for n in (3, 1)], 1))
+
+
+def test_mean_error_counts_a_lost_track_as_30_and_the_unknown_not_at_all():
+    errors = np.array([1.0, 2.0, np.inf, 50.0, np.nan, np.nan])
+    trial = dataclasses.replace(random_trial(), errors=errors)
+    assert trial.mean_error == pytest.approx((1.0 + 2.0 + 30.0 + 30.0) / 4)
+    assert not math.isnan(random_trial().mean_error)
+
+
+def test_tidy_removes_only_what_is_unfinished(tmp_path):
+    archive = Archive(tmp_path)
+    archive.write("cave", 0, random_trial())
+    archive.write_frames("cave", random_frames())
+    unfinished = tmp_path / "cave" / ".00001.abc.npz"
+    unfinished.write_bytes(b"PK")
+    archive.tidy()
+    assert not unfinished.exists()
+    assert_same(archive.read("cave", 0), random_trial())
+    assert_same(archive.read_frames("cave"), random_frames())
+    Archive(tmp_path / "none").tidy()
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def text(path):
+    path.write_text("distance: 0.3\n")
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 8
+    path.write_bytes(data)
+
+
+def objects(path):
+    arrays = dict(np.load(path))
+    name = "errors" if "errors" in arrays else "stamps"
+    np.savez(path, **arrays | {name: np.array([None, {}], object)})
+
+
+def lack(path):
+    arrays = dict(np.load(path))
+    np.savez(path, **{name: arrays[name] for name in ("T_odom_sensor", "stamps") if name in arrays})
+
+
+def folder(path):
+    path.unlink()
+    path.mkdir()
+
+
+@pytest.mark.parametrize("harm", [truncate, empty, text, flip, objects, lack, folder])
+def test_a_damaged_file_is_named(tmp_path, harm):
+    archive = Archive(tmp_path)
+    archive.write("cave", 0, random_trial())
+    archive.write_frames("cave", random_frames())
+    harm(archive.trial_path("cave", 0))
+    harm(tmp_path / "cave" / "frames.npz")
+    with pytest.raises(ArchiveError, match=r"cave/00000\.npz"):
+        archive.read("cave", 0)
+    with pytest.raises(ArchiveError, match=r"cave/frames\.npz"):
+        archive.read_frames("cave")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ArchiveError, match=r"cave/00007\.npz: there is no such file"):
+        Archive(tmp_path).read("cave", 7)
+    with pytest.raises(ArchiveError, match=r"cave/frames\.npz: there is no such file"):
+        Archive(tmp_path).read_frames("cave")
+
+
+def bare_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.arange(3))
+
+
+def encrypt(path):
+    """Set the bit that says so in the directory's first entry."""
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+
+
+def compress_strangely(path):
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 10] = 77
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("harm", [bare_array, encrypt, compress_strangely])
+def test_damage_that_zip_files_do_not_call_damage(tmp_path, harm):
+    archive = Archive(tmp_path)
+    archive.write("cave", 0, random_trial())
+    harm(archive.trial_path("cave", 0))
+    with pytest.raises(ArchiveError, match=r"cave/00000\.npz"):
+        archive.read("cave", 0)

@@ -1,0 +1,83 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from adaptune.archive import Archive
+
+
+def adaptune(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "adaptune.cli", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=os.environ | {"COLUMNS": "80"},
+    )
+
+
+def test_the_whole_way(study_file, tmp_path):
+    done = adaptune("offline", study_file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Fixed: max_correspondence_distance" in done.stdout
+    done = adaptune("online", study_file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "4 replays made" in done.stdout
+    done = adaptune("compare", study_file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for mode in ("baseline", "fixed", "paired", "paper"):
+        assert mode in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    assert (tmp_path / "runs/small/comparison/three.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["offline", "none.yaml"], "none.yaml: there is no such file"),
+        (["offline", "STUDY", "-o", "offline.sampler=best"], "offline.sampler"),
+        (["simulate", "STUDY"], "there is none to simulate"),
+        (["online", "STUDY"], "model.npz: there is no such model"),
+        (["compare", "STUDY"], "run `adaptune online`"),
+        (["online", "STUDY", "--model", "STUDY"], "is not an error model, or damaged"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words):
+    arguments = [study_file if a == "STUDY" else a for a in arguments]
+    done = adaptune(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_and_version(tmp_path):
+    done = adaptune("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    for command in ("simulate", "offline", "online", "compare"):
+        assert command in done.stdout
+    assert adaptune("--version", cwd=tmp_path).stdout.startswith("adaptune 0.")
+
+
+def test_ctrl_c_leaves_a_study_that_resumes(study_file, tmp_path):
+    command = [sys.executable, "-m", "adaptune.cli", "offline", str(study_file)]
+    many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
+    process = subprocess.Popen(
+        command + many, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    archive = Archive(tmp_path / "runs/small/trials")
+    deadline = time.monotonic() + 60
+    while not archive.trial_path("one", 3).exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "run the same command again" in said
+    assert "Traceback" not in said
+    finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
+    assert adaptune("offline", study_file, cwd=tmp_path).returncode == 0
+    assert {p: p.stat().st_mtime_ns for p in finished} == finished

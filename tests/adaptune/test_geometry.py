@@ -1,0 +1,200 @@
+"""Rigid transforms, one or many."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from adaptune.geometry import (
+    from_quaternions,
+    interpolate,
+    invert,
+    rectify,
+    rotation_angle,
+    steps,
+    to_quaternions,
+)
+
+modest = settings(max_examples=40, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_poses(seed, *shape, size=50.0):
+    """Rigid transforms of shape (*shape, 4, 4)."""
+    rng = np.random.default_rng(seed)
+    T = np.tile(np.eye(4), (*shape, 1, 1))
+    count = int(np.prod(shape))
+    T[..., :3, :3] = Rotation.random(count, rng=rng).as_matrix().reshape(*shape, 3, 3)
+    T[..., :3, 3] = rng.uniform(-size, size, (*shape, 3))
+    return T
+
+
+def pose(angle_z=0.0, x=0.0, y=0.0, z=0.0):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", angle_z).as_matrix()
+    T[:3, 3] = x, y, z
+    return T
+
+
+@modest
+@given(seeds)
+def test_inverse_undoes(seed):
+    T = random_poses(seed, 2, 3)
+    identity = np.broadcast_to(np.eye(4), T.shape)
+    np.testing.assert_allclose(invert(T) @ T, identity, atol=1e-12)
+    np.testing.assert_allclose(T @ invert(T), identity, atol=1e-12)
+    np.testing.assert_allclose(invert(T), np.linalg.inv(T), atol=1e-12)
+    np.testing.assert_array_equal(invert(T)[1, 2], invert(T[1, 2]))
+
+
+def test_inverse_leaves_its_argument_and_keeps_nan_to_itself():
+    T = random_poses(1, 3)
+    T[1] = np.nan
+    before = T.copy()
+    inverse = invert(T)
+    np.testing.assert_array_equal(T, before)
+    assert np.isnan(inverse[1, :3]).all()
+    np.testing.assert_allclose(
+        inverse[[0, 2]] @ T[[0, 2]], np.tile(np.eye(4), (2, 1, 1)), atol=1e-12
+    )
+
+
+@modest
+@given(seeds, st.floats(1e-12, 1e-4))
+def test_rectified_rotations_are_rotations(seed, noise):
+    exact = random_poses(seed, 4)
+    T = exact.copy()
+    T[:, :3, :3] += np.random.default_rng(seed).uniform(-noise, noise, (4, 3, 3))
+    before = T.copy()
+    R = rectify(T)[:, :3, :3]
+    # The error is squared.
+    excess = R @ np.swapaxes(R, 1, 2) - np.eye(3)
+    assert np.abs(excess).max() < 30 * noise**2 + 1e-14
+    assert np.abs(R - exact[:, :3, :3]).max() < 4 * noise
+    np.testing.assert_array_equal(T, before)
+    np.testing.assert_array_equal(rectify(T)[:, :, 3], T[:, :, 3])
+
+
+def test_rectify_keeps_a_chain_of_predictions_rigid():
+    T_previous = np.eye(4)
+    T = pose(0.1, x=1.0)
+    for _ in range(200):
+        T_previous, T = T, rectify(T @ (invert(T_previous) @ T))
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3], pose(0.1 * 201)[:3, :3], atol=1e-9)
+
+
+@modest
+@given(seeds)
+def test_steps_lead_from_the_first_pose_to_the_last(seed):
+    T = random_poses(seed, 6)
+    moved = T[0]
+    for step in steps(T):
+        moved = moved @ step
+    np.testing.assert_allclose(moved, T[-1], atol=1e-10)
+
+
+def test_a_step_is_seen_from_the_pose_before():
+    T = np.array([pose(np.pi / 2, x=5.0), pose(np.pi / 2, x=5.0, y=2.0)])
+    np.testing.assert_allclose(steps(T), [pose(x=2.0)], atol=1e-12)
+    assert steps(T[:1]).shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-12, 1e-8, 1e-3, 1.0, np.pi / 2, 3.0, np.pi - 1e-9, np.pi]
+)
+def test_rotation_angle(angle):
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        axis = rng.normal(size=3)
+        T = pose(x=3.0)
+        T[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+        assert rotation_angle(T) == pytest.approx(angle, rel=1e-7, abs=1e-14)
+    assert rotation_angle(np.tile(T, (2, 3, 1, 1))).shape == (2, 3)
+
+
+@modest
+@given(seeds)
+def test_quaternions_and_back(seed):
+    T = random_poses(seed, 5)
+    q = to_quaternions(T)
+    assert (q[:, 3] >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(from_quaternions(T[:, :3, 3], q), T, atol=1e-12)
+
+
+def test_quaternions_are_in_the_order_x_y_z_w_and_normalised():
+    half = np.sqrt(0.5)
+    T = from_quaternions([[1, 2, 3]], [[0, 0, 2 * half, 2 * half]])
+    np.testing.assert_allclose(T, [pose(np.pi / 2, 1, 2, 3)], atol=1e-12)
+    np.testing.assert_allclose(to_quaternions(T), [[0, 0, half, half]], atol=1e-12)
+
+
+def test_no_poses_at_all():
+    assert from_quaternions([], []).shape == (0, 4, 4)
+    assert to_quaternions(np.empty((0, 4, 4))).shape == (0, 4)
+    assert invert(np.empty((0, 4, 4))).shape == (0, 4, 4)
+    assert interpolate(np.empty(0, np.int64), np.empty((0, 4, 4)), np.array([1]), 1).shape == (
+        1,
+        4,
+        4,
+    )
+    assert interpolate(np.array([1]), np.eye(4)[None], np.empty(0, np.int64), 1).shape == (0, 4, 4)
+
+
+# Of the present day, where a double no longer holds nanoseconds.
+BEGIN = 1_700_000_000_123_456_789
+
+
+@modest
+@given(seeds, st.integers(0, 5 * 10**8))
+def test_interpolation_follows_a_screw_free_motion(seed, offset):
+    """Between two poses: the point on the line, the rotation on the shortest arc."""
+    T = random_poses(seed, 2)
+    stamps = BEGIN + np.array([0, 5 * 10**8])
+    got = interpolate(stamps, T, stamps[:1] + offset, 10**9)[0]
+    share = offset / (5 * 10**8)
+    np.testing.assert_allclose(
+        got[:3, 3], (1 - share) * T[0, :3, 3] + share * T[1, :3, 3], atol=1e-6
+    )
+    turn = Rotation.from_matrix(T[0, :3, :3]).inv() * Rotation.from_matrix(T[1, :3, :3])
+    R = Rotation.from_matrix(T[0, :3, :3]) * Rotation.from_rotvec(share * turn.as_rotvec())
+    np.testing.assert_allclose(got[:3, :3], R.as_matrix(), atol=1e-6)
+    np.testing.assert_array_equal(got[3], [0, 0, 0, 1])
+
+
+@modest
+@given(seeds)
+def test_interpolation_at_the_stamps_gives_the_very_poses(seed):
+    T = random_poses(seed, 8)
+    stamps = BEGIN + np.cumsum(np.random.default_rng(seed).integers(1, 10**10, 8))
+    np.testing.assert_array_equal(interpolate(stamps, T, stamps, 0), T)
+    np.testing.assert_array_equal(interpolate(stamps, T, stamps[[5, 2, 5]], 0), T[[5, 2, 5]])
+
+
+def test_interpolation_of_a_steady_turn():
+    times = np.arange(0, 11) * 10**8
+    T = np.array([pose(0.2 * i, x=i) for i in range(11)])
+    at = np.array([49, 50, 51, 777, 999]) * 10**6
+    got = interpolate(BEGIN + times, T, BEGIN + at, 10**8)
+    want = [pose(2e-9 * t, x=1e-8 * t) for t in at]
+    np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_nothing_is_interpolated_outside_or_in_gaps():
+    stamps = np.array([0, 10, 20, 50, 60])
+    T = np.array([pose(x=float(s)) for s in stamps])
+    at = np.array([-1, 0, 5, 15, 20, 21, 35, 49, 50, 55, 60, 61])
+    x = interpolate(stamps, T, at, max_gap=10)[:, 0, 3]
+    nan = np.nan
+    np.testing.assert_allclose(x, [nan, 0, 5, 15, 20, nan, nan, nan, 50, 55, 60, nan])
+    x = interpolate(stamps, T, at, max_gap=30)[:, 0, 3]
+    np.testing.assert_allclose(x, [nan, 0, 5, 15, 20, 21, 35, 49, 50, 55, 60, nan])
+    x = interpolate(stamps, T, at, max_gap=9)[:, 0, 3]
+    np.testing.assert_allclose(x, [nan, 0, nan, nan, 20, nan, nan, nan, 50, nan, 60, nan])
+
+
+def test_interpolation_of_a_single_pose():
+    got = interpolate(np.array([5]), pose(x=2.0)[None], np.array([4, 5, 6]), 10)
+    np.testing.assert_allclose(got[:, 0, 3], [np.nan, 2.0, np.nan])

@@ -1,0 +1,272 @@
+"""Sub-trajectory errors and KITTI's error."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from adaptune.metrics import (
+    FAILURE,
+    KITTI_LENGTHS,
+    cap,
+    kitti_error,
+    sub_trajectory_rte,
+    travelled,
+    window_ends,
+)
+from adaptune.trajectory import read_kitti
+
+modest = settings(max_examples=40, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def walk(rng, n, step=1.0, turn=0.1):
+    """Poses of a random walk forward, of shape (n, 4, 4)."""
+    T = np.tile(np.eye(4), (n, 1, 1))
+    for i in range(1, n):
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_rotvec(rng.normal(0, turn, 3)).as_matrix()
+        move[:3, 3] = [step * rng.uniform(0, 2), *rng.normal(0, 0.1 * step, 2)]
+        T[i] = T[i - 1] @ move
+    return T
+
+
+def drift(rng, T, size=0.02):
+    """An estimate of `T` whose every step is a little wrong."""
+    est = T.copy()
+    for i in range(1, len(T)):
+        wrong = np.eye(4)
+        wrong[:3, :3] = Rotation.from_rotvec(rng.normal(0, size, 3)).as_matrix()
+        wrong[:3, 3] = rng.normal(0, size, 3)
+        est[i] = est[i - 1] @ np.linalg.inv(T[i - 1]) @ T[i] @ wrong
+    return est
+
+
+def line(*x):
+    T = np.tile(np.eye(4), (len(x), 1, 1))
+    T[:, 0, 3] = x
+    return T
+
+
+def plain_end(T_ref, start, length):
+    """First frame further than `length` from `start` along the reference; None without."""
+    distance = 0.0
+    for j in range(start, len(T_ref)):
+        if np.isnan(T_ref[j]).any():
+            return None
+        if j > start:
+            distance += math.dist(T_ref[j, :3, 3], T_ref[j - 1, :3, 3])
+        if distance > length:
+            return j
+    return None
+
+
+def plain_error(T_ref, T_est, start, end):
+    """inv(dEst) dGt."""
+    d_gt = np.linalg.inv(T_ref[start]) @ T_ref[end]
+    d_est = np.linalg.inv(T_est[start]) @ T_est[end]
+    return np.linalg.inv(d_est) @ d_gt
+
+
+def plain_rte(T_ref, T_est, length, restarted):
+    errors = []
+    for start in range(len(T_ref)):
+        end = plain_end(T_ref, start, length)
+        if end is None:
+            errors.append(math.nan)
+        elif any(restarted[start + 1 : end + 1]):
+            errors.append(math.inf)
+        else:
+            t = plain_error(T_ref, T_est, start, end)[:3, 3]
+            errors.append(100 * math.hypot(*t) / length)
+    return errors
+
+
+def plain_kitti(T_ref, T_est, lengths, stride):
+    translations, rotations, used = [], [], []
+    for start in range(0, len(T_ref), stride):
+        for length in lengths:
+            end = plain_end(T_ref, start, length)
+            if end is None:
+                continue
+            E = plain_error(T_ref, T_est, start, end)
+            translations.append(math.hypot(*E[:3, 3]) / length)
+            cosine = (np.trace(E[:3, :3]) - 1) / 2
+            rotations.append(math.acos(min(1, max(-1, cosine))) / length)
+            used.append(length)
+    return 100 * np.mean(translations), math.degrees(np.mean(rotations)), tuple(sorted(set(used)))
+
+
+@modest
+@given(seeds, st.integers(0, 60), st.floats(0.5, 30.0), st.booleans(), st.booleans())
+def test_rte_follows_its_definition(seed, n, length, gaps, restarts):
+    rng = np.random.default_rng(seed)
+    T_ref = walk(rng, n)
+    T_est = drift(rng, T_ref)
+    if gaps:
+        T_ref[rng.random(n) < 0.05] = np.nan
+    restarted = rng.random(n) < (0.1 if restarts else 0.0)
+    want = plain_rte(T_ref, T_est, length, restarted)
+    got = sub_trajectory_rte(T_ref, T_est, length, restarted)
+    np.testing.assert_allclose(got, want, rtol=1e-7, atol=1e-9)
+    if not restarts:
+        np.testing.assert_array_equal(got, sub_trajectory_rte(T_ref, T_est, length))
+
+
+@modest
+@given(seeds)
+def test_kitti_error_follows_its_definition(seed):
+    rng = np.random.default_rng(seed)
+    T_ref = walk(rng, 80)
+    T_est = drift(rng, T_ref)
+    lengths, stride = (5.0, 20.0, 60.0, 1000.0), int(rng.integers(1, 12))
+    want = plain_kitti(T_ref, T_est, lengths, stride)
+    got = kitti_error(T_ref, T_est, lengths, stride)
+    assert got.translation == pytest.approx(want[0])
+    assert got.rotation == pytest.approx(want[1])
+    assert got.lengths == want[2]
+
+
+@modest
+@given(seeds)
+def test_frames_of_reference_do_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    T_ref = walk(rng, 50)
+    T_est = drift(rng, T_ref)
+    A, B = walk(rng, 3, step=100.0, turn=2.0)[1:]
+    np.testing.assert_allclose(
+        sub_trajectory_rte(A @ T_ref, B @ T_est, 8.0),
+        sub_trajectory_rte(T_ref, T_est, 8.0),
+        atol=1e-7,
+    )
+    np.testing.assert_allclose(
+        kitti_error(A @ T_ref, B @ T_est, (8.0,))[:2],
+        kitti_error(T_ref, T_est, (8.0,))[:2],
+        atol=1e-7,
+    )
+
+
+def test_the_end_is_the_first_frame_beyond_the_length():
+    # At the length itself is not beyond it.
+    T = line(0, 1, 2, 3, 3, 4, 6, 6.5)
+    np.testing.assert_array_equal(window_ends(T, 2.0), [3, 5, 6, 6, 6, 7, -1, -1])
+    np.testing.assert_array_equal(window_ends(T, 6.5), [-1] * 8)
+    np.testing.assert_array_equal(window_ends(T[:0], 1.0), [])
+    np.testing.assert_array_equal(window_ends(T[:1], 1.0), [-1])
+
+
+def test_going_back_counts_as_way():
+    T = line(0, 1, 0, 1, 0)
+    np.testing.assert_array_equal(travelled(T), [0, 1, 2, 3, 4])
+    np.testing.assert_array_equal(window_ends(T, 2.5), [3, 4, -1, -1, -1])
+
+
+def test_no_window_reaches_over_a_gap():
+    T = line(0, 1, 2, 3, 4, 5, 6, 7)
+    T[3] = np.nan
+    np.testing.assert_array_equal(window_ends(T, 1.5), [2, -1, -1, -1, 6, 7, -1, -1])
+    T[0] = T[7] = np.nan
+    np.testing.assert_array_equal(window_ends(T, 0.5), [-1, 2, -1, -1, 5, 6, -1, -1])
+    T[:] = np.nan
+    np.testing.assert_array_equal(window_ends(T, 0.5), [-1] * 8)
+
+
+def test_errors_are_divided_by_the_length_asked_for():
+    # The windows are 3 m long, the length asked for is 2.5 m.
+    T_ref, T_est = line(*range(10)), line(*(1.1 * np.arange(10)))
+    errors = sub_trajectory_rte(T_ref, T_est, 2.5)
+    np.testing.assert_allclose(errors, [100 * 0.3 / 2.5] * 7 + [np.nan] * 3)
+
+
+def test_windows_with_a_new_start_are_failures():
+    T = line(*range(9))
+    restarted = np.zeros(9, bool)
+    restarted[4] = True
+    # A window that ends there holds the failed step, one that begins there does not.
+    errors = sub_trajectory_rte(T, T, 1.5, restarted)
+    np.testing.assert_array_equal(np.isinf(errors), [i in (2, 3) for i in range(9)])
+    np.testing.assert_allclose(errors[[0, 1, 4, 5, 6]], 0.0, atol=1e-12)
+    assert np.isnan(errors[7:]).all()
+
+
+def test_where_there_is_no_window_there_is_no_failure():
+    T = line(0, 1, 2, 3)
+    T[2] = np.nan
+    assert np.isnan(sub_trajectory_rte(T, T, 1.5, np.ones(4, bool))).all()
+
+
+def test_a_wrong_heading_at_the_start_costs_all_the_way():
+    T_ref = line(*range(12))
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("z", 0.1).as_matrix()
+    T_est = T_ref.copy()
+    T_est[1:] = turned @ T_ref[1:]
+    error = sub_trajectory_rte(T_ref, T_est, 9.5)[0]
+    assert error == pytest.approx(100 * 2 * 10 * math.sin(0.05) / 9.5)
+
+
+def test_a_short_path_has_no_kitti_error():
+    T = line(*range(50))
+    error = kitti_error(T, T)
+    assert math.isnan(error.translation)
+    assert math.isnan(error.rotation)
+    assert error.lengths == ()
+
+
+def test_kitti_error_of_a_steady_drift():
+    T_ref = line(*range(1000))
+    T_est = np.tile(np.eye(4), (1000, 1, 1))
+    T_est[:, 0, 3] = 1.01 * np.arange(1000)
+    T_est[:, :3, :3] = Rotation.from_euler("x", 0.001 * np.arange(1000)[:, None]).as_matrix()
+    error = kitti_error(T_ref, T_est)
+    # A window holds one step more than its length.
+    more = np.mean([(v + 1) / v * ((999 - v) // 10) for v in range(100, 801, 100)])
+    more /= np.mean([(999 - v) // 10 for v in range(100, 801, 100)])
+    assert error.translation == pytest.approx(1.0 * more, rel=1e-2)
+    assert error.rotation == pytest.approx(math.degrees(0.001) * more, rel=1e-2)
+    assert error.lengths == KITTI_LENGTHS
+
+
+def test_kitti_error_of_a_recorded_pair(recorded):
+    folder = recorded / "kitti_00"
+    T_ref = read_kitti(folder / "ground_truth_kitti.txt")
+    T_est = read_kitti(folder / "kiss_icp_kitti.txt")
+    error = kitti_error(T_ref, T_est)
+    assert error.translation == pytest.approx(0.5283, abs=5e-5)
+    # Found by the arc cosine of a trace, which the rounding of the files reaches.
+    assert error.rotation == pytest.approx(0.001887, abs=1e-6)
+    assert error.lengths == KITTI_LENGTHS
+
+
+def test_rte_of_a_recorded_pair(recorded):
+    folder = recorded / "kitti_00"
+    T_ref = read_kitti(folder / "ground_truth_kitti.txt")
+    T_est = read_kitti(folder / "kiss_icp_kitti.txt")
+    errors = sub_trajectory_rte(T_ref, T_est, 100.0)
+    # The windows of 100 m among those of KITTI's error.
+    assert np.nanmean(errors[::10]) == pytest.approx(
+        kitti_error(T_ref, T_est, (100.0,)).translation
+    )
+    assert np.isnan(errors).sum() == (window_ends(T_ref, 100.0) < 0).sum() > 0
+
+
+def test_cap():
+    errors = np.array([0.0, 1.5, 29.9, 30.1, np.inf, np.nan], np.float32)
+    capped = cap(errors)
+    assert capped.dtype == np.float64
+    np.testing.assert_allclose(capped, [0.0, 1.5, 29.9, FAILURE, FAILURE, np.nan], rtol=1e-6)
+    assert FAILURE == 30.0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_estimate_that_is_not_finite_is_a_failure(bad):
+    """NaN means that nothing is known, and would be left out of every mean."""
+    T_ref = line(*range(9))
+    T_est = T_ref.copy()
+    T_est[4, :3] = bad
+    errors = sub_trajectory_rte(T_ref, T_est, 1.5)
+    assert np.isinf(errors[[2, 4]]).all()
+    assert np.isnan(errors).tolist() == [False] * 7 + [True] * 2

@@ -1,0 +1,128 @@
+import pytest
+
+from adaptune.study import ConfigurationError, load_study
+
+
+def failure(file, *overrides):
+    with pytest.raises(ConfigurationError) as caught:
+        load_study(file, overrides)
+    return str(caught.value)
+
+
+def test_reads_a_study(study_file, tmp_path):
+    study = load_study(study_file, ["offline.trials=7"], runs=tmp_path)
+    assert study.folder == tmp_path / "small"
+    assert study.config.offline.trials == 7
+    assert study.config.sequences["one"].bag == str(study_file.parent / "one.bag")
+    assert study.space.names == ("max_correspondence_distance", "keyframe_interval")
+    assert study.space.parameters["keyframe_interval"].low == 0.5
+    assert study.odometry().settings.downsampling == 0.5
+    assert study.odometry({"keyframe_interval": 2.0}).parameters == {
+        "max_correspondence_distance": 2.0,
+        "keyframe_interval": 2.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("odometry.name=gicpp", ["odometry.name", "did you mean 'gicp'"]),
+        ("odometry.settings.downsample=1", ["odometry.settings.downsample", "'downsampling'"]),
+        ("odometry.settings.downsampling=-1", ["odometry.settings.downsampling", "-1"]),
+        ("odometry.parameters.keyframe=1", ["odometry.parameters.keyframe"]),
+        ("odometry.parameters.keyframe={low: 1}", ["did you mean 'keyframe_interval'?"]),
+        (
+            "odometry.parameters.keyframe_interval={low: 3, high: 2}",
+            ["odometry.parameters.keyframe_interval", "low (3) must be less than high (2)"],
+        ),
+        (
+            "odometry.parameters.keyframe_interval.baseline=99",
+            ["keyframe_interval", "baseline (99)"],
+        ),
+        (
+            "odometry.parameters.keyframe_interval.low=0",
+            ["keyframe_interval", "log scale needs low (0) above 0"],
+        ),
+        ("sub_trajectory=none", ["sub_trajectory", '"none"']),
+        ("sub_trajectories=1", ["sub_trajectories: unknown key", "'sub_trajectory'"]),
+        ("offline.sampler=tpee", ["offline.sampler", "'tpe'"]),
+        ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
+        ("offline.trials=0", ["offline.trials", "not 0"]),
+        ("online.rules=[best]", ["online.rules.0", "best"]),
+        ("training=[ones]", ["training.0", "did you mean 'one'?"]),
+        ("training=[]", ["training"]),
+        ("test=[three, three]", ["test.1", "named twice"]),
+        ("sequences.one.bag=four.bag", ["sequences.one", "four.bag", "no such bag"]),
+        ("sequences.one.bag=${NO_SUCH_VARIABLE}/a.bag", ["NO_SUCH_VARIABLE"]),
+        ("sequences.one.points=/point", ["sequences.one", "'/points'", "/truth"]),
+        ("sequences.one.points=/truth", ["sequences.one", "/truth is", "PoseStamped"]),
+        ("sequences.one.reference=/points", ["sequences.one", "/points is", "PointCloud2"]),
+        ("sequences.one.reference=no.tum", ["sequences.one", "no.tum"]),
+        ("sequences.one.stops=1", ["sequences.one.stops", "'stop'"]),
+        ("sequences.one.start=5", None),
+        ("courses.one={scenes: [cave], seed: 1}", ["courses.one", "same name"]),
+        ("courses.far={scenes: [caves], seed: 1}", ["courses.far", "cave"]),
+        ("nonsense", ["-o nonsense"]),
+        ("offline={", ["-o offline={"]),
+    ],
+)
+def test_names_each_mistake(study_file, override, words):
+    if words is None:
+        load_study(study_file, [override])
+        return
+    message = failure(study_file, override)
+    assert message.startswith("-o")
+    for word in words:
+        assert word in message
+
+
+def test_tells_all_mistakes_at_once_with_their_lines(study_file):
+    file = study_file.with_name("wrong.yaml")
+    file.write_text(
+        study_file.read_text()
+        .replace("low: 0.5, high: 15.0", "low: 20, high: 15.0")
+        .replace("bag: two.bag", "bag: too.bag")
+        .replace("trials: 10", "trails: 10")
+        .replace("test: [three]", "test: [threee]")
+    )
+    lines = failure(file).splitlines()
+    assert [line.split(": ")[1] for line in lines] == [
+        "odometry.parameters.keyframe_interval",
+        "sequences.two",
+        "test.0",
+        "offline.trails",
+    ]
+    assert [int(line.split("line ")[1].split(":")[0]) for line in lines] == [6, 9, 12, 14]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "mapping"),
+        ("- a\n", "mapping"),
+        ("a: [", "line 1"),
+        ("training: [a]\ntraining: [b]\n", "line 2: 'training' was given before, in line 1"),
+        ("\x00", "special characters"),
+    ],
+)
+def test_refuses_what_is_no_study(tmp_path, text, words):
+    file = tmp_path / "a.yaml"
+    file.write_text(text)
+    message = failure(file)
+    assert str(file) in message
+    assert words in message
+
+
+def test_names_a_missing_file(tmp_path):
+    assert "no such file" in failure(tmp_path / "a.yaml")
+
+
+def test_folder_goes_on_only_with_the_same_study(study_file, tmp_path):
+    folder = tmp_path / "run"
+    load_study(study_file, [], folder).open()
+    load_study(study_file, ["offline.trials=99", "test=[]", "online.period=2"], folder).open()
+    other = load_study(study_file, ["offline.seed=9", "sequences.one.stop=3"], folder)
+    with pytest.raises(ConfigurationError, match=r"offline\.seed, sequences\.one\.stop"):
+        other.open()
+    # A test sequence may change: only replays depend on it, and they know what they are made of.
+    load_study(study_file, ["sequences.three.stop=3"], folder).open()

@@ -1,0 +1,96 @@
+"""Bags of a sensor driving through a world of points, small enough to register in no time."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+STORE = get_typestore(Stores.ROS1_NOETIC)
+FIRST_STAMP = 1_700_000_000_123_456_789
+
+
+def world(seed: int = 0, length: float = 40.0, n: int = 6000) -> NDArray[np.float64]:
+    """Points on a floor, two rough walls and some poles, along x."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-10.0, length + 10.0, n)
+    floor = np.stack([x, rng.uniform(-4.0, 4.0, n), rng.normal(-1.0, 0.01, n)], axis=1)
+    bumps = 0.5 * np.sin(1.7 * x + seed) + 0.3 * np.sin(0.61 * x)
+    side = rng.choice([-1.0, 1.0], n)
+    walls = np.stack([x, side * (4.0 + bumps), rng.uniform(-1.0, 3.0, n)], axis=1)
+    at = rng.uniform(-10.0, length + 10.0, 25)[rng.integers(0, 25, n // 3)]
+    poles = np.stack(
+        [at + rng.normal(0, 0.05, len(at)), 3.0 * np.sin(37.0 * at), rng.uniform(-1, 3, len(at))],
+        axis=1,
+    )
+    return np.concatenate([floor, walls, poles])
+
+
+def scans(
+    seed: int = 0, n_scans: int = 60, step: float = 0.3
+) -> list[tuple[int, NDArray[np.float32], NDArray[np.float64]]]:
+    """Stamp, points and pose of every scan of a straight drive along x at 10 Hz."""
+    rng = np.random.default_rng((seed, 1))
+    points = world(seed, n_scans * step)
+    made = []
+    for i in range(n_scans):
+        T_world_sensor = np.eye(4)
+        T_world_sensor[0, 3] = step * i
+        near = points[np.abs(points[:, 0] - step * i) < 12.0] - T_world_sensor[:3, 3]
+        some = near[rng.random(len(near)) < 0.7] + rng.normal(0.0, 0.01, (1, 3))
+        made.append((FIRST_STAMP + i * 100_000_000, some.astype(np.float32), T_world_sensor))
+    return made
+
+
+def cloud(stamp: int, points: NDArray[np.float32]) -> object:
+    """A sensor_msgs/PointCloud2 with x, y and z."""
+    types = STORE.types
+    field = types["sensor_msgs/msg/PointField"]
+    return types["sensor_msgs/msg/PointCloud2"](
+        header=header(stamp),
+        height=1,
+        width=len(points),
+        fields=[field(name, 4 * i, 7, 1) for i, name in enumerate("xyz")],
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(points),
+        data=np.ascontiguousarray(points, np.float32).view(np.uint8).reshape(-1),
+        is_dense=True,
+    )
+
+
+def header(stamp: int) -> object:
+    """A std_msgs/Header."""
+    time = STORE.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+    return STORE.types["std_msgs/msg/Header"](0, time, "sensor")
+
+
+def pose(stamp: int, T: NDArray[np.float64]) -> object:
+    """A geometry_msgs/PoseStamped of a pose without rotation."""
+    types = STORE.types
+    return types["geometry_msgs/msg/PoseStamped"](
+        header(stamp),
+        types["geometry_msgs/msg/Pose"](
+            types["geometry_msgs/msg/Point"](*T[:3, 3].tolist()),
+            types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        ),
+    )
+
+
+def write_bag(
+    path: Path,
+    drive: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]],
+    reference_delay: int = 0,
+) -> Path:
+    """Write a drive to a ROS 1 bag with /points and /truth."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with Writer(path) as bag:
+        points = bag.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
+        truth = bag.add_connection("/truth", "geometry_msgs/msg/PoseStamped", typestore=STORE)
+        for stamp, xyz, T in drive:
+            message = cloud(stamp, xyz)
+            bag.write(points, stamp, STORE.serialize_ros1(message, "sensor_msgs/msg/PointCloud2"))
+            message = pose(stamp + reference_delay, T)
+            bag.write(truth, stamp, STORE.serialize_ros1(message, "geometry_msgs/msg/PoseStamped"))
+    return path

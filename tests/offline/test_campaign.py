@@ -1,0 +1,138 @@
+import itertools
+import os
+import signal
+import time
+from pathlib import Path
+
+import drives
+import numpy as np
+import pytest
+
+from adaptune.archive import Archive
+from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.study import load_study
+from offline.campaign import train
+from offline.workers import WorkerError, Workers
+
+
+def files(folder):
+    """Contents of all that must not depend on who ran it, or when."""
+    contents = {}
+    for path in sorted((folder / "trials").rglob("*.npz")):
+        with np.load(path) as data:
+            contents[path.relative_to(folder)] = {
+                key: data[key].tobytes() for key in data if key != "seconds"
+            }
+    contents[Path("model.npz")] = (folder / "model.npz").read_bytes()
+    return contents
+
+
+@pytest.fixture(scope="module")
+def trained(study_file, tmp_path_factory):
+    study = load_study(study_file, [], tmp_path_factory.mktemp("run") / "study")
+    return study, train(study)
+
+
+def test_every_trial_is_in_the_archive(trained):
+    study, training = trained
+    archive = Archive(study.folder / "trials")
+    for name, number in itertools.product(("one", "two"), range(10)):
+        trial = archive.read(name, number)
+        assert trial.parameters == training.model.sets[number]
+        assert training.means[name][number] == pytest.approx(trial.mean_error, rel=1e-6)
+    assert training.model.sets[0] == study.space.baseline
+
+
+def test_the_fixed_set_has_the_least_mean_of_means(trained):
+    _, training = trained
+    means = np.mean([training.means["one"], training.means["two"]], axis=0)
+    assert training.model.fixed == np.argmin(means)
+    assert means.min() < means.max() / 1.5
+
+
+def test_the_model_is_that_of_the_trials(trained):
+    study, training = trained
+    model = ErrorModel.load(study.folder / "model.npz")
+    assert model.sets == training.model.sets
+    assert model.sequences == ["one", "two"]
+    assert model.errors.shape == (58, 10)
+    frames = Archive(study.folder / "trials").read_frames("two")
+    np.testing.assert_array_equal(model.histograms[29:], frames.histograms[:29])
+
+
+def test_number_of_workers_changes_nothing(trained, study_file, tmp_path):
+    study, _ = trained
+    alone = load_study(study_file, ["offline.workers=1"], tmp_path / "study")
+    train(alone)
+    assert files(alone.folder) == files(study.folder)
+
+
+def test_more_trials_go_on_where_fewer_stopped(trained, study_file, tmp_path):
+    study, _ = trained
+    folder = tmp_path / "study"
+    train(load_study(study_file, ["offline.trials=5"], folder))
+    before = {p: p.stat().st_mtime_ns for p in folder.glob("trials/*/0000?.npz")}
+    assert len(before) == 10
+    train(load_study(study_file, [], folder))
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    # The whole runs of the smaller study's fixed set are not the larger one's.
+    ours, theirs = files(folder), files(study.folder)
+    assert {k: ours[k] for k in theirs} == theirs
+
+
+def test_finished_work_is_not_repeated(trained, monkeypatch):
+    study, training = trained
+
+    def spawn(*_):
+        raise AssertionError("a worker was started")
+
+    monkeypatch.setattr(Workers, "_spawn", spawn)
+    assert train(study).means == training.means
+
+
+def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch):
+    study, _ = trained
+    again = load_study(study_file, [], tmp_path / "study")
+    spawned = []
+    spawn = Workers._spawn
+
+    def remember(self, w):
+        worker = spawn(self, w)
+        spawned.append(worker.process)
+        return worker
+
+    monkeypatch.setattr(Workers, "_spawn", remember)
+
+    def kill(_what, done, _total):
+        if done and len(spawned) == 2:
+            os.kill(spawned[0].pid, signal.SIGKILL)
+            time.sleep(0.05)
+
+    train(again, kill)
+    assert len(spawned) > 2
+    assert files(again.folder) == files(study.folder)
+
+
+def test_a_task_that_kills_its_worker_twice_is_told(study_file, tmp_path, monkeypatch):
+    study = load_study(study_file, ["offline.workers=1"], tmp_path / "study")
+    spawn = Workers._spawn
+
+    def doomed(self, w):
+        worker = spawn(self, w)
+        worker.process.kill()
+        worker.process.join()
+        return worker
+
+    monkeypatch.setattr(Workers, "_spawn", doomed)
+    with pytest.raises(WorkerError, match=r"died twice \(exit code -9\) on one, trials 0, 1, 2, 3"):
+        train(study)
+
+
+def test_what_a_worker_finds_wrong_reaches_the_user(study_file, tmp_path):
+    drives.write_bag(tmp_path / "short.bag", drives.scans(0, 9))
+    study = load_study(
+        study_file, [f"sequences.two.bag={tmp_path / 'short.bag'}"], tmp_path / "study"
+    )
+    with pytest.raises(AdaptuneError, match=r"two: its path of 2\.4 m holds no sub-trajectory"):
+        train(study)

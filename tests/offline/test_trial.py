@@ -1,0 +1,144 @@
+import dataclasses
+
+import drives
+import numpy as np
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import invert
+from adaptune.metrics import sub_trajectory_rte
+from adaptune.odometry import Registration
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.study import Study, load_study
+from offline.trial import PreparedSequence, run_trials
+
+GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+
+
+@pytest.fixture(scope="module")
+def study(study_file, tmp_path_factory):
+    return load_study(study_file, [], tmp_path_factory.mktemp("run"))
+
+
+def test_a_good_trial(study):
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(study, sequence, [GOOD])
+    assert trial.parameters == GOOD
+    assert not trial.restarted.any()
+    assert trial.registered.all()
+    assert trial.mean_error < 2.0
+    # 39 steps of 0.3 m: sub-trajectories of more than 3 m start at the first 29 frames.
+    assert np.flatnonzero(~np.isnan(trial.errors)).tolist() == list(range(29))
+    expected = sub_trajectory_rte(sequence.frames.T_ref_sensor, trial.T_odom_sensor, 3.0)
+    np.testing.assert_array_equal(trial.errors, expected)
+
+
+def test_trials_side_by_side_are_those_one_by_one(study):
+    sequence = PreparedSequence(study, "one", 1e9)
+    sets = [GOOD, GOOD | {"keyframe_interval": 5.0}, GOOD | {"max_correspondence_distance": 0.2}]
+    together = run_trials(study, sequence, sets)
+    for parameters, trial in zip(sets, together, strict=True):
+        (alone,) = run_trials(study, sequence, [parameters])
+        np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
+    assert not np.array_equal(together[0].T_odom_sensor, together[1].T_odom_sensor)
+
+
+@pytest.mark.parametrize("memory", [0.0, 2e6])
+def test_scans_that_do_not_fit_are_read_again(study, memory):
+    whole = PreparedSequence(study, "one", 1e9)
+    part = PreparedSequence(study, "one", memory)
+    assert part.nbytes <= memory < whole.nbytes
+    for _ in range(2):
+        (a,), (b,) = run_trials(study, whole, [GOOD]), run_trials(study, part, [GOOD])
+        np.testing.assert_array_equal(a.T_odom_sensor, b.T_odom_sensor)
+
+
+class Slipping(KeyframeGicp):
+    """Loses track by a given distance at given scans, and stays beside the track."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.scan = 0
+        self.slip = np.eye(4)
+        self.starts = []
+
+    def start(self, prepared, T_odom_sensor, T_previous_current=None):
+        self.starts.append((self.scan, T_odom_sensor, T_previous_current))
+        super().start(prepared, T_odom_sensor, T_previous_current)
+
+    def register(self, prepared):
+        self.scan += 1
+        T, ok = super().register(prepared)
+        if self.scan in (10, 25):
+            self.slip[1, 3] += 0.31 if self.scan == 10 else 0.29
+        return Registration(T @ self.slip, ok)
+
+
+def test_a_lost_track_starts_anew_at_the_reference(study, monkeypatch):
+    boxes = []
+
+    def odometry(self, parameters=None):
+        boxes.append(Slipping(parameters, self.settings))
+        return boxes[-1]
+
+    monkeypatch.setattr(Study, "odometry", odometry)
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(study, sequence, [GOOD])
+    frames = sequence.frames
+    # 3 m/s at 10 Hz bounds a step's departure by 0.3 m: the second slip is none.
+    assert 10 in np.flatnonzero(trial.restarted)
+    assert 25 not in np.flatnonzero(trial.restarted)
+    np.testing.assert_array_equal(trial.T_odom_sensor[10], frames.T_ref_sensor[10])
+    _, T, motion = next(s for s in boxes[-1].starts if s[0] == 10 and s[2] is not None)
+    np.testing.assert_array_equal(T, frames.T_ref_sensor[10])
+    np.testing.assert_allclose(
+        motion, invert(frames.T_ref_sensor[9]) @ frames.T_ref_sensor[10], atol=1e-12
+    )
+
+
+def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monkeypatch):
+    class Lost(Slipping):
+        def register(self, prepared):
+            self.scan += 1
+            T, ok = KeyframeGicp.register(self, prepared)
+            if self.scan == 10:
+                T = T @ np.diag([1.0, 1.0, 1.0, 1.0])
+                T[1, 3] += 5.0
+            return Registration(T, ok)
+
+    monkeypatch.setattr(Study, "odometry", lambda self, p=None: Lost(p, self.settings))
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(study, sequence, [GOOD])
+    assert np.flatnonzero(trial.restarted).tolist() == [10]
+    # Eleven steps of 0.3 m are more than 3 m: windows from -1 (none) to 9 cross the step to 10.
+    assert np.flatnonzero(np.isinf(trial.errors)).tolist() == list(range(10))
+    assert trial.errors[10:29].max() < 3.0
+    assert trial.mean_error == pytest.approx((10 * 30.0 + trial.errors[10:29].sum()) / 29)
+    (whole,) = run_trials(study, sequence, [GOOD], whole=True)
+    assert not whole.restarted.any()
+    assert np.isfinite(whole.errors[:29]).all()
+
+
+def test_a_reference_of_another_time_is_refused(study, tmp_path):
+    drives.write_bag(tmp_path / "late.bag", drives.scans(0, 12), reference_delay=10**12)
+    with pytest.raises(AdaptuneError, match="one: the reference does not overlap the scans"):
+        PreparedSequence(with_bag(study, tmp_path / "late.bag"), "one", 1e9)
+
+
+def test_a_sequence_shorter_than_the_sub_trajectory_is_refused(study, tmp_path):
+    drives.write_bag(tmp_path / "short.bag", drives.scans(0, 9))
+    with pytest.raises(AdaptuneError, match=r"path of 2\.4 m holds no sub-trajectory of 3 m"):
+        PreparedSequence(with_bag(study, tmp_path / "short.bag"), "one", 1e9)
+
+
+def test_a_sequence_without_reference_is_refused(study):
+    with pytest.raises(AdaptuneError, match=r"sequences\.one: training needs a reference"):
+        PreparedSequence(with_bag(study, study.config.sequences["one"].bag, None), "one", 1e9)
+
+
+def with_bag(study, bag, reference="/truth"):
+    entry = study.config.sequences["one"].model_copy(
+        update={"bag": str(bag), "reference": reference}
+    )
+    config = study.config.model_copy(update={"sequences": {"one": entry}})
+    return dataclasses.replace(study, config=config)

@@ -1,0 +1,131 @@
+import itertools
+
+import numpy as np
+import pytest
+
+from adaptune.model import Selection
+from adaptune.model.base import Rule
+from adaptune.study import load_study
+from offline.campaign import train
+from offline.validation import (
+    LabelledSequence,
+    LeftOut,
+    Validation,
+    ValidationError,
+    leave_one_out,
+    validate,
+)
+
+SETS = np.linspace(0.0, 1.0, 5)[:, None]
+
+
+def sequence(name, means, kind, rng, n=80):
+    """A sequence of one kind of place, whose errors differ from set to set."""
+    histograms = rng.poisson(3.0, (n, 90)).astype(float)
+    histograms[:, kind * 9 : kind * 9 + 9] += 30.0
+    errors = (np.array(means) * rng.uniform(0.9, 1.1, (n, 1))).astype(np.float32)
+    return LabelledSequence(name, np.arange(n) // 10, histograms, errors)
+
+
+def two_kinds(rng):
+    """Set 2 does everywhere; set 0 is better in one kind of place, set 4 in the other."""
+    kinds = {0: [0.5, 1.5, 1.0, 2.0, 3.0], 1: [3.0, 2.0, 1.0, 1.5, 0.4]}
+    return [sequence(f"{k}{i}", kinds[k], k, rng) for k, i in itertools.product((0, 1), range(4))]
+
+
+def test_rules_gain_where_places_tell_the_sets_apart():
+    validation = leave_one_out(two_kinds(np.random.default_rng(0)), SETS)
+    for rule in ("paired", "paper"):
+        np.testing.assert_allclose(validation.ratios[rule], [0.5] * 4 + [0.4] * 4, rtol=0.05)
+        assert validation.verdict(rule).startswith(f"Adapt by `{rule}`")
+    np.testing.assert_allclose(
+        validation.ratios["oracle, second"], [0.5] * 4 + [0.4] * 4, rtol=0.05
+    )
+    np.testing.assert_allclose(validation.ratios["baseline"], [0.5] * 4 + [3.0] * 4, rtol=0.05)
+
+
+class Cheat(Rule):
+    """Knows only what it was fitted on, and shows it."""
+
+    fitted = ()
+
+    def fit(self, data):
+        self.data = data
+        Cheat.fitted += (data,)
+        return self
+
+    def predict(self, feature):
+        raise NotImplementedError
+
+    def select(self, _feature):
+        return Selection(0, 0.0, 0.0)
+
+
+def test_the_sequence_left_out_is_never_seen():
+    sequences = two_kinds(np.random.default_rng(1))
+    marked = [
+        LabelledSequence(s.name, s.seconds, s.histograms, s.errors + np.float32(i))
+        for i, s in enumerate(sequences)
+    ]
+    Cheat.fitted = ()
+    leave_one_out(marked, SETS, {"cheat": Cheat})
+    for i, data in enumerate(Cheat.fitted):
+        seen = {e.tobytes() for e in data.errors}
+        assert not seen & {e.tobytes() for e in marked[i].errors}
+        assert len(seen) == 7 * 80
+
+
+def test_a_selection_holds_for_its_second():
+    asked = []
+
+    class Remember(Cheat):
+        def select(self, feature):
+            asked.append(feature)
+            return Selection(len(asked) % 2, 0.0, 0.0)
+
+    sequences = two_kinds(np.random.default_rng(2))[:2]
+    validation = leave_one_out(sequences, SETS, {"r": Remember})
+    assert len(asked) == 2 * 8
+    expected = np.where(np.arange(80) // 10 % 2 == 0, 1, 0)
+    np.testing.assert_allclose(
+        validation.left_out[0].errors["r"], sequences[0].errors[np.arange(80), expected], rtol=1e-6
+    )
+
+
+def test_the_oracle_is_never_worse_than_anything():
+    rng = np.random.default_rng(3)
+    sequences = [sequence(str(i), rng.lognormal(size=5), i % 3, rng) for i in range(6)]
+    ratios = leave_one_out(sequences, SETS).ratios
+    for mode in ratios:
+        assert (ratios["oracle, second"] <= ratios[mode] + 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("ratios", "verdict"),
+    [
+        ([0.5, 0.6, 0.7, 0.8], "Adapt by"),
+        ([0.5, 0.6, 0.7, 1.2], "Do not adapt by"),
+        ([0.7, 1.04, 1.02, 1.01], "Nothing shows that"),
+        ([1.0, 1.0, 1.0, 1.0], "Nothing shows that"),
+    ],
+)
+def test_verdicts(ratios, verdict):
+    left_out = [
+        LeftOut(str(i), {"fixed": np.ones(9), "rule": np.full(9, r)}, {})
+        for i, r in enumerate(ratios)
+    ]
+    assert Validation(left_out).verdict("rule").startswith(verdict)
+
+
+def test_one_sequence_cannot_be_validated():
+    with pytest.raises(ValidationError, match="one sequence"):
+        leave_one_out(two_kinds(np.random.default_rng(0))[:1], SETS)
+
+
+def test_validates_a_study(study_file, tmp_path):
+    study = load_study(study_file, [], tmp_path / "study")
+    train(study)
+    validation, rows = validate(study)
+    assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
+    assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
+    assert (study.folder / "validation.csv").exists()

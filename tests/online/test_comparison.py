@@ -1,0 +1,149 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from adaptune.model import ErrorModel
+from adaptune.study import load_study
+from adaptune.trajectory import Trajectory, read_tum, write_tum
+from offline.campaign import train
+from online.comparison import ComparisonError, bootstrap, compare, run_replays
+
+MODES = ["baseline", "fixed", "paired", "paper"]
+
+
+@pytest.fixture(scope="module")
+def trained(study_file, tmp_path_factory):
+    study = load_study(study_file, [], tmp_path_factory.mktemp("run") / "study")
+    train(study)
+    return study
+
+
+@pytest.fixture(scope="module")
+def replayed(trained):
+    assert run_replays(trained, trained.folder / "model.npz") == 4
+    return trained
+
+
+def test_rows_and_files(replayed):
+    rows = compare(replayed)
+    assert [(row["sequence"], row["mode"]) for row in rows] == [("three", mode) for mode in MODES]
+    of = {row["mode"]: row for row in rows}
+    assert of["fixed"]["vs fixed"] == 1.0
+    assert of["fixed"]["95 %"] == "1.00-1.00"
+    for row in rows:
+        assert row["_rte_low"] <= row["RTE [%]"] <= row["_rte_high"]
+        assert row["vs fixed"] == pytest.approx(row["RTE [%]"] / of["fixed"]["RTE [%]"])
+    folder = replayed.folder / "comparison"
+    with (folder / "comparison.csv").open() as file:
+        assert [row["mode"] for row in csv.DictReader(file)] == MODES
+    assert json.loads((folder / "comparison.json").read_text())[1]["vs fixed"] == 1.0
+    assert (folder / "three.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(replayed):
+    model = ErrorModel.load(replayed.folder / "model.npz")
+    folder = replayed.folder / "replays/three"
+    about = {m: json.loads((folder / m / "replay.json").read_text())["about"] for m in MODES}
+    assert about["baseline"]["parameters"] == replayed.space.baseline
+    assert about["fixed"]["parameters"] == model.sets[model.fixed]
+    for mode in ("paired", "paper"):
+        with (folder / mode / "selections.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        assert len(rows) == 4  # 40 scans at 10 Hz
+        for row in rows:
+            chosen = model.sets[int(row["set"])]
+            assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
+
+
+def test_replays_are_made_once(replayed, study_file):
+    model = replayed.folder / "model.npz"
+    assert run_replays(replayed, model) == 0
+    assert run_replays(replayed, model, again=True) == 4
+    cut = load_study(study_file, ["online.period=2"], replayed.folder)
+    # Baseline and fixed replays hold no selections, but their records name the period.
+    assert run_replays(cut, model) == 4
+    assert run_replays(replayed, model) == 4
+
+
+def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_file):
+    study = load_study(study_file, ["sequences.three.reference="], trained.folder)
+    run_replays(study, trained.folder / "model.npz")
+    rows = compare(study)
+    assert [row["RTE [%]"] for row in rows] == [None] * 4
+    assert not (study.folder / "replays/three/reference.tum").exists()
+    run_replays(trained, trained.folder / "model.npz")
+    assert compare(trained)[0]["RTE [%]"] is not None
+
+
+def test_a_written_reference_is_that_of_the_scans(replayed):
+    reference = read_tum(replayed.folder / "replays/three/reference.tum")
+    np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.3 * np.arange(40), atol=1e-9)
+
+
+def test_rows_over_several_sequences(replayed, study_file):
+    study = load_study(study_file, ["test=[three, two]"], replayed.folder)
+    run_replays(study, replayed.folder / "model.npz")
+    rows = compare(study)
+    assert [row["sequence"] for row in rows] == ["three"] * 4 + ["two"] * 4 + ["all 2"] * 4
+    a, b, all_ = rows[3], rows[7], rows[11]
+    assert all_["RTE [%]"] == pytest.approx((a["RTE [%]"] + b["RTE [%]"]) / 2)
+    assert all_["vs fixed"] == pytest.approx((a["vs fixed"] * b["vs fixed"]) ** 0.5)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("odometry.settings.downsampling=0.4", "is a model of .*0.5.*0.4"),
+        ("odometry.parameters.keyframe_interval.high=20", "other parameters or ranges"),
+        ("test=[]", "name at least one sequence"),
+    ],
+)
+def test_refuses_a_model_of_something_else(trained, study_file, override, words):
+    study = load_study(study_file, [override], trained.folder)
+    with pytest.raises(ComparisonError, match=words):
+        run_replays(study, trained.folder / "model.npz")
+
+
+def test_names_a_missing_replay(study_file, tmp_path):
+    study = load_study(study_file, [], tmp_path / "study")
+    with pytest.raises(ComparisonError, match="adaptune online"):
+        compare(study)
+
+
+def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
+    truth = read_tum_of(trained, study_file)
+    write_tum(tmp_path / "late.tum", Trajectory(truth.stamps + 10**12, truth.T_world_sensor))
+    study = load_study(
+        study_file, [f"sequences.three.reference={tmp_path / 'late.tum'}"], trained.folder
+    )
+    with pytest.raises(ComparisonError, match="three: the reference does not overlap"):
+        run_replays(study, trained.folder / "model.npz")
+
+
+def read_tum_of(study, study_file):
+    return load_study(study_file, [], study.folder).sequence("three").reference()
+
+
+def test_bootstrap_covers_the_mean_of_correlated_errors():
+    rng = np.random.default_rng(0)
+    covered = {1: 0, 40: 0}
+    for _ in range(60):
+        noise = rng.normal(size=640)
+        errors = 1.0 + np.convolve(noise, np.ones(40) / 40, mode="valid")
+        for block in covered:
+            _, _, ((low, high), _) = bootstrap(errors, errors, block)
+            covered[block] += low <= 1.0 <= high
+    # Neighbouring errors share their windows: drawn one by one they seem far too certain.
+    assert covered[40] >= 48
+    assert covered[1] <= 30
+
+
+def test_bootstrap_of_a_ratio_is_paired():
+    rng = np.random.default_rng(1)
+    fixed = rng.lognormal(size=500)
+    mean, ratio, ((low, high), (ratio_low, ratio_high)) = bootstrap(0.5 * fixed, fixed, 20)
+    assert mean == pytest.approx(0.5 * fixed.mean())
+    assert (ratio, ratio_low, ratio_high) == pytest.approx((0.5, 0.5, 0.5))
+    assert low < mean < high

@@ -1,0 +1,146 @@
+import csv
+import json
+
+import drives
+import numpy as np
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.model import Selection
+from adaptune.odometry import HealthCheck, Odometry, OdometryError, Registration
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.sequence import Scan
+from adaptune.space import Float, ParameterSpace
+from adaptune.trajectory import read_tum
+from online.replay import replay, write_replay
+
+
+class Scripted(Odometry):
+    """Moves along x by the steps it is given, and remembers what was done to it."""
+
+    space = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
+    live = True
+
+    def __init__(self, steps=()):
+        super().__init__()
+        self.steps = list(steps)
+        self.events = []
+
+    def prepare(self, scan):
+        return scan.stamp
+
+    def start(self, prepared, T_odom_sensor, T_previous_current=None):
+        motion = None if T_previous_current is None else float(T_previous_current[0, 3])
+        self.events.append(("start", prepared, float(T_odom_sensor[0, 3]), motion))
+        self.T = T_odom_sensor
+
+    def register(self, prepared):
+        self.events.append(("register", prepared, self.parameters["speed"]))
+        step = self.steps.pop(0) if self.steps else 0.1
+        self.T = self.T.copy()
+        self.T[0, 3] += 0.0 if step is None else step
+        return Registration(self.T, registered=step is not None)
+
+    def configure(self, parameters):
+        super().configure(parameters)
+        self.events.append(("configure", parameters["speed"]))
+
+
+def scans(stamps):
+    return [Scan(int(s * 1e9), np.zeros((0, 3), np.float32)) for s in stamps]
+
+
+HEALTH = HealthCheck(max_speed=5.0, max_acceleration=20.0)
+
+
+def test_selects_at_the_first_scan_and_then_every_period_before_registering():
+    box = Scripted()
+    asked = []
+
+    def policy(scan):
+        asked.append(scan.stamp)
+        return Selection(len(asked) % 2, 1.0, 2.0)
+
+    stamps = [0.0, 0.4, 0.8, 1.0, 1.2, 1.9, 2.3, 4.95, 5.0, 5.05]
+    result = replay(scans(stamps), box, HEALTH, policy, [{"speed": 3.0}, {"speed": 4.0}])
+    assert [s / 1e9 for s in asked] == [0.0, 1.0, 2.3, 4.95, 5.0]
+    assert [c.stamp for c in result.choices] == asked
+    assert [c.parameters["speed"] for c in result.choices] == [4.0, 3.0, 4.0, 3.0, 4.0]
+    # The change comes before the scan that it was made from.
+    assert box.events[:2] == [("configure", 4.0), ("start", 0, 0.0, None)]
+    at = box.events.index(("register", 1_000_000_000, 3.0))
+    assert box.events[at - 1] == ("configure", 3.0)
+
+
+def test_without_a_policy_nothing_is_changed():
+    box = Scripted()
+    result = replay(scans(np.arange(30) / 10), box, HEALTH)
+    assert not [event for event in box.events if event[0] == "configure"]
+    assert result.choices == []
+    np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], np.arange(30) * 0.1)
+
+
+@pytest.mark.parametrize("jump", [3.0, -2.0, np.nan, np.inf])
+def test_an_impossible_step_starts_anew_at_the_last_healthy_motion(jump):
+    box = Scripted([0.1, 0.2, jump, 0.2])
+    result = replay(scans(np.arange(6) / 10), box, HEALTH)
+    assert np.flatnonzero(result.restarted).tolist() == [3]
+    x = result.trajectory.T_world_sensor[:, 0, 3]
+    np.testing.assert_allclose(x, [0.0, 0.1, 0.3, 0.5, 0.7, 0.8])
+    start = [event for event in box.events if event[0] == "start"][1]
+    assert start[1] == 300_000_000
+    assert start[2:] == pytest.approx((0.5, 0.2))
+
+
+def test_a_platform_that_did_change_its_motion_is_believed_in_the_end():
+    # From 0.1 to 0.45 m a scan is 3.5 m/s at once; the bound grows with the time unseen.
+    box = Scripted([0.1, 0.1, *[0.45] * 6])
+    result = replay(scans(np.arange(9) / 10), box, HEALTH)
+    assert np.flatnonzero(result.restarted).tolist() == [3]
+    assert np.diff(result.trajectory.T_world_sensor[:, 0, 3])[-1] == pytest.approx(0.45)
+
+
+def test_poor_scans_are_counted(tmp_path):
+    box = Scripted([0.1, None, 0.1])
+    result = replay(scans(np.arange(5) / 10), box, HEALTH)
+    assert result.registered.tolist() == [True, True, False, True, True]
+    write_replay(tmp_path, result, {"mode": "x"})
+    assert json.loads((tmp_path / "replay.json").read_text())["poor_scans"] == 1
+
+
+def test_no_scans():
+    with pytest.raises(AdaptuneError, match="no scan"):
+        replay([], Scripted(), HEALTH)
+
+
+def test_an_odometry_that_is_not_live_is_refused():
+    class Stiff(Scripted):
+        live = False
+
+    with pytest.raises(OdometryError, match="cannot change its parameters"):
+        replay(scans([0.0]), Stiff(), HEALTH, lambda _: Selection(0, 1.0, 1.0), [{"speed": 1.0}])
+
+
+def test_a_real_replay_is_the_same_every_time(tmp_path):
+    drive = [Scan(stamp, points) for stamp, points, _ in drives.scans(0, 25)]
+    sets = [
+        {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0},
+        {"max_correspondence_distance": 0.7, "keyframe_interval": 3.0},
+    ]
+
+    def policy(scan):
+        return Selection(scan.stamp // 10**9 % 2, 0.5, 1.0)
+
+    results = [replay(drive, KeyframeGicp(sets[0]), HealthCheck(), policy, sets) for _ in range(2)]
+    a, b = (r.trajectory.T_world_sensor for r in results)
+    np.testing.assert_array_equal(a, b)
+    assert abs(a[-1, 0, 3] - 24 * 0.3) < 0.1
+    write_replay(tmp_path, results[0], {})
+    written = read_tum(tmp_path / "trajectory.tum")
+    np.testing.assert_array_equal(written.stamps, [stamp for stamp, _, _ in drives.scans(0, 25)])
+    np.testing.assert_allclose(written.T_world_sensor, a, atol=1e-8)
+    with (tmp_path / "selections.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["stamp_ns"]) for row in rows] == [c.stamp for c in results[0].choices]
+    assert {row["predicted_error_percent"] for row in rows} == {"0.5000"}
+    assert {float(row["keyframe_interval"]) for row in rows} == {1.0, 3.0}
