@@ -11,7 +11,9 @@ from adaptune.simulation.recording import CLOUD, undistort
 from adaptune.simulation.simulate import Drive
 from adaptune.trajectory import read_kitti, read_tum
 
-COURSE = Course(scenes=("street",), length=10.0, sensor="vlp16", columns=120, imu=200)
+COURSE = Course(
+    scenes=("corridor",), length=10.0, sensor="vlp16", columns=60, imu=200, motion="car"
+)
 RECORDINGS = {"ros1": "run.bag", "mcap": "run.mcap", "ros2": "run"}
 
 
@@ -163,8 +165,8 @@ def test_a_folder_of_something_else_stays(tmp_path):
     (folder / "chapter.tex").write_text("mine")
     with pytest.raises(SimulationError, match="no recording of this kind: it stays"):
         record(COURSE, folder, overwrite=True)
-    record(COURSE, tmp_path / "run")
-    record(COURSE, tmp_path / "run", overwrite=True)
+    for _ in range(2):
+        record(COURSE, tmp_path / "run", overwrite=True)
     assert (folder / "chapter.tex").read_text() == "mine"
 
 

@@ -11,7 +11,7 @@ def test_odometry_survives(scene):
     cls = box_class("gicp")
     odometry = cls({"max_correspondence_distance": 1.5, "keyframe_interval": 3.0})
     T_world_sensor, poses = [], []
-    for scan in simulate(Course(scenes=(scene,), length=28.0, columns=450)):
+    for scan in simulate(Course(scenes=(scene,), length=26.0, columns=300)):
         prepared = odometry.prepare(scan)
         if poses:
             poses.append(odometry.register(prepared).T_odom_sensor)

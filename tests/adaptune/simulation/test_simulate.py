@@ -87,7 +87,7 @@ def test_every_sensor_scans(name):
 
 
 def test_movers_are_hit_where_they_are():
-    given = course("street", moving_objects=True, length=30.0, seed=2, columns=900)
+    given = course("street", moving_objects=True, length=20.0, seed=2, columns=450)
     drive = Drive(given)
     still = list(Drive(given.model_copy(update={"moving_objects": False})).scans())
     near = 0
@@ -99,7 +99,7 @@ def test_movers_are_hit_where_they_are():
             centre = mover.at(drive.road, t)[0][0] + [0.0, 0.0, 0.9]
             close = [np.sum(np.linalg.norm(p - centre, axis=1) < 0.8) for p in (points, others)]
             near += close[0] > close[1] + 10
-    assert near > 20
+    assert near > 5
 
 
 def test_weather_thins_the_far_and_fills_the_near():
