@@ -88,7 +88,7 @@ def towards(
 
 
 @numba.njit(cache=True)
-def receive(  # noqa: PLR0917 - compiled functions take no keywords
+def receive(
     directions: F32,
     rays: F32,
     hits: F32,

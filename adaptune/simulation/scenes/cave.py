@@ -7,7 +7,7 @@ from adaptune.simulation.noise import fractal, fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
 
-_CHAMBERS, _ROOMS = 13.0, 5.0
+_CHAMBERS, _ROOMS = 13.0, 6.0
 """Metres from one side chamber to the next, and from one narrow to the next."""
 
 
@@ -46,8 +46,8 @@ def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     """Give offset and height of the rock at stations and angles from the left, over the top."""
     along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
     room = _rooms(s, seed)
-    half = 1.15 + room * (2.4 + 0.8 * fractal(along, 9.0, seed + 21).reshape(s.shape))
-    roof = 2.0 + room * (1.2 + 0.9 * fractal(along, 13.0, seed + 22).reshape(s.shape))
+    half = 1.0 + room * (2.4 + 0.8 * fractal(along, 9.0, seed + 21).reshape(s.shape))
+    roof = 1.7 + room * (1.2 + 0.9 * fractal(along, 13.0, seed + 22).reshape(s.shape))
     lean = 0.9 * room * fractal(along, 7.0, seed + 23).reshape(s.shape)
     chamber = room * _chambers(s, angle, seed)
     d, z = (half + chamber) * np.cos(angle), roof * np.sin(angle)

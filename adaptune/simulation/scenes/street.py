@@ -7,7 +7,7 @@ from adaptune.simulation.noise import fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, paved
 
-_KERB, _CROSSING = 10.0, 4
+_KERB, _CROSSING = 9.0, 4
 """Metres from the road's middle to the kerb, and tiles from one crossing to the next."""
 
 
