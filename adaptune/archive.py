@@ -17,6 +17,9 @@ from adaptune.geometry import Poses
 from adaptune.metrics import cap
 from adaptune.space import ParameterSet
 
+_DAMAGE = (OSError, ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What numpy and zipfile raise on files that are not what they say."""
+
 
 class ArchiveError(AdaptuneError):
     """A file of the archive that is not what it should be."""
@@ -96,9 +99,10 @@ class Archive:
 
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Keep what all trials on a sequence share."""
-        with replacing(self.folder / sequence / "frames.npz") as beside:
+        path = self.folder / sequence / "frames.npz"
+        with replacing(path) as beside, beside.open("wb") as file:
             np.savez_compressed(
-                beside,
+                file,
                 stamps=frames.stamps,
                 T_ref_sensor=frames.T_ref_sensor,
                 histograms=frames.histograms.astype(np.uint16),
@@ -119,9 +123,10 @@ class Archive:
 
     def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
         """Keep a trial."""
-        with replacing(self.trial_path(sequence, number, whole)) as beside:
+        path = self.trial_path(sequence, number, whole)
+        with replacing(path) as beside, beside.open("wb") as file:
             np.savez(
-                beside,
+                file,
                 parameters=np.frombuffer(json.dumps(trial.parameters).encode(), np.uint8),
                 T_odom_sensor=trial.T_odom_sensor,
                 errors=trial.errors.astype(np.float32),
@@ -162,5 +167,5 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
             return dict(file)
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: there is no such file; run `adaptune offline`") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except _DAMAGE as error:
         raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error

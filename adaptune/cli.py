@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,6 +57,7 @@ app = typer.Typer(
         "A study is a YAML file: an odometry, its parameters, sequences to train and to test on. "
         "Everything about it is kept in a folder, and the same command run again goes on where "
         "the last one stopped.\n\n"
+        "    adaptune inspect  my.bag               # what is in a recording\n\n"
         "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
         "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
         "    adaptune validate configs/demo.yaml    # would adapting pay elsewhere?\n\n"
@@ -109,6 +111,51 @@ def _main(
     )
     for chatty in ("matplotlib", "numba", "asyncio"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+@app.command()
+def inspect(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A bag, or its folder.", show_default=False)
+    ],
+    png: Annotated[
+        Path | None, typer.Option(help="Draw the first scan to this PNG.", dir_okay=False)
+    ] = None,
+) -> None:
+    """Tell what is in a recording, what each stage lacks, and how to name it in a study."""
+    from adaptune.inspect import inspect as inspect_file
+    from adaptune.inspect import render_inspection, write_inspection_png
+
+    found = inspect_file(file)
+    console.print(render_inspection(found))
+    if png is not None:
+        write_inspection_png(found, png)
+        console.print(f"First scan: {png}", highlight=False)
+
+
+class CacheAction(StrEnum):
+    """What to do with the cache."""
+
+    LIST = "list"
+    CLEAR = "clear"
+
+
+@app.command()
+def cache(
+    action: Annotated[CacheAction, typer.Argument(help="List or clear it.")] = CacheAction.LIST,
+) -> None:
+    """List or clear the decoded recordings that are kept on disk.
+
+    Bags are decoded once and mapped into memory from then on. `ADAPTUNE_CACHE` names another
+    folder; `ADAPTUNE_CACHE_GB` bounds its size (50), and 0 turns it off.
+    """
+    from adaptune.inspect import render_cache
+    from adaptune.sequence.cache import clear_cache
+
+    if action is CacheAction.CLEAR:
+        console.print(f"Freed {clear_cache() / 1e9:.2f} GB.", highlight=False)
+    else:
+        console.print(render_cache())
 
 
 @app.command()

@@ -15,7 +15,7 @@ def pin(core: int) -> Callable[[], None]:
     """Keep this process on one core, where the system can, and return how to undo it.
 
     Open3D sums in an order that depends on its threads: only on one core do its results repeat
-    bit by bit.
+    bit by bit. Threads that run already keep their cores, so this comes before Open3D's first use.
     """
     if not hasattr(os, "sched_setaffinity"):
         return lambda: None

@@ -38,7 +38,7 @@ def _eigenvalues(c: NDArray[np.float64]) -> tuple[float, float, float]:
         return q, q, q
     determinant = (
         xx * yy * zz
-        + 2.0 * c[3] * c[4] * c[5]
+        + 2.0 * c[3] * (c[4] * c[5])
         - (xx * c[5] * c[5] + yy * c[4] * c[4])
         - zz * c[3] * c[3]
     )

@@ -86,13 +86,16 @@ def sub_trajectory_rte(
     -------
     ndarray of shape (n,)
         Percent of `length`: NaN for frames without a full sub-trajectory, infinity for those
-        whose sub-trajectory contains a lost track.
+        whose sub-trajectory contains a lost track or poses that are not finite.
     """
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
     errors = np.full(len(ends), np.nan)
-    T = _relative_errors(T_ref_sensor, T_odom_sensor, starts, ends[starts])
+    with np.errstate(invalid="ignore"):
+        T = _relative_errors(T_ref_sensor, T_odom_sensor, starts, ends[starts])
     errors[starts] = 100.0 / length * np.linalg.norm(T[:, :3, 3], axis=1)
+    # An odometry whose poses are not finite has lost track; only the reference may be unknown.
+    errors[starts[~np.isfinite(errors[starts])]] = np.inf
     if restarted is not None:
         # The step that failed ends at its frame: a window that starts there is sound.
         failures = np.cumsum(restarted)

@@ -137,7 +137,9 @@ class Categorical(_Parameter):
 
     def to_unit(self, value: Any) -> float:
         """Map a choice to the middle of its share of [0, 1]."""
-        return (self.choices.index(value) + 0.5) / len(self.choices)
+        # Not by index(): True is equal to 1.
+        alike = [type(value) is type(choice) and value == choice for choice in self.choices]
+        return (alike.index(True) + 0.5) / len(self.choices)
 
     def from_unit(self, unit: float) -> Value:
         """Map from [0, 1] to the choice whose share it falls in."""

@@ -1,4 +1,4 @@
-"""Trajectories, and their files in the TUM and KITTI formats."""
+"""Trajectories, and their files in the TUM, KITTI, EuRoC and OXTS formats."""
 
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
@@ -27,10 +28,13 @@ class Trajectory:
         Strictly increasing integer nanoseconds.
     T_world_sensor : ndarray of shape (n, 4, 4)
         The pose at each stamp, in metres.
+    max_gap : float
+        Seconds; between poses further apart nothing is known.
     """
 
     stamps: NDArray[np.int64]
     T_world_sensor: Poses
+    max_gap: float = 1.0
 
     def __post_init__(self) -> None:
         if self.T_world_sensor.shape != (len(self.stamps), 4, 4):
@@ -44,7 +48,7 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def at(self, stamps: NDArray[np.int64], max_gap: float = 1.0) -> Poses:
+    def at(self, stamps: NDArray[np.int64], max_gap: float | None = None) -> Poses:
         """Interpolated poses.
 
         Parameters
@@ -52,17 +56,20 @@ class Trajectory:
         stamps
             Nanoseconds, of shape (m,).
         max_gap
-            Seconds; nothing is interpolated between poses further apart.
+            Seconds, in place of the trajectory's own.
 
         Returns
         -------
         ndarray of shape (m, 4, 4)
             NaN where the trajectory says nothing.
         """
-        return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(max_gap * 1e9))
+        gap = self.max_gap if max_gap is None else max_gap
+        return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
 
 
-def _rows(path: Path, columns: int, kind: str) -> list[tuple[int, list[str]]]:
+def _rows(
+    path: Path, columns: int, kind: str, or_more: bool = False
+) -> list[tuple[int, list[str]]]:
     """Split the lines that are neither empty nor a comment, with their numbers."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -75,12 +82,12 @@ def _rows(path: Path, columns: int, kind: str) -> list[tuple[int, list[str]]]:
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
             continue
-        if len(fields) != columns:
+        if len(fields) != columns and not (or_more and len(fields) > columns):
             raise TrajectoryError(
                 f"{path}, line {number}: a {kind} line has {columns} numbers, this has "
                 f"{len(fields)}"
             )
-        rows.append((number, fields))
+        rows.append((number, fields[:columns]))
     if not rows:
         raise TrajectoryError(f"{path}: holds no pose")
     return rows
@@ -121,12 +128,19 @@ def read_tum(path: Path) -> Trajectory:
             raise TrajectoryError(
                 f"{path}, line {number}: its stamp does not come after the line before"
             )
-    norms = np.linalg.norm(values[:, 3:], axis=1)
-    if (worst := int(np.argmax(np.abs(norms - 1.0)))) >= 0 and abs(norms[worst] - 1.0) > 1e-2:
+    _check_quaternions(path, rows, values[:, 3:])
+    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], values[:, 3:]))
+
+
+def _check_quaternions(
+    path: Path, rows: list[tuple[int, list[str]]], quaternions: NDArray[np.float64]
+) -> None:
+    norms = np.linalg.norm(quaternions, axis=1)
+    worst = int(np.argmax(np.abs(norms - 1.0)))
+    if abs(norms[worst] - 1.0) > 1e-2:
         raise TrajectoryError(
             f"{path}, line {rows[worst][0]}: its quaternion has length {norms[worst]:.3g}, not 1"
         )
-    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], values[:, 3:]))
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -164,3 +178,110 @@ def write_kitti(path: Path, T_world_sensor: Poses) -> None:
     """Write poses of shape (n, 4, 4) as 12 numbers a line, the rows of a 3x4 matrix."""
     rows = T_world_sensor[:, :3].reshape(-1, 12)
     write_text(path, "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows))
+
+
+def is_kitti(path: Path) -> bool:
+    """Whether a file's first pose is one of 12 numbers, without a stamp.
+
+    Raises
+    ------
+    TrajectoryError
+        If the file cannot be read.
+    """
+    return path.suffix != ".csv" and _columns(path) == 12
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read poses with stamps: ``.csv`` as EuRoC writes them, all else as TUM.
+
+    Raises
+    ------
+    TrajectoryError
+        Naming the file and the line that is not a pose.
+    """
+    return read_euroc(path) if path.suffix == ".csv" else read_tum(path)
+
+
+def _columns(path: Path) -> int:
+    """Numbers in the first line that is neither empty nor a comment."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            for line in file:
+                fields = line.replace(",", " ").split()
+                if fields and not fields[0].startswith("#"):
+                    return len(fields)
+    except FileNotFoundError as error:
+        raise TrajectoryError(f"{path}: there is no such file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"{path}: cannot be read as text ({error})") from error
+    return 0
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """Read ``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...`` lines, nanoseconds and metres.
+
+    What follows the pose (velocities, biases) is left aside.
+
+    Raises
+    ------
+    TrajectoryError
+        Naming the file and the line that is not a pose, or does not come after the one before.
+    """
+    rows = _rows(path, 8, "EuRoC", or_more=True)
+    values = _numbers(path, [(number, fields[1:]) for number, fields in rows])
+    stamps = np.empty(len(rows), np.int64)
+    for i, (number, fields) in enumerate(rows):
+        try:
+            stamps[i] = int(fields[0])
+        except (ValueError, OverflowError) as error:
+            raise TrajectoryError(
+                f"{path}, line {number}: {fields[0]!r} is not a time in nanoseconds"
+            ) from error
+        if i and stamps[i] <= stamps[i - 1]:
+            raise TrajectoryError(
+                f"{path}, line {number}: its stamp does not come after the line before"
+            )
+    quaternions = values[:, [4, 5, 6, 3]]
+    _check_quaternions(path, rows, quaternions)
+    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], quaternions))
+
+
+_EARTH_RADIUS = 6378137.0
+
+
+def read_oxts(files: list[Path]) -> Poses:
+    """Poses of a GPS/IMU from KITTI's OXTS files, one a file.
+
+    Latitude, longitude, altitude (degrees, metres), roll, pitch and yaw (radians) are mapped by a
+    Mercator projection true at the first file's latitude; the first position is the origin.
+
+    Returns
+    -------
+    ndarray of shape (n, 4, 4)
+        x points east, y north and z up.
+
+    Raises
+    ------
+    TrajectoryError
+        Naming the file that cannot be read.
+    """
+    values = np.empty((len(files), 6))
+    for i, path in enumerate(files):
+        rows = _rows(path, 6, "OXTS", or_more=True)
+        values[i] = _numbers(path, rows)[0]
+    latitude, longitude, altitude = values[:, 0], values[:, 1], values[:, 2]
+    if np.any(np.abs(latitude) >= 90.0):
+        raise TrajectoryError(f"{files[int(np.argmax(np.abs(latitude)))]}: no such latitude")
+    scale = np.cos(np.deg2rad(latitude[0])) * _EARTH_RADIUS
+    position = np.stack(
+        [
+            scale * np.deg2rad(longitude),
+            scale * np.log(np.tan(np.deg2rad(90.0 + latitude) / 2.0)),
+            altitude,
+        ],
+        axis=1,
+    )
+    T = np.tile(np.eye(4), (len(files), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("ZYX", values[:, [5, 4, 3]]).as_matrix()
+    T[:, :3, 3] = position - position[0]
+    return T

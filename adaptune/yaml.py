@@ -17,11 +17,7 @@ class _Loader(yaml.SafeLoader):
     """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 - that is how PyYAML keeps them
-        first: [
-            (tag, regexp)
-            for tag, regexp in resolvers
-            if tag.rpartition(":")[2] not in ("bool", "int", "float", "timestamp")
-        ]
+        first: [(tag, regexp) for tag, regexp in resolvers if tag.rpartition(":")[2] == "null"]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
@@ -85,9 +81,11 @@ class Document:
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = f"line {mark.line + 1}: " if mark else ""
-            raise YamlError(f"{where}{error.problem or error.context}") from error
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            raise YamlError(str(error)) from error
+            what = ", ".join(part for part in (error.context, error.problem) if part)
+            raise YamlError(f"{where}{what}") from error
+        except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
+            # What PyYAML's constructors raise on tags that do not suit their values.
+            raise YamlError(f"{type(error).__name__}: {error}") from error
 
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""
@@ -117,7 +115,11 @@ def scalar(text: str) -> Any:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what either version of YAML would not read back as a string."""
+    """Quotes what either version of YAML would not read back as a string, and repeats lists."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        """Write everything out."""
+        return True
 
 
 for _tag, _regexp, _first in (("int", _INT, "-+0123456789"), ("float", _FLOAT, "-+0123456789.")):

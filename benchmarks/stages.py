@@ -23,7 +23,7 @@ from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
 from adaptune.odometry import HealthCheck
 from adaptune.odometry.gicp import crop
-from adaptune.sequence import BagSequence, Scan
+from adaptune.sequence import Scan, SequenceConfig, open_sequence
 from adaptune.study import Study, load_study
 from adaptune.trajectory import read_kitti
 from offline.campaign import train
@@ -31,6 +31,8 @@ from offline.trial import PreparedSequence, run_trials
 from online.replay import adaptive, replay
 
 REPETITIONS = 5
+UNCACHED = [f"sequences.{name}.cache=false" for name in ("hall_begin", "hall_end", "street")]
+"""Reading is part of a replay from the bag."""
 
 
 def seconds(function: Callable[[], object]) -> float:
@@ -111,7 +113,7 @@ def adaptive_replay(study: Study, model: ErrorModel) -> None:
                 crop(scan, settings.min_range),  # type: ignore[attr-defined]
                 downsampling_resolution=settings.downsampling,  # type: ignore[attr-defined]
             )
-            for scan in BagSequence(street.path, "/velodyne_points")
+            for scan in street
         ]
         return bare_gicp(
             prepared,
@@ -133,7 +135,8 @@ def adaptive_replay(study: Study, model: ErrorModel) -> None:
 def main(folder: Path) -> None:
     """Measure everything."""
     cores.pin(0)
-    points = next(iter(BagSequence(folder / "hilti_2022_scan.bag"))).points
+    bag = str(folder / "hilti_2022_scan.bag")
+    points = next(iter(open_sequence(SequenceConfig(bag=bag)))).points
     rng = np.random.default_rng(0)
     more = points[: 100_000 - len(points)]
     noise = rng.normal(0.0, 0.02, more.shape).astype(np.float32)
@@ -147,7 +150,9 @@ def main(folder: Path) -> None:
     print(f"RTE of {len(T_ref)} poses over 100 m: {1e3 * np.median(times):.2f} ms")
     with tempfile.TemporaryDirectory() as runs:
         config = Path(__file__).parent.parent / "configs/hall.yaml"
-        study = load_study(config, ["offline.trials=32", "offline.workers=1"], Path(runs) / "hall")
+        study = load_study(
+            config, [*UNCACHED, "offline.trials=32", "offline.workers=1"], Path(runs) / "hall"
+        )
         trial(study)
         adaptive_replay(study, train(study).model)
 

@@ -2,13 +2,15 @@
 
 import logging
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adaptune import __version__
+from adaptune import __version__, report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
+from adaptune.files import write_text
 from adaptune.model import ErrorModel
 from adaptune.model.base import mean_errors
 from adaptune.space import ParameterSet
@@ -47,7 +49,8 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
     Parameters
     ----------
     study
-        The study; its folder holds the archive and receives ``model.npz``.
+        The study; its folder holds the archive and receives the error model (``model.npz``), the
+        fixed set (``fixed.yaml``) and a table of all trials (``trials.csv``, ``trials.json``).
     progress
         Told about every finished trial.
 
@@ -69,7 +72,19 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
         name: mean_errors(model.errors[model.sequence == s], np.zeros((model.sequence == s).sum()))
         for s, name in enumerate(model.sequences)
     }
+    write_text(study.folder / "fixed.yaml", yaml.dump(model.sets[model.fixed]))
+    report.write_rows(study.folder, "trials", _rows(model, means))
     return Training(model, {name: m.tolist() for name, m in means.items()}, whole)
+
+
+def _rows(model: ErrorModel, means: dict[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
+    """A row for every trial: its number, its parameters, and its mean errors in percent."""
+    all_means = np.mean(list(means.values()), axis=0)
+    return [
+        {"trial": n, **parameters, "mean": float(all_means[n])}
+        | {name: float(of_sequence[n]) for name, of_sequence in means.items()}
+        for n, parameters in enumerate(model.sets)
+    ]
 
 
 def _run_batches(

@@ -137,11 +137,13 @@ class _Run:
         self.T_odom_sensor[i] = T
 
     def _lost(self, i: int, T_odom_sensor: Poses) -> bool:
-        T_previous_current = invert(self.T_odom_sensor[i - 1]) @ T_odom_sensor
-        departure = T_previous_current[:3, 3] - self._T_ref_steps[i - 1, :3, 3]
-        if np.isnan(departure).any():
-            # Without a reference nothing can be said, unless the odometry itself talks nonsense.
+        T_ref_step = self._T_ref_steps[i - 1]
+        if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
             return False
+        if not np.isfinite(T_odom_sensor).all():
+            return True
+        T_previous_current = invert(self.T_odom_sensor[i - 1]) @ T_odom_sensor
+        departure = T_previous_current[:3, 3] - T_ref_step[:3, 3]
         return bool(np.linalg.norm(departure) > self._bounds[i - 1])
 
 

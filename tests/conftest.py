@@ -1,6 +1,7 @@
 """What tests need that is not in the repository, and what many of them share."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import drives
@@ -29,6 +30,14 @@ def lacking(name: str, reason: str) -> None:
     if name in os.environ.get("ADAPTUNE_REQUIRE", "").split(","):
         pytest.fail(f"ADAPTUNE_REQUIRE names {name}, but {reason}")
     pytest.skip(reason)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Decoded scans go to a folder of the tests', and not to the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ADAPTUNE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

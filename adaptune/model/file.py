@@ -27,6 +27,8 @@ _DAMAGE = (
     KeyError,
     TypeError,
     EOFError,
+    AttributeError,
+    RuntimeError,
     SpaceError,
     zipfile.BadZipFile,
     zlib.error,
@@ -103,9 +105,10 @@ class ErrorModel:
             "provenance": self.provenance,
             "sets": self.sets,
         }
-        with replacing(path) as beside:
+        # numpy adds a suffix to a name, but not to an open file.
+        with replacing(path) as beside, beside.open("wb") as file:
             np.savez_compressed(
-                beside,
+                file,
                 header=np.frombuffer(json.dumps(header).encode(), np.uint8),
                 # Counts of cells are small whole numbers.
                 histograms=self.histograms.astype(np.uint16),

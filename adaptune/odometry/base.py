@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.sequence import Scan
-from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.space import ParameterSet, ParameterSpace, nearest
 
 
 class OdometryError(AdaptuneError):
@@ -60,6 +60,11 @@ class Odometry(ABC):
         outside the range in `space` are the caller's to judge.
     settings
         An instance of `settings_type`.
+
+    Raises
+    ------
+    OdometryError
+        If there is no such parameter.
     """
 
     space: ClassVar[ParameterSpace]
@@ -70,7 +75,7 @@ class Odometry(ABC):
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
     ):
         self.settings: Any = self.settings_type() if settings is None else settings
-        self.parameters = self.space.baseline | (parameters or {})
+        self.parameters = self.space.baseline | self._known(parameters or {})
 
     @abstractmethod
     def prepare(self, scan: Scan) -> Any:
@@ -107,11 +112,20 @@ class Odometry(ABC):
         Raises
         ------
         OdometryError
-            If the odometry is not `live`.
+            If the odometry is not `live`, or has no such parameter.
         """
         if not self.live:
             raise OdometryError(f"{type(self).__name__} cannot change its parameters between scans")
-        self.parameters |= parameters
+        self.parameters |= self._known(parameters)
+
+    def _known(self, parameters: ParameterSet) -> ParameterSet:
+        for name in parameters:
+            if name not in self.space.names:
+                raise OdometryError(
+                    f"{type(self).__name__} has no parameter {name!r}: "
+                    f"{nearest(name, self.space.names)}"
+                )
+        return parameters
 
 
 def prepared_bytes(prepared: Any) -> int:

@@ -51,10 +51,11 @@ class KeyframeGicp(KeyframeOdometry):
 
     def prepare(self, scan: Scan) -> Prepared:
         """See `Odometry.prepare`."""
+        points = crop(scan, self.settings.min_range)
+        if len(points) < MIN_POINTS:
+            return Prepared(small_gicp.PointCloud(points), None)
         cloud, tree = small_gicp.preprocess_points(
-            crop(scan, self.settings.min_range),
-            downsampling_resolution=self.settings.downsampling,
-            num_threads=1,
+            points, downsampling_resolution=self.settings.downsampling, num_threads=1
         )
         return Prepared(cloud, tree)
 

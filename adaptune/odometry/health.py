@@ -38,7 +38,8 @@ class HealthCheck(BaseModel):
         elapsed
             Seconds since `last_velocity`.
         """
-        if np.linalg.norm(velocity) > self.max_speed:
+        speed = np.linalg.norm(velocity)
+        if not np.isfinite(speed) or speed > self.max_speed:
             return False
         if last_velocity is None:
             return True

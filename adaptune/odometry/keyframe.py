@@ -37,21 +37,22 @@ class KeyframeOdometry(Odometry):
     def register(self, prepared: Any) -> Registration:
         """See `Odometry.register`."""
         T_keyframe_guess = self._T_keyframe_sensor @ self._T_previous_current
-        T_keyframe_sensor, ok = T_keyframe_guess, False
-        if self.usable(prepared):
-            if not self.usable(self._keyframe):
-                # Nothing can be matched to a poor keyframe: take the first good scan instead.
-                self.start(
-                    prepared, self._T_odom_keyframe @ T_keyframe_guess, self._T_previous_current
-                )
-                return Registration(self._T_odom_keyframe)
-            alignment = self.align(self._keyframe, prepared, T_keyframe_guess)
-            if alignment.ok and np.isfinite(alignment.T_target_source).all():
-                T_keyframe_sensor, ok = rectify(alignment.T_target_source), True
-                self._T_previous_current = invert(self._T_keyframe_sensor) @ T_keyframe_sensor
+        if not self.usable(prepared):
+            self._T_keyframe_sensor = T_keyframe_guess
+            return Registration(self._T_odom_keyframe @ T_keyframe_guess, registered=False)
+        T_target_source, ok = T_keyframe_guess, False
+        if self.usable(self._keyframe):
+            T_target_source, ok = self.align(self._keyframe, prepared, T_keyframe_guess)
+        if ok and np.isfinite(T_target_source).all():
+            T_keyframe_sensor = rectify(T_target_source)
+            self._T_previous_current = invert(self._T_keyframe_sensor) @ T_keyframe_sensor
+        else:
+            T_keyframe_sensor, ok = T_keyframe_guess, False
         self._T_keyframe_sensor = T_keyframe_sensor
         T_odom_sensor = self._T_odom_keyframe @ T_keyframe_sensor
-        if ok and np.linalg.norm(T_keyframe_sensor[:3, 3]) >= self.parameters["keyframe_interval"]:
+        # What cannot be matched to the keyframe now will not be later, from further away.
+        interval = self.parameters["keyframe_interval"]
+        if not ok or np.linalg.norm(T_keyframe_sensor[:3, 3]) >= interval:
             self.start(prepared, T_odom_sensor, self._T_previous_current)
         return Registration(T_odom_sensor, ok)
 

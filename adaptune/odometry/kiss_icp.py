@@ -1,10 +1,12 @@
 """KISS-ICP, through its Python class."""
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
+from numpy.typing import NDArray
 from pydantic import Field
 
 from adaptune.geometry import Poses
@@ -21,6 +23,20 @@ class Settings(BaseSettings):
     min_range: float = Field(1.0, ge=0)
     max_range: float = Field(100.0, gt=0)
     deskew: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Points, their times as shares of the turn, and whether enough are in range."""
+
+    points: NDArray[np.float64]
+    times: NDArray[np.float64]
+    usable: bool
+
+    @property
+    def nbytes(self) -> int:
+        """What the arrays hold."""
+        return self.points.nbytes + self.times.nbytes
 
 
 class Kiss(Odometry):
@@ -55,16 +71,19 @@ class Kiss(Odometry):
         config.adaptive_threshold.min_motion_th = self.parameters["min_motion_th"]
         return config
 
-    def prepare(self, scan: Scan) -> tuple[Any, Any]:
+    def prepare(self, scan: Scan) -> Prepared:
         """See `Odometry.prepare`."""
         points = scan.points.astype(np.float64)
+        squared = np.einsum("ij,ij->i", points, points)
+        near, far = self.settings.min_range, self.settings.max_range
+        n_in_range = np.count_nonzero((squared > near**2) & (squared < far**2))
         times = np.empty(0)
         if scan.times is not None and len(scan.times):
             # KISS-ICP wants the share of the turn.
             first, last = float(scan.times.min()), float(scan.times.max())
             if last > first:
                 times = (scan.times.astype(np.float64) - first) / (last - first)
-        return points, times
+        return Prepared(points, times, bool(n_in_range >= MIN_POINTS))
 
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
@@ -78,10 +97,9 @@ class Kiss(Odometry):
 
     def register(self, prepared: Any) -> Registration:
         """See `Odometry.register`."""
-        points, times = prepared
         kiss = self._kiss
-        if len(points) < MIN_POINTS:
+        if not prepared.usable:
             kiss.last_pose = kiss.last_pose @ kiss.last_delta
             return Registration(kiss.last_pose, registered=False)
-        kiss.register_frame(points, times)
+        kiss.register_frame(prepared.points, prepared.times)
         return Registration(kiss.last_pose)

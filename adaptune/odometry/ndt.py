@@ -73,4 +73,4 @@ class KeyframeNdt(KeyframeOdometry):
         except RuntimeError:
             # No cell of the target holds enough points.
             return Alignment(T_target_guess, ok=False)
-        return Alignment(result.transformation, len(result.correspondence_set) > 0)
+        return Alignment(result.transformation, len(result.correspondence_set) >= MIN_POINTS)

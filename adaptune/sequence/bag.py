@@ -1,197 +1,403 @@
-"""Sequences in ROS 1 and ROS 2 bags."""
+"""Recordings in ROS 1 and ROS 2 bags."""
 
-import logging
-from collections.abc import Iterable, Iterator
+import struct
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune import geometry
-from adaptune.errors import AdaptuneError
-from adaptune.sequence import pointcloud2
+from adaptune.sequence import livox, pointcloud2
+from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloudError, stamp_ns
 from adaptune.sequence.scan import Scan
+from adaptune.sequence.sequence import Frame, Repairs, SequenceError
+from adaptune.sequence.timing import AUTO, Timing
 from adaptune.space import nearest
-from adaptune.trajectory import Trajectory, read_tum
+from adaptune.trajectory import Trajectory
 
-POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
-_REFERENCE_POSES = {
-    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
-    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
+POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *livox.TYPES)
+IMU_TYPES = ("sensor_msgs/msg/Imu",)
+
+_Pose = tuple[int, str, Any, Any]
+"""Stamp, frame, translation, quaternion."""
+
+
+def _header_pose(message: Any, pose: Any) -> list[_Pose]:
+    return [(stamp_ns(message.header), message.header.frame_id, pose.position, pose.orientation)]
+
+
+def _transforms(transforms: Iterable[Any]) -> list[_Pose]:
+    return [
+        (stamp_ns(t.header), t.child_frame_id, t.transform.translation, t.transform.rotation)
+        for t in transforms
+    ]
+
+
+POSES: dict[str, Callable[[Any], list[_Pose]]] = {
+    "geometry_msgs/msg/PoseStamped": lambda m: _header_pose(m, m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _header_pose(m, m.pose.pose),
+    "nav_msgs/msg/Odometry": lambda m: _header_pose(m, m.pose.pose),
+    "nav_msgs/msg/Path": lambda m: [pose for p in m.poses for pose in _header_pose(p, p.pose)],
+    "geometry_msgs/msg/TransformStamped": lambda m: _transforms([m]),
+    "tf2_msgs/msg/TFMessage": lambda m: _transforms(m.transforms),
+    "tf/msg/tfMessage": lambda m: _transforms(m.transforms),
 }
-
-_log = logging.getLogger(__name__)
-
-
-class SequenceError(AdaptuneError):
-    """A recording that cannot be read as asked."""
+"""Poses in a message, by its type."""
+# Each repeats all of the one before.
+_PATH = "nav_msgs/msg/Path"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
-class BagSequence:
-    """Scans and reference trajectory of a bag.
-
-    Parameters
-    ----------
-    path
-        A ROS 1 ``.bag`` or a ROS 2 bag's folder.
-    points
-        Topic of the point clouds; may be left out where the bag has only one.
-    reference
-        Topic with the sensor's reference poses, or the path of a TUM file; may be left out.
-    start, stop
-        Seconds since the first scan: scans in [start, stop) belong to the sequence.
+def bag_paths(given: Sequence[str]) -> list[Path]:
+    """What to open for the paths, folders and patterns that a user gives.
 
     Raises
     ------
     SequenceError
-        If the bag cannot be opened or has no such topic.
+        Naming what is not there or holds no bag.
     """
+    paths: list[Path] = []
+    for text in given:
+        path = Path(text)
+        if path.is_dir():
+            paths += _in_folder(path)
+        elif path.exists():
+            if path.suffix not in (".bag", ".mcap", ".db3"):
+                raise SequenceError(
+                    f"{path}: not a bag; there are .bag, .mcap and .db3 files and ROS 2 folders"
+                )
+            paths.append(path)
+        elif found := sorted(path.parent.glob(path.name)):
+            paths += bag_paths([str(match) for match in found])
+        else:
+            raise SequenceError(f"{path}: there is no such bag")
+    if len({path.suffix == ".bag" for path in paths}) > 1:
+        raise SequenceError(f"{paths[0]} and {paths[-1]} are of ROS 1 and ROS 2: they do not mix")
+    return paths
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    if (folder / "metadata.yaml").exists():
+        return [folder]
+    # A recorder that was killed leaves its files without the metadata.
+    for suffix in (".mcap", ".db3", ".bag"):
+        if found := sorted(folder.glob(f"*{suffix}")):
+            return found
+    raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
+
+
+@cache
+def _typestore() -> Any:
+    """What messages of ROS 2 bags are when the bags themselves do not tell."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types: Any = {}
+    for name, text in livox.DEFINITIONS.items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+class BagSource:
+    """Scans, IMU and poses of one or more bags that follow each other.
+
+    Parameters
+    ----------
+    paths
+        ROS 1 ``.bag`` files, or ROS 2 folders and files, as `bag_paths` gives them.
+    points
+        Topic of the point clouds; may be left out where there is only one.
+    timing
+        What the stamps mean.
+    about
+        What `about` told when they were opened before; the bags are then not opened now.
+
+    Raises
+    ------
+    SequenceError
+        If a bag cannot be opened or has no such topic.
+    """
+
+    random_access: ClassVar[bool] = False
 
     def __init__(
         self,
-        path: Path,
+        paths: Sequence[Path],
         points: str | None = None,
-        reference: str | Path | None = None,
-        start: float = 0.0,
-        stop: float | None = None,
+        timing: Timing = AUTO,
+        about: dict[str, Any] | None = None,
     ):
-        self.path = path
-        self.start, self.stop = start, stop
-        with self._open() as reader:
-            self.points = self._topic(reader, points, [POINTS_TYPE], "point clouds")
+        self.paths, self.timing = tuple(paths), timing
+        if about is not None:
+            self.topics: dict[str, str] = dict(about["topics"])
+            self.points: str = about["points"]
+            self.n_messages: int = about["n_messages"]
+            self._duration: int = about["duration"]
+            return
+        with self.open() as reader:
+            self.topics = {c.topic: c.msgtype for c in reader.connections}
+            self.points = self.topic(points, POINTS_TYPES, "point clouds")
             self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
-            if isinstance(reference, str):
-                reference = self._topic(reader, reference, _REFERENCE_POSES, "poses")
-        self.reference_source = reference
+            self._duration = max(reader.end_time - reader.start_time, 0)
 
-    def __iter__(self) -> Iterator[Scan]:
-        """Read the scans in order of their recording.
+    def about(self) -> dict[str, Any]:
+        """What opening the bags has told, as plain data."""
+        return {
+            "name": self.name,
+            "topics": self.topics,
+            "points": self.points,
+            "n_messages": self.n_messages,
+            "duration": self._duration,
+        }
 
-        A scan whose stamp does not come after the one before it is left out, with a warning.
+    @property
+    def name(self) -> str:
+        """The bag's file; the first one's, and how many more there are."""
+        more = f" (and {len(self.paths) - 1} more)" if len(self.paths) > 1 else ""
+        return f"{self.paths[0]}{more}"
 
-        Raises
-        ------
-        SequenceError
-            Naming the message that cannot be decoded.
-        """
-        first = last = None
-        dropped = 0
-        for number, message in enumerate(self._messages(self.points), start=1):
-            stamp = stamp_ns(message.header)
-            first = stamp if first is None else first
-            seconds = (stamp - first) * 1e-9
-            if seconds < self.start or (self.stop is not None and seconds >= self.stop):
-                continue
-            if last is not None and stamp <= last:
-                dropped += 1
-                continue
-            last = stamp
-            try:
-                yield pointcloud2.decode(message)
-            except PointCloudError as error:
-                raise SequenceError(
-                    f"{self.path}: message {number} on {self.points}: {error}"
-                ) from error
-        if last is None:
-            raise SequenceError(
-                f"{self.path}: no scan on {self.points} between start = {self.start:g} s and "
-                f"stop = {'the end' if self.stop is None else f'{self.stop:g} s'}"
-            )
-        if dropped:
-            _log.warning("%s: left out %d scans that go back in time", self.path, dropped)
-
-    def reference(self) -> Trajectory | None:
-        """Reference poses of the sensor, if the sequence has any.
-
-        Of poses with the same stamp the first one counts.
+    def frames(self) -> Iterator[Frame]:
+        """All scans in the order of their recording.
 
         Raises
         ------
         SequenceError
-            If the topic holds no pose, or poses that are not finite.
-        TrajectoryError
-            If the file cannot be read.
+            If the bags cannot be read on.
         """
-        if self.reference_source is None:
+        number = 0
+        with self.open() as reader:
+            decode = self._decoder(reader)
+            for _, recorded, data in self.read(reader, self.points):
+                number += 1
+                stamp = header_stamp(data, reader.is2)
+                if stamp is None:
+                    raise SequenceError(
+                        f"{self.name}: message {number} on {self.points} is cut short"
+                    )
+                yield Frame(stamp, recorded, partial(self._load, decode, data, number))
+
+    def span(self) -> tuple[int, int] | None:
+        """First stamp, and the last one if the recorder's clock went as the sensor's."""
+        first = next(self.frames(), None)
+        return None if first is None else (first.stamp, first.stamp + self._duration)
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
+
+        Poses that are not finite or whose quaternion has no length are left out and counted.
+
+        Raises
+        ------
+        SequenceError
+            If the topic is not there, or holds no usable pose.
+        """
+        if name is None:
             return None
-        if isinstance(self.reference_source, Path):
-            return read_tum(self.reference_source)
-        stamps, values = [], []
-        for message in self._messages(self.reference_source):
-            pose = _REFERENCE_POSES[message.__msgtype__](message)
-            p, q = pose.position, pose.orientation
-            stamps.append(stamp_ns(message.header))
-            values.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-        if not stamps:
-            raise SequenceError(f"{self.path}: no pose on {self.reference_source}")
-        unique, index = np.unique(np.array(stamps, np.int64), return_index=True)
-        poses = np.array(values)[index]
-        norms = np.linalg.norm(poses[:, 3:], axis=1)
-        if not np.isfinite(poses).all() or np.any(norms < 0.1):
+        name = self.topic(name, POSES, "poses")
+        messages = self.messages(name, last=self.topics[name] == _PATH)
+        found = [pose for message in messages for pose in POSES[message.__msgtype__](message)]
+        if self.topics[name] in _TRANSFORMS:
+            found = self._of_frame(name, found, child_frame)
+        if not found:
+            raise SequenceError(f"{self.name}: no pose on {name}")
+        stamps = np.array([stamp for stamp, *_ in found], np.int64)
+        values = np.array([(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for _, _, p, q in found])
+        with np.errstate(invalid="ignore", over="ignore"):
+            norms = np.linalg.norm(values[:, 3:], axis=1)
+        usable = np.isfinite(values).all(axis=1) & np.isfinite(norms) & (norms > 0.1)
+        if not usable.any():
             raise SequenceError(
-                f"{self.path}: a pose on {self.reference_source} is not finite or has no rotation"
+                f"{self.name}: every pose on {name} is not finite or has no rotation"
             )
+        repairs = Repairs()
+        for _ in range(int(np.count_nonzero(~usable))):
+            repairs.add(f"poses on {name} that are not finite or have no rotation")
+        repairs.report(self.name)
+        unique, index = np.unique(stamps[usable], return_index=True)
+        poses = values[usable][index]
         return Trajectory(unique, geometry.from_quaternions(poses[:, :3], poses[:, 3:]))
 
+    def imu(self, name: str | None) -> Imu | None:
+        """Measurements on a topic, as they were recorded.
+
+        Raises
+        ------
+        SequenceError
+            If the topic is not there, or its measurements are not finite.
+        """
+        name = self.topic(name, IMU_TYPES, "an IMU's measurements")
+        stamps, values = [], []
+        for message in self.messages(name):
+            w, a = message.angular_velocity, message.linear_acceleration
+            stamps.append(stamp_ns(message.header))
+            values.append((w.x, w.y, w.z, a.x, a.y, a.z))
+        if not stamps:
+            raise SequenceError(f"{self.name}: no measurement on {name}")
+        unique, index = np.unique(np.array(stamps, np.int64), return_index=True)
+        measured = np.array(values)[index]
+        if not np.isfinite(measured).all():
+            raise SequenceError(f"{self.name}: a measurement on {name} is not finite")
+        return Imu(unique, measured[:, :3], measured[:, 3:])
+
+    def topic(self, name: str | None, types: Iterable[str], what: str) -> str:
+        """The topic of this name, or the only one of these types.
+
+        Raises
+        ------
+        SequenceError
+            Naming what there is.
+        """
+        types = tuple(types)
+        fitting = sorted(t for t, kind in self.topics.items() if kind in types)
+        if name is None:
+            if len(fitting) != 1:
+                raise SequenceError(
+                    f"{self.name}: {len(fitting)} topics with {what}"
+                    + (f", name one of them: {', '.join(fitting)}" if fitting else self._list())
+                )
+            return fitting[0]
+        if name in fitting:
+            return name
+        if name in self.topics:
+            raise SequenceError(f"{self.name}: {name} is {self.topics[name]}, not {what}")
+        raise SequenceError(
+            f"{self.name}: no topic {name}; {nearest(name, self.topics)}{self._list()}"
+        )
+
+    def check(self, reference: str | None, imu: str | None) -> None:
+        """Make sure that the named topics are there.
+
+        Raises
+        ------
+        SequenceError
+            Naming what there is.
+        """
+        if reference is not None:
+            self.topic(reference, POSES, "poses")
+        if imu is not None:
+            self.topic(imu, IMU_TYPES, "an IMU's measurements")
+
+    def _list(self) -> str:
+        topics = sorted(f"{topic} ({kind})" for topic, kind in self.topics.items())
+        return f"; it holds {', '.join(topics) or 'nothing'}"
+
+    def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
+        """Deserialised messages of a topic, or its last one only.
+
+        Raises
+        ------
+        SequenceError
+            Naming the message that cannot be read.
+        """
+        with self.open() as reader:
+            messages: Iterable[Any] = enumerate(self.read(reader, topic), start=1)
+            if last:
+                messages = deque(messages, maxlen=1)
+            for number, (connection, _, data) in messages:
+                try:
+                    yield reader.deserialize(data, connection.msgtype)
+                except Exception as error:
+                    raise SequenceError(
+                        f"{self.name}: message {number} on {topic} is damaged ({error})"
+                    ) from error
+
     @contextmanager
-    def _open(self) -> Iterator[AnyReader]:
+    def open(self) -> Iterator[AnyReader]:
+        """Open the bags for reading.
+
+        Raises
+        ------
+        SequenceError
+            If they cannot be opened.
+        """
         try:
-            reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader = AnyReader(self.paths, default_typestore=_typestore())
             reader.open()
-        except FileNotFoundError as error:
-            raise SequenceError(f"{self.path}: there is no such bag") from error
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
             raise SequenceError(
-                f"{self.path}: cannot be opened as a bag ({error}); if the recording was cut "
-                f"short, repair it first (`rosbag reindex` or `ros2 bag reindex`)"
+                f"{self.name}: cannot be opened as a bag ({_say(error)}); if the recording was cut "
+                f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
             ) from error
         try:
             yield reader
         finally:
             reader.close()
 
-    def _messages(self, topic: str) -> Iterator[Any]:
-        with self._open() as reader:
-            connections = [c for c in reader.connections if c.topic == topic]
-            messages = reader.messages(connections)
-            while True:
-                try:
-                    connection, _, data = next(messages)
-                    message = reader.deserialize(data, connection.msgtype)
-                except StopIteration:
-                    return
-                except Exception as error:
-                    raise SequenceError(
-                        f"{self.path}: cannot read on ({type(error).__name__}: {error}); the "
-                        f"bag is damaged"
-                    ) from error
-                yield message
+    def read(
+        self, reader: AnyReader, topic: str | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Serialised messages of a topic, or of all topics.
 
-    def _topic(self, reader: AnyReader, name: str | None, types: Iterable[str], what: str) -> str:
-        fitting = sorted({c.topic for c in reader.connections if c.msgtype in types})
-        if name is None:
-            if len(fitting) != 1:
+        Raises
+        ------
+        SequenceError
+            If the bags cannot be read on.
+        """
+        messages = reader.messages([c for c in reader.connections if topic in (None, c.topic)])
+        while True:
+            try:
+                message = next(messages)
+            except StopIteration:
+                return
+            except Exception as error:
                 raise SequenceError(
-                    f"{self.path}: {len(fitting)} topics with {what}, name the one to use: "
-                    f"{', '.join(fitting) or _list(reader.connections)}"
-                )
-            return fitting[0]
-        if name in fitting:
-            return name
-        present = {c.topic: c.msgtype for c in reader.connections}
-        if name in present:
-            raise SequenceError(f"{self.path}: {name} is {present[name]}, not {what}")
-        raise SequenceError(
-            f"{self.path}: no topic {name}; {nearest(name, present)} "
-            f"The bag holds {_list(reader.connections)}"
+                    f"{self.name}: cannot read on ({_say(error)}); the bag is damaged, `stop` "
+                    f"before the damage or repair it"
+                ) from error
+            yield message
+
+    def _decoder(self, reader: AnyReader) -> Callable[[bytes], Scan]:
+        kind, types = self.topics[self.points], reader.typestore
+        if kind not in livox.TYPES:
+            # Scans are decoded after the reader has moved on, even after it was closed.
+            read = types.deserialize_cdr if reader.is2 else types.deserialize_ros1
+            return lambda data: pointcloud2.decode(read(data, kind), self.timing)
+        definitions = types.fielddefs
+        fields = tuple(definitions[kind][1])
+        point = tuple(definitions[kind.replace("CustomMsg", "CustomPoint")][1])
+        return partial(
+            livox.decode, message=fields, point=point, cdr=reader.is2, timing=self.timing
         )
 
+    def _load(self, decode: Callable[[bytes], Scan], data: bytes, number: int) -> Scan:
+        try:
+            return decode(data)
+        except Exception as error:
+            told = str(error) if isinstance(error, PointCloudError) else f"damaged ({_say(error)})"
+            raise SequenceError(
+                f"{self.name}: message {number} on {self.points}: {told}"
+            ) from error
 
-def _list(connections: list[Connection]) -> str:
-    return ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in connections})) or "nothing"
+    def _of_frame(self, topic: str, found: list[_Pose], frame: str | None) -> list[_Pose]:
+        frames = sorted({name for _, name, *_ in found})
+        if frame is None and len(frames) > 1:
+            raise SequenceError(
+                f"{self.name}: {topic} has the transforms of several frames, name one of them as "
+                f"`child_frame`: {', '.join(frames)}"
+            )
+        if frame is not None and frame not in frames:
+            raise SequenceError(f"{self.name}: {topic}: no frame {frame}; {nearest(frame, frames)}")
+        return [pose for pose in found if frame in (None, pose[1])]
+
+
+def header_stamp(data: bytes | memoryview, cdr: bool) -> int | None:
+    """Stamp of a serialised message that begins with a header; none if it is too short."""
+    if len(data) < 12:
+        return None
+    # Before the stamp come the encapsulation in ROS 2, and the sequence number in ROS 1.
+    little = not cdr or data[1] == 1
+    seconds, nanoseconds = struct.unpack_from("<II" if little else ">II", data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _say(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text[:200] or type(error).__name__

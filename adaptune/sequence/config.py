@@ -2,9 +2,12 @@
 
 import os
 import re
+from collections.abc import Callable
+from functools import cache as once
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -13,10 +16,30 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
+from scipy.spatial.transform import Rotation
 
-from adaptune.sequence.bag import BagSequence, SequenceError
+from adaptune import geometry
+from adaptune.geometry import Poses
+from adaptune.sequence import cache, views
+from adaptune.sequence.bag import BagSource, bag_paths
+from adaptune.sequence.folder import kitti, scan_folder
+from adaptune.sequence.motion import compensate_rotation
+from adaptune.sequence.scan import Scan
+from adaptune.sequence.sequence import (
+    ImuSettings,
+    RecordedSequence,
+    ReferenceSettings,
+    Section,
+    Sequence,
+    SequenceError,
+    Source,
+)
+from adaptune.sequence.timing import Timing, Unit
 
-_REFERENCE_FILES = (".tum", ".txt")
+_REFERENCE_FILES = (".tum", ".txt", ".csv")
+_SOURCES = ("bag", "kitti", "folder", "evalio")
+# Livox IMUs measure acceleration in multiples of this.
+_STANDARD_GRAVITY = 9.80665
 
 
 def resolve(path: str, info: ValidationInfo) -> str:
@@ -37,26 +60,51 @@ def _resolve_file(reference: str, info: ValidationInfo) -> str:
     return resolve(reference, info) if reference.endswith(_REFERENCE_FILES) else reference
 
 
-class SequenceConfig(BaseModel):
-    """A recording and what of it to use.
+_Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
-    Attributes
-    ----------
-    bag : str
-        Path of the bag.
-    points : str, optional
-        Topic of the point clouds.
-    reference : str, optional
-        Topic of the reference poses, or a TUM file (``.tum``, ``.txt``).
-    start, stop : float
-        Seconds since the first scan.
+
+def _check_transform(given: Any) -> Any:
+    to_pose(given)
+    return given
+
+
+def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
+    """Pose of shape (4, 4) from ``x y z qx qy qz qw``, or from the rows of a matrix.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
     """
+    values = np.array(given, np.float64) if len({np.size(row) for row in given}) == 1 else None
+    if values is not None and values.shape == (7,):
+        if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
+            raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
+        pose: Poses = geometry.from_quaternions(values[None, :3], values[None, 3:])[0]
+        return pose
+    if values is None or values.shape not in ((4, 4), (3, 4)):
+        raise ValueError("give x y z qx qy qz qw, or the four rows of a 4x4 matrix")
+    R = values[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise ValueError("its first three columns and rows are not a rotation")
+    T = np.eye(4)
+    # Written with a few digits, it is a rotation only nearly.
+    T[:3, :3] = Rotation.from_matrix(R).as_matrix()
+    T[:3, 3] = values[:3, 3]
+    return T
 
+
+Transform = Annotated[_Numbers | tuple[_Numbers, ...], AfterValidator(_check_transform)]
+"""A pose as seven numbers, or as the rows of a matrix."""
+
+
+class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    bag: Annotated[str, AfterValidator(resolve)]
-    points: str | None = None
-    reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
+
+class _Part(_Section):
+    """Seconds since the first scan."""
+
     start: float = Field(0.0, ge=0)
     stop: float | None = Field(None, gt=0)
 
@@ -67,8 +115,183 @@ class SequenceConfig(BaseModel):
         return self
 
 
-def open_sequence(config: SequenceConfig) -> BagSequence:
-    """Open what a study describes.
+class DropConfig(_Part):
+    """Which share of the scans from `start` to `stop` is lost."""
+
+    share: float = Field(gt=0, lt=1)
+    seed: int = Field(0, ge=0)
+
+
+class SpeedConfig(_Part):
+    """How many times faster the scans from `start` to `stop` arrive."""
+
+    factor: float = Field(gt=0, allow_inf_nan=False)
+
+
+class NoiseConfig(_Section):
+    """Metres by which points are moved along their rays."""
+
+    sigma: float = Field(gt=0, allow_inf_nan=False)
+    seed: int = Field(0, ge=0)
+
+
+class ViewConfig(_Section):
+    """One view, by its name; views apply in the order of the list.
+
+    Attributes
+    ----------
+    cut : list of (start, stop)
+        Only these parts, in seconds since the first scan.
+    drop : DropConfig
+    speed : SpeedConfig
+    reverse : true
+    rings : int
+        Every how many rings one is kept.
+    noise : NoiseConfig
+    transform : Transform
+        Pose of the LiDAR in the frame from which to see it.
+    """
+
+    cut: tuple[tuple[float, float], ...] | None = Field(None, min_length=1)
+    drop: DropConfig | None = None
+    speed: SpeedConfig | None = None
+    reverse: Literal[True] | None = None
+    rings: int | None = Field(None, ge=2)
+    noise: NoiseConfig | None = None
+    transform: Transform | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self._given()) != 1:
+            raise ValueError(
+                f"each view is an entry of its own, `- name: ...` with one of "
+                f"{', '.join(type(self).model_fields)}"
+            )
+        if self.cut and (bad := [part for part in self.cut if not 0 <= part[0] < part[1]]):
+            raise ValueError(f"a part goes from a start to a later stop, not {list(bad[0])}")
+        return self
+
+    def of(self, sequence: views.Reversible) -> views.Reversible:
+        """The sequence as this view shows it."""
+        (name,) = self._given()
+        return _VIEWS[name](sequence, getattr(self, name))
+
+    def _given(self) -> list[str]:
+        return [name for name in type(self).model_fields if getattr(self, name) is not None]
+
+
+_VIEWS: dict[str, Callable[[views.Reversible, Any], views.Reversible]] = {
+    "cut": views.cut,
+    "drop": lambda of, v: views.drop(of, v.share, (v.start, v.stop), v.seed),
+    "speed": lambda of, v: views.speed(of, v.factor, (v.start, v.stop)),
+    "reverse": lambda of, _: views.Reversed(of),
+    "rings": views.thin_rings,
+    "noise": lambda of, v: views.add_noise(of, v.sigma, v.seed),
+    "transform": lambda of, v: views.transform(of, to_pose(v)),
+}
+
+
+class ImuConfig(_Section):
+    """An IMU.
+
+    Attributes
+    ----------
+    topic : str, optional
+        May be left out where there is only one.
+    extrinsic : Transform, optional
+        Its pose in the LiDAR's frame.
+    unit : {"m/s2", "g"}
+        Of its accelerometer.
+    """
+
+    topic: str | None = None
+    extrinsic: Transform | None = None
+    unit: Literal["m/s2", "g"] = "m/s2"
+
+
+class SequenceConfig(_Part):
+    """A recording and what of it to use.
+
+    Attributes
+    ----------
+    bag : str or list of str, optional
+        Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
+    kitti : str, optional
+        In place of `bag`, the folder of a KITTI odometry sequence, or of a drive of KITTI raw or
+        KITTI-360.
+    folder : str, optional
+        In place of `bag`, a folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
+    evalio : str, optional
+        In place of `bag`, the name of one of evalio's sequences, as ``newer_college_2020/short``.
+    points : str, optional
+        Topic of the point clouds.
+    stamp : {"auto", "start", "end"}
+        What of a scan its stamp marks.
+    time_unit : {"s", "ms", "us", "ns"}, optional
+        Unit of the points' times.
+    period : float
+        Seconds a scan takes, where neither points nor files tell.
+    start, stop : float
+        Seconds since the first scan.
+    stride : int
+        Every how many scans to use.
+    reference : str, optional
+        Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
+    child_frame : str, optional
+        Where `reference` is a topic of transforms, the frame whose poses to take.
+    extrinsic : Transform, optional
+        The LiDAR's pose in the frame that the reference poses are of.
+    clock_offset : float
+        Seconds to add to the reference's stamps.
+    max_gap : float
+        Seconds; nothing is known between reference poses further apart.
+    imu : ImuConfig, optional
+    compensate : {"gyro"}, optional
+        Take the rotation that the IMU measured out of every scan.
+    views : list of ViewConfig
+    cache : bool
+        Whether to keep decoded bags on disk.
+    """
+
+    bag: (
+        Annotated[str, AfterValidator(resolve)]
+        | Annotated[tuple[Annotated[str, AfterValidator(resolve)], ...], Field(min_length=1)]
+        | None
+    ) = None
+    kitti: Annotated[str, AfterValidator(resolve)] | None = None
+    folder: Annotated[str, AfterValidator(resolve)] | None = None
+    evalio: str | None = None
+    points: str | None = None
+    stamp: Literal["auto", "start", "end"] = "auto"
+    time_unit: Unit | None = None
+    period: float = Field(0.1, gt=0, allow_inf_nan=False)
+    stride: int = Field(1, ge=1)
+    reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
+    child_frame: str | None = None
+    extrinsic: Transform | None = None
+    clock_offset: float = Field(0.0, allow_inf_nan=False)
+    max_gap: float = Field(1.0, gt=0, allow_inf_nan=False)
+    imu: ImuConfig | None = None
+    compensate: Literal["gyro"] | None = None
+    views: tuple[ViewConfig, ...] = ()
+    cache: bool = True
+
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
+        given = [name for name in _SOURCES if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"give one of {', '.join(_SOURCES)}, not {' and '.join(given) or 'none'}"
+            )
+        if self.points is not None and given[0] != "bag":
+            raise ValueError(f"`points` names a topic of a bag; {given[0]} has none")
+        if self.compensate and self.imu is None:
+            raise ValueError("`compensate: gyro` needs `imu`")
+        return self
+
+
+def open_sequence(config: SequenceConfig) -> Sequence:
+    """Open what a study describes; scans are not read before they are asked for.
 
     Raises
     ------
@@ -80,4 +303,72 @@ def open_sequence(config: SequenceConfig) -> BagSequence:
         reference = Path(reference)
         if not reference.is_file():
             raise SequenceError(f"{reference}: there is no such file")
-    return BagSequence(Path(config.bag), config.points, reference, config.start, config.stop)
+    source, key = _source(config)
+    if isinstance(source, BagSource):
+        topic = reference if isinstance(reference, str) else None
+        source.check(topic, None if config.imu is None else config.imu.topic)
+    recorded = RecordedSequence(
+        source,
+        _section(config),
+        ReferenceSettings(
+            reference,
+            config.child_frame,
+            None if config.extrinsic is None else to_pose(config.extrinsic),
+            config.clock_offset,
+            config.max_gap,
+        ),
+        _imu(config.imu),
+        key,
+    )
+    sequence: views.Reversible = recorded
+    if config.compensate:
+        sequence = _compensated(recorded)
+    for view in config.views:
+        sequence = view.of(sequence)
+    return sequence
+
+
+def _source(config: SequenceConfig) -> tuple[Source, str | None]:
+    """What reads the recording, and under which key its decoded scans are kept."""
+    timing = Timing(config.stamp, config.time_unit, config.period)
+    if config.kitti is not None:
+        return kitti(Path(config.kitti)), None
+    if config.folder is not None:
+        return scan_folder(Path(config.folder), timing), None
+    if config.evalio is not None:
+        from adaptune.sequence.evalio import evalio_source
+
+        return evalio_source(config.evalio), None
+    bags = (config.bag,) if isinstance(config.bag, str) else config.bag or ()
+    paths = bag_paths(bags)
+    if not config.cache or not cache.cap():
+        return BagSource(paths, config.points, timing), None
+    try:
+        key = cache.key(paths, (config.points, timing, _section(config)))
+    except OSError as error:
+        raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
+    entry = cache.find(key)
+    about = None if entry is None else entry.about
+    return BagSource(paths, config.points, timing, about), key
+
+
+def _section(config: SequenceConfig) -> Section:
+    return Section(config.start, config.stop, config.stride)
+
+
+def _imu(config: ImuConfig | None) -> ImuSettings | None:
+    if config is None:
+        return None
+    T = None if config.extrinsic is None else to_pose(config.extrinsic)
+    return ImuSettings(config.topic, T, _STANDARD_GRAVITY if config.unit == "g" else 1.0)
+
+
+def _compensated(sequence: RecordedSequence) -> views.View:
+    """The sequence without the rotation that its gyroscope measured; the IMU is read once."""
+    imu = once(sequence.imu)
+
+    def change(scan: Scan) -> Scan:
+        measured = imu()
+        return scan if measured is None else compensate_rotation(scan, measured)
+
+    return views.View(sequence, change)

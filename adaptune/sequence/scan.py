@@ -1,6 +1,7 @@
 """One turn of a LiDAR."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A point cloud in the sensor's frame.
+    """A point cloud in the sensor's frame; its arrays cannot be written to.
 
     Attributes
     ----------
@@ -18,11 +19,30 @@ class Scan:
         float32 metres, finite. There may be none.
     times : ndarray of shape (n,), optional
         float32 seconds since `stamp` at which each point was measured.
+    rings : ndarray of shape (n,), optional
+        uint16 number of the laser that measured each point.
     """
 
     stamp: int
     points: NDArray[np.float32]
     times: NDArray[np.float32] | None = None
+    rings: NDArray[np.uint16] | None = None
+
+    def __post_init__(self) -> None:
+        # Decoded scans may be shared by all who use them, as those from the cache are.
+        for array in (self.points, self.times, self.rings):
+            if array is not None:
+                array.flags.writeable = False
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def select(self, which: NDArray[Any]) -> "Scan":
+        """The scan with some of its points, by a mask of shape (n,) or indices of shape (m,)."""
+        index = np.flatnonzero(which) if which.dtype == np.bool_ else which
+        return Scan(
+            self.stamp,
+            self.points.take(index, axis=0),
+            None if self.times is None else self.times.take(index),
+            None if self.rings is None else self.rings.take(index),
+        )

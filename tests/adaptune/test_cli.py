@@ -55,10 +55,23 @@ def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words)
     assert "Traceback" not in done.stderr
 
 
+def test_inspect_and_cache(study_file, tmp_path):
+    done = adaptune("inspect", study_file.parent / "one.bag", "--png", "one.png", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "/points" in done.stdout
+    assert "sequences:" in done.stdout
+    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
+    done = adaptune("inspect", study_file, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert adaptune("cache", cwd=tmp_path).returncode == 0
+    assert adaptune("cache", "clear", cwd=tmp_path).stdout.startswith("Freed")
+
+
 def test_help_and_version(tmp_path):
     done = adaptune("--help", cwd=tmp_path)
     assert done.returncode == 0
-    for command in ("simulate", "offline", "online", "compare"):
+    for command in ("inspect", "simulate", "offline", "validate", "online", "compare", "cache"):
         assert command in done.stdout
     assert adaptune("--version", cwd=tmp_path).stdout.startswith("adaptune 0.")
 

@@ -1,3 +1,4 @@
+import csv
 import itertools
 import os
 import signal
@@ -8,6 +9,7 @@ import drives
 import numpy as np
 import pytest
 
+from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
@@ -42,6 +44,17 @@ def test_every_trial_is_in_the_archive(trained):
         assert trial.parameters == training.model.sets[number]
         assert training.means[name][number] == pytest.approx(trial.mean_error, rel=1e-6)
     assert training.model.sets[0] == study.space.baseline
+
+
+def test_the_table_of_trials(trained):
+    study, training = trained
+    with (study.folder / "trials.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["trial"]) for row in rows] == list(range(10))
+    assert float(rows[7]["two"]) == pytest.approx(training.means["two"][7])
+    best = min(rows, key=lambda row: float(row["mean"]))
+    fixed = yaml.Document((study.folder / "fixed.yaml").read_text()).data
+    assert {name: float(best[name]) for name in fixed} == fixed
 
 
 def test_the_fixed_set_has_the_least_mean_of_means(trained):

@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.study import load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
@@ -118,7 +119,7 @@ def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
     study = load_study(
         study_file, [f"sequences.three.reference={tmp_path / 'late.tum'}"], trained.folder
     )
-    with pytest.raises(ComparisonError, match="three: the reference does not overlap"):
+    with pytest.raises(AdaptuneError, match=r"the reference tells of .* set `clock_offset`"):
         run_replays(study, trained.folder / "model.npz")
 
 

@@ -1,0 +1,367 @@
+"""Decoded sequences on disk, shared by all processes.
+
+An entry is a folder of arrays that are mapped into memory, named by a digest of what was decoded
+and how. It is written beside its place and renamed there when whole: a writer that is killed
+leaves a folder whose name begins with a dot, which the next one removes.
+"""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from adaptune.sequence.scan import Scan
+
+_log = logging.getLogger(__name__)
+
+_VERSION = 1
+_SAMPLE = 1 << 16
+_CAP_GB = 50.0
+# A writer that has not written for this long is taken for dead.
+_DEAD = 3600.0
+_INDEX = np.dtype([("stamp", "<i8"), ("end", "<i8"), ("times", "?"), ("rings", "?")])
+_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "points": ("<f4", (3,)),
+    "times": ("<f4", ()),
+    "rings": ("<u2", ()),
+}
+
+
+def folder() -> Path:
+    """Where decoded sequences are kept: ``$ADAPTUNE_CACHE``, or in the user's cache folder."""
+    if given := os.environ.get("ADAPTUNE_CACHE"):
+        return Path(given).expanduser()
+    if sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "adaptune"
+
+
+def cap() -> int:
+    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50."""
+    try:
+        return round(float(os.environ.get("ADAPTUNE_CACHE_GB", _CAP_GB)) * 1e9)
+    except ValueError:
+        return round(_CAP_GB * 1e9)
+
+
+def key(paths: Sequence[Path], settings: Any) -> str:
+    """Digest of files and settings.
+
+    Of a file count its size, its time of change, its beginning and its end; its name does not. Of
+    a folder count its files.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
+    digest = hashlib.blake2b(f"{_VERSION} {settings!r}".encode(), digest_size=16)
+    for path in paths:
+        files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+        for file in files:
+            status = file.stat()
+            digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
+            with file.open("rb") as stream:
+                digest.update(stream.read(_SAMPLE))
+                stream.seek(max(status.st_size - _SAMPLE, 0))
+                digest.update(stream.read(_SAMPLE))
+    return digest.hexdigest()
+
+
+class CachedScans:
+    """The scans of an entry, in any order.
+
+    Parameters
+    ----------
+    path
+        Folder of the entry.
+
+    Attributes
+    ----------
+    about : dict
+        What was noted of the sequence when it was decoded.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.about: dict[str, Any] = json.loads((path / "about.json").read_text("utf-8"))
+        self._index = np.load(path / "index.npy")
+        self._ends: list[int] = self._index["end"].tolist()
+        # All at once: what is mapped stays even if another process removes the entry.
+        self._points, self._times, self._rings = map(self._map, _ARRAYS)
+        # Says when the entry was last of use.
+        os.utime(path / "about.json")
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, i: int) -> Scan:
+        stamp, end, times, rings = self._index[i].item()
+        part = slice(self._ends[i - 1] if i else 0, end)
+        return Scan(
+            stamp,
+            self._points[part],
+            self._times[part] if times else None,
+            self._rings[part] if rings else None,
+        )
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """Stamps of the scans, of shape (n,)."""
+        stamps: NDArray[np.int64] = self._index["stamp"]
+        return stamps
+
+    def _map(self, name: str) -> NDArray[Any]:
+        path = self.path / f"{name}.npy"
+        # An empty file cannot be mapped.
+        array: NDArray[Any] = np.load(
+            path, mmap_mode="r" if self._ends and self._ends[-1] else None
+        )
+        # A view of the base class: slices of memmap itself are slow to make.
+        return array.view(np.ndarray)
+
+
+def find(key: str) -> CachedScans | None:
+    """The entry of this digest, if it is there and whole."""
+    path = folder() / key
+    try:
+        return CachedScans(path)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        _log.warning("%s: is damaged and removed (%s)", path, error)
+        shutil.rmtree(path, ignore_errors=True)
+        return None
+
+
+class _Growing:
+    """A .npy file whose length is not known before it is closed."""
+
+    def __init__(self, path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]):
+        self._dtype, self._shape, self.length = dtype, shape, 0
+        self._file: BinaryIO = path.open("wb")
+        self._header()
+
+    def append(self, array: NDArray[Any]) -> None:
+        self._file.write(np.ascontiguousarray(array, self._dtype).data)
+        self.length += len(array)
+
+    def close(self) -> None:
+        self._file.seek(0)
+        self._header()
+        self._file.close()
+
+    def _header(self) -> None:
+        # numpy leaves room for the first axis to grow, so the header keeps its size.
+        npy.write_array_header_1_0(
+            self._file,
+            {
+                "descr": npy.dtype_to_descr(self._dtype),
+                "fortran_order": False,
+                "shape": (self.length, *self._shape),
+            },
+        )
+
+
+class Writer:
+    """Writes an entry scan by scan, as a context: it is there when the block ends well.
+
+    Parameters
+    ----------
+    key
+        Digest of the entry.
+    about
+        What to note of the sequence; plain data.
+    """
+
+    def __init__(self, key: str, about: dict[str, Any]):
+        self._key, self._about = key, about
+        self._done = False
+        root = folder()
+        root.mkdir(parents=True, exist_ok=True)
+        _sweep(root)
+        self._beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
+        self._arrays = {
+            name: _Growing(self._beside / f"{name}.npy", np.dtype(kind), shape)
+            for name, (kind, shape) in _ARRAYS.items()
+        }
+        self._index: list[tuple[int, int, bool, bool]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def append(self, scan: Scan) -> None:
+        """Add a scan."""
+        n = len(scan)
+        self._arrays["points"].append(scan.points)
+        for name, values in (("times", scan.times), ("rings", scan.rings)):
+            array = self._arrays[name]
+            if values is not None:
+                # Those before had none: their share is left empty.
+                array.append(np.zeros(self._arrays["points"].length - n - array.length))
+                array.append(values)
+        self._index.append(
+            (
+                scan.stamp,
+                self._arrays["points"].length,
+                scan.times is not None,
+                scan.rings is not None,
+            )
+        )
+
+    def done(self) -> None:
+        """Say that the last scan was added."""
+        self._done = True
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            for array in self._arrays.values():
+                array.close()
+            if self._done and error is None:
+                np.save(self._beside / "index.npy", np.array(self._index, _INDEX))
+                about = json.dumps(self._about, indent=1)
+                (self._beside / "about.json").write_text(about, "utf-8")
+                _make_room(_size(self._beside))
+                # Another process may have been first; its arrays are the same.
+                if not (folder() / self._key).exists():
+                    self._beside.rename(folder() / self._key)
+        except OSError as problem:
+            _log.warning("%s: not kept in the cache (%s)", self._about.get("name"), problem)
+        finally:
+            shutil.rmtree(self._beside, ignore_errors=True)
+
+
+def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan]:
+    """Pass scans on and keep them; nothing is kept unless all of them were asked for."""
+    try:
+        writer = Writer(key, about)
+    except OSError as error:
+        _log.warning("%s: not kept in the cache (%s)", about.get("name"), error)
+        yield from scans
+        return
+    with writer:
+        keeping, total = True, 0
+        for scan in scans:
+            total += scan.points.nbytes
+            if keeping and total > cap():
+                _log.warning("%s: larger than the cache may grow, not kept", about.get("name"))
+                keeping = False
+            if keeping:
+                try:
+                    writer.append(scan)
+                except OSError as error:
+                    _log.warning("%s: not kept in the cache (%s)", about.get("name"), error)
+                    keeping = False
+            yield scan
+        if keeping:
+            writer.done()
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """A decoded sequence on disk.
+
+    Attributes
+    ----------
+    name : str
+        The recording.
+    path : Path
+        Folder of the entry.
+    size : int
+        Bytes.
+    used : float
+        When it was last opened, in seconds since 1970.
+    n_scans : int
+    """
+
+    name: str
+    path: Path
+    size: int
+    used: float
+    n_scans: int
+
+
+def list_cache() -> list[CacheEntry]:
+    """All entries, the last used first."""
+    entries = []
+    root = folder()
+    for path in root.iterdir() if root.is_dir() else ():
+        if path.name.startswith("."):
+            continue
+        try:
+            about = path / "about.json"
+            name = json.loads(about.read_text("utf-8"))["name"]
+            n_scans = len(np.load(path / "index.npy", mmap_mode="r"))
+            entry = CacheEntry(name, path, _size(path), about.stat().st_mtime, n_scans)
+        except (OSError, ValueError, KeyError):
+            continue
+        entries.append(entry)
+    return sorted(entries, key=lambda entry: -entry.used)
+
+
+def clear_cache() -> int:
+    """Remove all entries and what dead writers left.
+
+    Returns
+    -------
+    int
+        Bytes that are free again.
+    """
+    freed = 0
+    root = folder()
+    for path in root.iterdir() if root.is_dir() else ():
+        # Nothing is removed that was not written here, should the folder be shared.
+        if path.name.startswith(".writing-") or (path / "index.npy").exists():
+            freed += _size(path)
+            shutil.rmtree(path, ignore_errors=True)
+    return freed
+
+
+def _make_room(size: int) -> None:
+    entries = list_cache()
+    total = sum(entry.size for entry in entries) + size
+    for entry in reversed(entries):
+        if total <= cap():
+            return
+        # Processes that have it mapped keep what they mapped.
+        shutil.rmtree(entry.path, ignore_errors=True)
+        total -= entry.size
+
+
+def _sweep(root: Path) -> None:
+    for path in root.glob(".writing-*"):
+        try:
+            newest = max(p.stat().st_mtime for p in (path, *path.iterdir()))
+        except OSError:
+            continue
+        if time.time() - newest > _DEAD:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _size(path: Path) -> int:
+    return sum(p.stat().st_size for p in path.iterdir() if p.is_file())

@@ -1,0 +1,166 @@
+"""Sequences of the public data sets that evalio knows, by name."""
+
+from collections.abc import Iterator
+from functools import partial
+from importlib import import_module
+from itertools import count
+from typing import Any, ClassVar
+
+import numpy as np
+
+from adaptune import geometry
+from adaptune.geometry import Poses
+from adaptune.sequence.bag import BagSource, bag_paths
+from adaptune.sequence.imu import Imu
+from adaptune.sequence.scan import Scan
+from adaptune.sequence.sequence import Frame, SequenceError, Source
+from adaptune.sequence.timing import Timing
+from adaptune.trajectory import Trajectory
+
+
+def evalio_source(name: str) -> Source:
+    """Scans, poses and IMU of a sequence such as ``newer_college_2020/short_experiment``.
+
+    evalio tells where the files are (in its data folder, ``$EVALIO_DATA``), what their stamps mean
+    and which frames the poses are of. Bags are read here; evalio converts all other files.
+
+    Raises
+    ------
+    SequenceError
+        If evalio is not installed, or does not know or have the sequence.
+    """
+    try:
+        datasets: Any = import_module("evalio.datasets")
+    except ImportError as error:
+        raise SequenceError(
+            f"{name}: evalio's data sets need evalio: `pip install evalio` ({error})"
+        ) from error
+    try:
+        dataset: Any = datasets.get_sequence(name)
+    except Exception as error:
+        raise SequenceError(
+            f"{name}: evalio knows no such sequence ({error or type(error).__name__}); "
+            f"`evalio ls` lists them"
+        ) from error
+    if isinstance(dataset, Exception):
+        raise SequenceError(f"{name}: evalio knows no such sequence; `evalio ls` lists them")
+    if not dataset.is_downloaded():
+        raise SequenceError(
+            f"{name}: not in evalio's data folder ({dataset.folder}); fetch it with "
+            f"`evalio dl {name}`, or set EVALIO_DATA to where it is"
+        )
+    recording = dataset.data_iter()
+    if isinstance(recording, datasets.RosbagIter):
+        return _EvalioBag(dataset, recording)
+    return _EvalioFiles(dataset)
+
+
+def _poses(dataset: Any) -> Trajectory | None:
+    """Poses of the LiDAR; evalio's own are of a frame of each data set."""
+    truth = dataset.ground_truth_raw()
+    if truth is None or not len(truth.stamps):
+        return None
+    T_truth_sensor = (dataset.imu_T_gt().inverse() * dataset.imu_T_lidar()).to_mat()
+    stamps = np.array([stamp.to_nsec() for stamp in truth.stamps], np.int64)
+    unique, index = np.unique(stamps, return_index=True)
+    T = np.array([pose.to_mat() for pose in truth.poses])[index] @ T_truth_sensor
+    return Trajectory(unique, T)
+
+
+def _place_of_imu(dataset: Any) -> Poses:
+    """Tell the IMU's pose in the LiDAR's frame."""
+    return geometry.invert(np.asarray(dataset.imu_T_lidar().to_mat(), np.float64))
+
+
+class _EvalioBag(BagSource):
+    """A data set kept in bags: evalio tells the topics, the stamps and the poses."""
+
+    def __init__(self, dataset: Any, recording: Any):
+        at_end = str(recording.lidar_format.stamp) == "end"
+        period = float(recording.lidar_params.delta_time().to_sec())
+        self._dataset, self._imu_topic = dataset, recording.imu_topic
+        paths = bag_paths([str(path) for path in recording.path])
+        recording.reader.close()
+        super().__init__(
+            paths, recording.lidar_topic, Timing("end" if at_end else "start", period=period)
+        )
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """The data set's poses, or those of a topic."""
+        return _poses(self._dataset) if name is None else super().poses(name, child_frame)
+
+    def imu(self, name: str | None) -> Imu | None:
+        """The data set's IMU."""
+        found = super().imu(name or self._imu_topic)
+        if found is None:
+            return None
+        return Imu(
+            found.stamps, found.angular_velocity, found.acceleration, _place_of_imu(self._dataset)
+        )
+
+
+class _EvalioFiles:
+    """A data set kept in files of its own, which evalio converts point by point."""
+
+    random_access: ClassVar[bool] = False
+
+    def __init__(self, dataset: Any):
+        self._dataset = dataset
+        self.n_messages = len(dataset)
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence."""
+        return str(self._dataset.full_name)
+
+    def about(self) -> dict[str, Any]:
+        """Its name is all there is to note."""
+        return {"name": self.name}
+
+    def frames(self) -> Iterator[Frame]:
+        """All scans."""
+        measurements = iter(self._dataset.lidar())
+        for number in count(1):
+            try:
+                measurement = next(measurements)
+            except StopIteration:
+                return
+            except Exception as error:
+                raise SequenceError(
+                    f"{self.name}: scan {number} cannot be read ({error})"
+                ) from error
+            stamp = measurement.stamp.to_nsec()
+            yield Frame(stamp, stamp, partial(_scan, measurement))
+
+    def span(self) -> tuple[int, int] | None:
+        """First stamp, and the last one if scans take as long as the LiDAR's data sheet says."""
+        first = next(self.frames(), None)
+        if first is None:
+            return None
+        period = self._dataset.lidar_params().delta_time().to_sec()
+        return first.stamp, first.stamp + round(self.n_messages * period * 1e9)
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """The data set's poses."""
+        if name is not None or child_frame is not None:
+            raise SequenceError(f"{self.name}: has no topics; leave `reference` out or name a file")
+        return _poses(self._dataset)
+
+    def imu(self, name: str | None) -> Imu | None:
+        """The data set's IMU."""
+        if name is not None:
+            raise SequenceError(f"{self.name}: has no topics; leave `imu.topic` out")
+        measured = list(self._dataset.imu())
+        stamps = np.array([m.stamp.to_nsec() for m in measured], np.int64)
+        unique, index = np.unique(stamps, return_index=True)
+        gyro = np.array([m.gyro for m in measured], np.float64)[index]
+        acceleration = np.array([m.accel for m in measured], np.float64)[index]
+        return Imu(unique, gyro, acceleration, _place_of_imu(self._dataset))
+
+
+def _scan(measurement: Any) -> Scan:
+    points = np.array(measurement.to_vec_positions(), np.float32).reshape(-1, 3)
+    times = np.array(measurement.to_vec_stamps(), np.float32)
+    squares = np.einsum("ij,ij->i", points, points)
+    scan = Scan(measurement.stamp.to_nsec(), points, np.maximum(times, np.float32(0.0)))
+    return scan.select((squares > 0) & (squares < np.inf))

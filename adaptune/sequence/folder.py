@@ -1,0 +1,368 @@
+"""Recordings kept as a folder with one file a scan."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import geometry, open3d
+from adaptune.geometry import Poses
+from adaptune.sequence.imu import Imu
+from adaptune.sequence.pointcloud2 import PointCloudError, from_fields
+from adaptune.sequence.scan import Scan
+from adaptune.sequence.sequence import Frame, SequenceError
+from adaptune.sequence.timing import AUTO, Timing
+from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
+
+SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+
+
+@dataclass(frozen=True, eq=False)
+class FileSource:
+    """Scans in files of their own.
+
+    Attributes
+    ----------
+    name : str
+        The folder.
+    files : sequence of Path
+    stamps : ndarray of shape (n,)
+        Nanoseconds of each file.
+    timing : Timing
+        What the stamps mean.
+    own_poses : callable, optional
+        Reads the poses of the LiDAR that lie beside the files.
+    """
+
+    name: str
+    files: Sequence[Path]
+    stamps: NDArray[np.int64]
+    timing: Timing = AUTO
+    own_poses: Callable[[], Trajectory] | None = None
+
+    random_access: ClassVar[bool] = True
+
+    def about(self) -> dict[str, Any]:
+        """Its name is all there is to note."""
+        return {"name": self.name}
+
+    @property
+    def n_messages(self) -> int:
+        """Number of files."""
+        return len(self.files)
+
+    def frames(self) -> Iterator[Frame]:
+        """All scans in the order of the files' names."""
+        for path, stamp in zip(self.files, self.stamps.tolist(), strict=True):
+            yield Frame(stamp, stamp, partial(read_scan, path, stamp, self.timing))
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last stamp."""
+        return (int(self.stamps[0]), int(self.stamps[-1])) if len(self.stamps) else None
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """Poses of the LiDAR that lie beside the files.
+
+        Raises
+        ------
+        SequenceError
+            If a topic is asked for.
+        TrajectoryError
+            If they cannot be read.
+        """
+        if name is not None or child_frame is not None:
+            raise SequenceError(
+                f"{self.name}: has no topics; `reference` must be a file of poses, or be left out"
+            )
+        return None if self.own_poses is None else self.own_poses()
+
+    def imu(self, name: str | None) -> Imu | None:
+        """Folders hold none."""
+        if name is not None:
+            raise SequenceError(f"{self.name}: has no topics; leave `imu` out")
+        return None
+
+
+def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
+    """Read one file: ``.bin`` as KITTI writes them, ``.npy``, ``.pcd`` or ``.ply``.
+
+    Raises
+    ------
+    SequenceError
+        Naming the file.
+    """
+    try:
+        return from_fields(_fields(path), stamp, timing)
+    except FileNotFoundError as error:
+        raise SequenceError(f"{path}: there is no such file") from error
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, PointCloudError) as error:
+        raise SequenceError(f"{path}: cannot be read as a scan ({error})") from error
+
+
+def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    if path.suffix == ".bin":
+        size = path.stat().st_size
+        if size % 16:
+            raise ValueError(f"{size} bytes are not a whole number of points of four float32")
+        array: NDArray[Any] = np.fromfile(path, "<f4").reshape(-1, 4)
+    elif path.suffix == ".npy":
+        array = np.load(path, allow_pickle=False)
+        if array.dtype.names is not None:
+            _require_xyz(array.dtype.names)
+            return array.reshape(-1)
+    else:
+        return _open3d_fields(path)
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise ValueError(f"an array of shape {array.shape} is not one of points")
+    return {axis: array[:, i] for i, axis in enumerate("xyz")}
+
+
+def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
+    cloud = open3d.load().t.io.read_point_cloud(str(path))
+    # What it cannot read it gives back without points, without a word.
+    if "positions" not in cloud.point or not len(cloud.point.positions):
+        raise ValueError("it is damaged or holds no point")
+    fields = {name: tensor.numpy() for name, tensor in cloud.point.items()}
+    columns = {name: v[:, 0] for name, v in fields.items() if v.ndim == 2 and v.shape[1] == 1}
+    return columns | {axis: fields["positions"][:, i] for i, axis in enumerate("xyz")}
+
+
+def _require_xyz(names: Sequence[str]) -> None:
+    if missing := [axis for axis in "xyz" if axis not in names]:
+        raise KeyError(f"no field {', '.join(missing)}; there is {', '.join(names)}")
+
+
+def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
+    """Scans of a folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
+
+    Stamps are the lines of ``times.txt`` (seconds) where there is one; else the files' names
+    where these are seconds with a fraction or nanoseconds since 1970; else one `period` a file.
+
+    Raises
+    ------
+    SequenceError
+        If there is no scan, or the stamps do not go with the files.
+    """
+    if not folder.is_dir():
+        raise SequenceError(f"{folder}: there is no such folder")
+    for suffix in SUFFIXES:
+        if files := sorted(folder.glob(f"*{suffix}"), key=_natural):
+            break
+    else:
+        raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)})")
+    if (times := folder / "times.txt").exists():
+        stamps = _seconds(times)
+        if len(stamps) != len(files):
+            raise SequenceError(f"{times}: {len(stamps)} times for {len(files)} scans")
+    else:
+        named = _named_stamps(files)
+        evenly = np.arange(len(files)) * round(timing.period * 1e9)
+        stamps = evenly if named is None else named
+    return FileSource(str(folder), files, stamps, timing)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Key by which scan_10 comes after scan_9."""
+    return [(int(n or 0), text) for text, n in re.findall(r"(\D*)(\d*)", path.stem)]
+
+
+def _named_stamps(files: Sequence[Path]) -> NDArray[np.int64] | None:
+    stems = [path.stem for path in files]
+    if all(re.fullmatch(r"\d{17,19}", stem) for stem in stems):
+        return np.array([int(stem) for stem in stems], np.int64)
+    if all(re.fullmatch(r"\d{1,10}\.\d+", stem) for stem in stems):
+        return np.array([int(Decimal(stem).scaleb(9)) for stem in stems], np.int64)
+    return None
+
+
+def kitti(folder: Path) -> FileSource:
+    """Scans of a KITTI odometry sequence, a KITTI raw drive or a KITTI-360 drive.
+
+    The kind is told by what the folder holds: ``velodyne/`` with ``times.txt`` and ``calib.txt``
+    (poses in ``poses.txt``, or ``poses/`` two folders up), or ``velodyne_points/data/`` (poses
+    from ``oxts/``, or from ``data_poses/`` two folders up).
+
+    Raises
+    ------
+    SequenceError
+        If it holds neither, or files are missing.
+    """
+    if (folder / "velodyne").is_dir():
+        return _kitti_odometry(folder)
+    if (folder / "velodyne_points" / "data").is_dir():
+        return _kitti_drive(folder)
+    if not folder.is_dir():
+        raise SequenceError(f"{folder}: there is no such folder")
+    raise SequenceError(
+        f"{folder}: not a KITTI sequence; it has neither velodyne/ nor velodyne_points/data/"
+    )
+
+
+def _kitti_odometry(folder: Path) -> FileSource:
+    files = _scans(folder / "velodyne")
+    stamps = _seconds(folder / "times.txt")
+    if len(files) > len(stamps):
+        raise SequenceError(f"{folder}: {len(stamps)} lines in times.txt for {len(files)} scans")
+    candidates = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt")
+    found = next((path for path in candidates if path.exists()), None)
+
+    def poses() -> Trajectory:
+        assert found is not None
+        T_world_camera = read_kitti(found)
+        if len(T_world_camera) != len(stamps):
+            raise SequenceError(f"{found}: {len(T_world_camera)} poses for {len(stamps)} stamps")
+        T_camera_sensor = calibration(folder / "calib.txt", "Tr")
+        T = geometry.invert(T_camera_sensor) @ T_world_camera @ T_camera_sensor
+        return Trajectory(stamps, T)
+
+    # Files may be missing from the front or the middle: each is told by its number.
+    return FileSource(
+        str(folder), files, _by_number(files, stamps), own_poses=poses if found else None
+    )
+
+
+def _kitti_drive(folder: Path) -> FileSource:
+    points = folder / "velodyne_points"
+    files = _scans(points / "data")
+    started = points / "timestamps_start.txt"
+    path = started if started.exists() else points / "timestamps.txt"
+    stamps = _by_number(files, _dates(path))
+    poses: Callable[[], Trajectory] | None = None
+    if (folder / "oxts" / "data").is_dir():
+        poses = partial(_oxts_poses, folder)
+    elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
+        poses = partial(_kitti_360_poses, record, _dates(path))
+    return FileSource(str(folder), files, stamps, own_poses=poses)
+
+
+def _oxts_poses(folder: Path) -> Trajectory:
+    files = sorted((folder / "oxts" / "data").glob("*.txt"))
+    stamps = _by_number(files, _dates(folder / "oxts" / "timestamps.txt"))
+    T_sensor_imu = _calibration_rt(folder.parent / "calib_imu_to_velo.txt")
+    T_world_imu = read_oxts(files)
+    _, first = np.unique(stamps, return_index=True)
+    T = T_sensor_imu @ geometry.invert(T_world_imu[0]) @ T_world_imu @ geometry.invert(T_sensor_imu)
+    return Trajectory(stamps[first], T[first])
+
+
+def _kitti_360_poses(record: Path, stamps: NDArray[np.int64]) -> Trajectory:
+    path = record / "poses.txt"
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise TrajectoryError(f"{path}: cannot be read ({error})") from error
+    if rows.shape[1] != 13 or not len(rows) or not np.isfinite(rows).all():
+        raise TrajectoryError(f"{path}: lines must hold a frame and the 12 numbers of a pose")
+    frames = rows[:, 0].astype(np.int64)
+    if np.any(np.diff(frames) <= 0) or frames[0] < 0 or frames[-1] >= len(stamps):
+        raise TrajectoryError(f"{path}: its frames are not in order, or not those of the drive")
+    folder = record.parent.parent / "calibration"
+    T_body_camera = calibration(folder / "calib_cam_to_pose.txt", "image_00")
+    T_sensor_camera = _matrix(folder / "calib_cam_to_velo.txt")
+    T_world_body = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_body[:, :3] = rows[:, 1:].reshape(-1, 3, 4)
+    return Trajectory(
+        stamps[frames], T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
+    )
+
+
+def calibration(path: Path, key: str) -> Poses:
+    """A 3x4 matrix of KITTI's ``key: 12 numbers`` files, as a pose of shape (4, 4).
+
+    Raises
+    ------
+    SequenceError
+        Naming the key that is missing.
+    """
+    numbers = _entries(path).get(key)
+    if numbers is None or len(numbers) != 12:
+        raise SequenceError(f"{path}: no line `{key}:` with 12 numbers")
+    return _pose(np.array(numbers).reshape(3, 4))
+
+
+def _calibration_rt(path: Path) -> Poses:
+    entries = _entries(path)
+    if len(entries.get("R", [])) != 9 or len(entries.get("T", [])) != 3:
+        raise SequenceError(f"{path}: no lines `R:` and `T:` with 9 and 3 numbers")
+    rotation = np.array(entries["R"]).reshape(3, 3)
+    return _pose(np.column_stack([rotation, entries["T"]]))
+
+
+def _matrix(path: Path) -> Poses:
+    try:
+        numbers = [float(field) for field in _text(path).split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 12:
+        raise SequenceError(f"{path}: must hold the 12 numbers of a 3x4 matrix")
+    return _pose(np.array(numbers).reshape(3, 4))
+
+
+def _pose(rows: NDArray[np.float64]) -> Poses:
+    T = np.eye(4)
+    T[:3] = rows
+    return T
+
+
+def _entries(path: Path) -> dict[str, list[float]]:
+    entries = {}
+    for line in _text(path).splitlines():
+        key, colon, numbers = line.partition(":")
+        try:
+            entries[key.strip()] = [float(field) for field in numbers.split()] if colon else []
+        except ValueError:  # a date, for example
+            continue
+    return entries
+
+
+def _scans(folder: Path) -> list[Path]:
+    files = sorted(folder.glob("*.bin"))
+    if not files:
+        raise SequenceError(f"{folder}: holds no .bin files")
+    return files
+
+
+def _by_number(files: Sequence[Path], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Stamp of each file by the number that its name is."""
+    try:
+        numbers = np.array([int(path.stem) for path in files])
+        of_files: NDArray[np.int64] = stamps[numbers]
+    except (ValueError, IndexError) as error:
+        raise SequenceError(
+            f"{files[0].parent}: the files' numbers do not go with {len(stamps)} stamps"
+        ) from error
+    return of_files
+
+
+def _seconds(path: Path) -> NDArray[np.int64]:
+    try:
+        seconds = [Decimal(line) for line in _text(path).split()]
+        return np.array([int(s.scaleb(9).to_integral_value()) for s in seconds], np.int64)
+    except (InvalidOperation, ValueError, OverflowError) as error:
+        raise SequenceError(f"{path}: a line is not a time in seconds") from error
+
+
+def _dates(path: Path) -> NDArray[np.int64]:
+    lines = [line.strip() for line in _text(path).splitlines()]
+    try:
+        # An empty line stands for a scan that was lost; it has no file.
+        dates = np.array([line or "NaT" for line in lines], "datetime64[ns]")
+    except ValueError as error:
+        raise SequenceError(f"{path}: a line is not a date and time ({error})") from error
+    stamps: NDArray[np.int64] = dates.astype(np.int64)
+    return stamps
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise SequenceError(f"{path}: there is no such file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise SequenceError(f"{path}: cannot be read as text ({error})") from error

@@ -1,0 +1,107 @@
+"""Measurements of an IMU."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import correlate
+
+from adaptune import geometry
+from adaptune.geometry import Poses
+from adaptune.trajectory import Trajectory
+
+_CORRELATION = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Imu:
+    """What an IMU measured, in its own frame.
+
+    Attributes
+    ----------
+    stamps : ndarray of shape (n,)
+        Strictly increasing integer nanoseconds.
+    angular_velocity : ndarray of shape (n, 3)
+        Radians per second.
+    acceleration : ndarray of shape (n, 3)
+        Metres per second squared, gravity included.
+    T_sensor_imu : ndarray of shape (4, 4)
+        The IMU's pose in the LiDAR's frame.
+    """
+
+    stamps: NDArray[np.int64]
+    angular_velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    T_sensor_imu: Poses = field(default_factory=lambda: np.eye(4))
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+def clock_offset(trajectory: Trajectory, imu: Imu, rate: float = 50.0) -> float | None:
+    """Seconds to add to a trajectory's stamps so that it turns when the gyroscope does.
+
+    The rates of turning, which no choice of frames changes, are correlated at every offset at
+    which the shorter recording lies at least half inside the other.
+
+    Parameters
+    ----------
+    trajectory, imu
+        Of the same motion, each on its own clock.
+    rate
+        Samples per second to compare.
+
+    Returns
+    -------
+    float or None
+        None where the two do not tell the same motion.
+    """
+    if len(trajectory) < 3 or len(imu) < 3:
+        return None
+    turned = geometry.rotation_angle(geometry.steps(trajectory.T_world_sensor))
+    seconds = np.diff(trajectory.stamps) * 1e-9
+    middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
+    a = _sampled(middles, turned / seconds, rate)
+    # A gyroscope is faster than the poses: it is averaged over as long as they are apart.
+    window = max(round(np.median(seconds) * rate), 1)
+    gyro = np.linalg.norm(imu.angular_velocity, axis=1)
+    b = _sampled((imu.stamps - imu.stamps[0]) * 1e-9, gyro, rate)
+    b = np.convolve(b, np.ones(window) / window, mode="same")
+    if min(len(a), len(b)) < 2 * rate:
+        return None
+    coefficients, lags = _correlation(a, b)
+    best = int(np.argmax(coefficients))
+    if coefficients[best] < _CORRELATION:
+        return None
+    start = (imu.stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
+    return float(start + lags[best] / rate)
+
+
+def _sampled(
+    seconds: NDArray[np.float64], values: NDArray[np.float64], rate: float
+) -> NDArray[np.float64]:
+    # Ten hours at 50 Hz; anything longer is a stamp gone wrong.
+    grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / rate)
+    sampled: NDArray[np.float64] = np.interp(grid, seconds, values)
+    return sampled
+
+
+def _correlation(
+    a: NDArray[np.float64], b: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Pearson's coefficient of the overlap of `a`, moved to start at each sample of `b`."""
+    lags = np.arange(-(len(a) - 1), len(b))
+    ones_a, ones_b = np.ones_like(a), np.ones_like(b)
+
+    def slide(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        result: NDArray[np.float64] = correlate(y, x, mode="full", method="fft")
+        return result
+
+    n = np.maximum(slide(ones_a, ones_b).round(), 1.0)
+    mean_a, mean_b = slide(a, ones_b) / n, slide(ones_a, b) / n
+    covariance = slide(a, b) / n - mean_a * mean_b
+    variance_a = slide(a**2, ones_b) / n - mean_a**2
+    variance_b = slide(ones_a, b**2) / n - mean_b**2
+    scale = np.sqrt(np.maximum(variance_a * variance_b, 1e-18))
+    enough = n >= min(len(a), len(b)) / 2
+    return np.where(enough, covariance / scale, -1.0), lags

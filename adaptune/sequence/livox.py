@@ -1,0 +1,138 @@
+"""livox_ros_driver/CustomMsg to scans."""
+
+import struct
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+
+from adaptune.sequence.pointcloud2 import PointCloudError, from_fields
+from adaptune.sequence.scan import Scan
+from adaptune.sequence.timing import Timing
+
+TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+
+# For ROS 2 bags without definitions; all others bring their own.
+DEFINITIONS = {
+    f"{package}/msg/{name}": text
+    for package in ("livox_ros_driver", "livox_ros_driver2")
+    for name, text in (
+        (
+            "CustomPoint",
+            "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
+            "uint8 reflectivity\nuint8 tag\nuint8 line\n",
+        ),
+        (
+            "CustomMsg",
+            "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
+            "uint8[3] rsvd\nCustomPoint[] points\n",
+        ),
+    )
+}
+
+_Fields = Sequence[tuple[str, Any]]
+
+
+def decode(
+    data: bytes | memoryview, message: _Fields, point: _Fields, cdr: bool, timing: Timing
+) -> Scan:
+    """Decode a serialised message without an object for each of its points.
+
+    Parameters
+    ----------
+    data
+        The message as it lies in the bag.
+    message, point
+        Fields of the message and of one point, as rosbags gives them.
+    cdr
+        Whether it is serialised as in ROS 2.
+    timing
+        What its stamps mean; the points' offsets count from the time base, and the stamp marks
+        the same moment, unless it is said to mark the scan's end.
+
+    Raises
+    ------
+    PointCloudError
+        If the message is not as its definition says.
+    """
+    little = not cdr or data[1:2] == b"\x01"
+    order = "<" if little else ">"
+    try:
+        stamp, raw = _parse(
+            data[4:] if cdr else data, tuple(message), tuple(point), cdr=cdr, order=order
+        )
+    except (struct.error, KeyError, ValueError, IndexError) as error:
+        raise PointCloudError(f"not a Livox message as its definition says ({error})") from error
+    return from_fields(raw, stamp, timing)
+
+
+def _parse(
+    data: bytes | memoryview, message: _Fields, point: _Fields, *, cdr: bool, order: str
+) -> tuple[int, NDArray[Any]]:
+    # In ROS 1 a header begins with its sequence number.
+    at = 0 if cdr else 4
+    seconds, nanoseconds, length = struct.unpack_from(order + "III", data, at)
+    at += 12 + length
+    if message[0][0] != "header":
+        raise ValueError("it does not begin with a header")
+    for name, description in message[1:]:
+        if name == "points":
+            break
+        size, number = _extent(description)
+        at = _aligned(at, size if cdr else 1) + size * number
+    else:
+        raise KeyError("points")
+    at = _aligned(at, 4 if cdr else 1)
+    (count,) = struct.unpack_from(order + "I", data, at)
+    at += 4
+    dtype, used = _point_dtype(point, cdr, order)
+    needed = at + (count - 1) * dtype.itemsize + used if count else at
+    if len(data) < needed:
+        raise ValueError(f"{count} points need {needed} bytes, there are {len(data)}")
+    raw = np.ndarray((max(count - 1, 0),), dtype, buffer=data, offset=at)
+    if count:
+        last = np.zeros(1, dtype)
+        last.view(np.uint8)[:used] = np.frombuffer(data, np.uint8, used, needed - used)
+        raw = np.concatenate([raw, last])
+    return seconds * 10**9 + nanoseconds, raw
+
+
+@lru_cache(maxsize=8)
+def _point_dtype(point: _Fields, cdr: bool, order: str) -> tuple[np.dtype[Any], int]:
+    """Type of a point, padded to the next one, and where its last byte ends."""
+    names, formats, offsets, at, widest = [], [], [], 0, 1
+    for name, description in point:
+        size, number = _extent(description)
+        kind = {"u": "u", "i": "i", "f": "f"}.get(description[1][0][:1])
+        if number != 1 or kind is None:
+            raise ValueError(f"a point's {name} is not a number")
+        at = _aligned(at, size if cdr else 1)
+        widest = max(widest, size)
+        names.append(name)
+        formats.append(f"{order}{kind}{size}")
+        offsets.append(at)
+        at += size
+    if missing := {"x", "y", "z", "offset_time"} - set(names):
+        raise KeyError(", ".join(sorted(missing)))
+    itemsize = _aligned(at, widest if cdr else 1)
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
+    # Behind the last point there is no padding.
+    return dtype, at
+
+
+def _extent(description: Any) -> tuple[int, int]:
+    """Bytes of an element and number of elements of a field of fixed size."""
+    if description[0] == Nodetype.ARRAY:
+        inner, number = description[1]
+        return _extent(inner)[0], number
+    if description[0] != Nodetype.BASE or description[1][0] == "string":
+        raise ValueError("a field before the points has no fixed size")
+    name = description[1][0]
+    return {"bool": 1, "byte": 1, "char": 1, "octet": 1}.get(name) or np.dtype(name).itemsize, 1
+
+
+def _aligned(at: int, to: int) -> int:
+    return -(-at // to) * to

@@ -1,0 +1,458 @@
+"""What every kind of recording gives, and what all of them need done to it."""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import geometry
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses
+from adaptune.sequence import cache
+from adaptune.sequence.imu import Imu, clock_offset
+from adaptune.sequence.scan import Scan
+from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
+
+_log = logging.getLogger(__name__)
+
+# No platform that carries a LiDAR is faster; only a jump of the reference is.
+_FASTEST = 100.0
+
+
+class SequenceError(AdaptuneError):
+    """A recording that cannot be read as asked."""
+
+
+class Sequence(Protocol):
+    """Scans of a LiDAR in the order of their stamps, and what is known of its motion."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it: its file."""
+        ...
+
+    @property
+    def n_messages(self) -> int:
+        """At least as many as there are scans."""
+        ...
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Read the scans; their stamps strictly increase."""
+        ...
+
+    def reference(self) -> Trajectory | None:
+        """Poses of the LiDAR, if they are known."""
+        ...
+
+    def imu(self) -> Imu | None:
+        """Measurements of the IMU, if there is one."""
+        ...
+
+    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Nanoseconds at which what was measured at `stamps` arrives when played in real time."""
+        ...
+
+
+class Frame(NamedTuple):
+    """A scan before it is decoded.
+
+    Attributes
+    ----------
+    stamp : int
+        Nanoseconds, as recorded.
+    recorded : int
+        Nanoseconds on the clock of the recorder; the stamp where there is none.
+    load : callable
+        Decodes the scan.
+    """
+
+    stamp: int
+    recorded: int
+    load: Callable[[], Scan]
+
+
+class Source(Protocol):
+    """One format of recordings.
+
+    Attributes
+    ----------
+    random_access : bool
+        Whether frames hold nothing in memory before they are loaded.
+    """
+
+    random_access: ClassVar[bool]
+
+    @property
+    def name(self) -> str:
+        """What messages call it: its file."""
+        ...
+
+    @property
+    def n_messages(self) -> int:
+        """At least as many as there are scans."""
+        ...
+
+    def frames(self) -> Iterator[Frame]:
+        """All scans in the order of their recording."""
+        ...
+
+    def about(self) -> dict[str, Any]:
+        """What to note of it beside its decoded scans, as plain data."""
+        ...
+
+    def span(self) -> tuple[int, int] | None:
+        """First stamp, and about the last one; none where there is no scan."""
+        ...
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """Reference poses that the recording brings along, or those of one topic."""
+        ...
+
+    def imu(self, name: str | None) -> Imu | None:
+        """Measurements of its IMU, in the IMU's own units."""
+        ...
+
+
+@dataclass
+class Repairs:
+    """What was left out of a recording, by reason."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, reason: str) -> None:
+        """Count one."""
+        self.counts[reason] = self.counts.get(reason, 0) + 1
+
+    def report(self, name: str) -> None:
+        """Log what was counted, if anything."""
+        if self.counts:
+            what = ", ".join(f"{n} {reason}" for reason, n in self.counts.items())
+            _log.warning("%s: left out %s", name, what)
+
+
+BACKWARD = "scans whose stamps do not come after the one before"
+LEAP = "scans whose stamps leap ahead of the recording"
+
+
+def in_order(frames: Iterable[Frame], repairs: Repairs) -> Iterator[Frame]:
+    """Leave out the fewest frames so that stamps strictly increase.
+
+    Where a stamp does not come after the one before it, one of the two is wrong: the one that
+    disagrees more with the recorder's clock is left out. A single stamp in the future thus costs
+    one scan, not all that follow.
+    """
+    last: Frame | None = None
+    doubtful: Frame | None = None
+    for frame in frames:
+        if doubtful is not None:
+            if frame.stamp > doubtful.stamp:
+                yield doubtful
+                last = doubtful
+            elif _leap(last, doubtful) > _leap(last, frame):
+                repairs.add(LEAP)
+            else:
+                repairs.add(BACKWARD)
+                continue
+            doubtful = None
+        if last is not None and frame.stamp <= last.stamp:
+            repairs.add(BACKWARD)
+        elif last is None or _leap(last, frame) > _DOUBT:
+            # The next one will tell. Others are not held back, so that they are decoded while
+            # their bytes are still in the processor's cache.
+            doubtful = frame
+        else:
+            yield frame
+            last = frame
+    if doubtful is not None:
+        yield doubtful
+
+
+# Nanoseconds; a recorder is seldom later than this.
+_DOUBT = 50_000_000
+
+
+def _leap(last: Frame | None, frame: Frame) -> int:
+    """By how much a stamp has moved against the recorder's clock."""
+    usual = 0 if last is None else last.stamp - last.recorded
+    return abs(frame.stamp - frame.recorded - usual)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a sequence.
+
+    Attributes
+    ----------
+    start, stop : float
+        Seconds since the first scan; those in [start, stop) belong to it.
+    stride : int
+        Every how many of them.
+    """
+
+    start: float = 0.0
+    stop: float | None = None
+    stride: int = 1
+
+    def of(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """The frames in it; their stamps strictly increase."""
+        first, number = None, 0
+        for frame in frames:
+            first = frame.stamp if first is None else first
+            seconds = (frame.stamp - first) * 1e-9
+            if self.stop is not None and seconds >= self.stop:
+                return
+            if seconds >= self.start:
+                if number % self.stride == 0:
+                    yield frame
+                number += 1
+
+    def __str__(self) -> str:
+        stop = "the end" if self.stop is None else f"{self.stop:g} s"
+        return f"between start = {self.start:g} s and stop = {stop}"
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceSettings:
+    """Where reference poses come from and how they become those of the LiDAR.
+
+    Attributes
+    ----------
+    source : str or Path, optional
+        A topic or a file; what the recording brings along when left out.
+    child_frame : str, optional
+        On a topic of transforms, the frame whose poses to take.
+    T_reference_sensor : ndarray of shape (4, 4), optional
+        The LiDAR's pose in the frame that the poses are of.
+    clock_offset : float
+        Seconds to add to the poses' stamps.
+    max_gap : float
+        Seconds; between poses further apart nothing is known.
+    """
+
+    source: str | Path | None = None
+    child_frame: str | None = None
+    T_reference_sensor: Poses | None = None
+    clock_offset: float = 0.0
+    max_gap: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSettings:
+    """Which IMU, and how its measurements become SI units.
+
+    Attributes
+    ----------
+    topic : str, optional
+        The only one when left out.
+    T_sensor_imu : ndarray of shape (4, 4), optional
+        The IMU's pose in the LiDAR's frame.
+    scale : float
+        Metres per second squared in a unit of its accelerometer.
+    """
+
+    topic: str | None = None
+    T_sensor_imu: Poses | None = None
+    scale: float = 1.0
+
+
+_WHOLE = Section()
+_OWN = ReferenceSettings()
+
+
+class RecordedSequence:
+    """A part of a recording, with its reference.
+
+    Parameters
+    ----------
+    source
+        The recording.
+    section
+        Which part of it.
+    reference, imu
+        Where its motion is told; no IMU when left out.
+    key
+        Under which the decoded scans are kept on disk; not at all when left out.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        section: Section = _WHOLE,
+        reference: ReferenceSettings = _OWN,
+        imu: ImuSettings | None = None,
+        key: str | None = None,
+    ):
+        self.source, self.section, self.key = source, section, key
+        self._reference, self._imu = reference, imu
+
+    @property
+    def name(self) -> str:
+        """The recording's file."""
+        return self.source.name
+
+    @property
+    def n_messages(self) -> int:
+        """Scans in the recording, over the stride."""
+        return -(-self.source.n_messages // self.section.stride)
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Read the scans one after the other.
+
+        Scans whose stamps do not come after the one before are left out, counted, and reported in
+        the log.
+
+        Raises
+        ------
+        SequenceError
+            Naming the message that cannot be decoded, or if the section holds no scan.
+        """
+        repairs = Repairs()
+        if self.key is None:
+            yield from self._decode(repairs)
+        elif (kept := cache.find(self.key)) is not None:
+            yield from kept
+            repairs.counts = kept.about["left_out"]
+        else:
+            about = self.source.about() | {"left_out": repairs.counts}
+            yield from cache.tee(self._decode(repairs), self.key, about)
+        repairs.report(self.name)
+
+    def _decode(self, repairs: Repairs) -> Iterator[Scan]:
+        last = None
+        for frame in self.section.of(in_order(self.source.frames(), repairs)):
+            scan = frame.load()
+            if last is not None and scan.stamp <= last:
+                repairs.add(BACKWARD)
+                continue
+            last = scan.stamp
+            yield scan
+        if last is None:
+            raise SequenceError(f"{self.name}: no scan {self.section}")
+
+    def backward(self) -> Iterator[Scan]:
+        """Read the scans, the last one first; a bag is decoded to the cache before.
+
+        Raises
+        ------
+        SequenceError
+            If a bag is not kept in the cache, or does not fit.
+        """
+        if self.source.random_access:
+            frames = list(self.section.of(in_order(self.source.frames(), Repairs())))
+            yield from (frame.load() for frame in reversed(frames))
+            return
+        if self.key is not None and cache.find(self.key) is None:
+            for _ in self:
+                pass
+        kept = None if self.key is None else cache.find(self.key)
+        if kept is None:
+            raise SequenceError(
+                f"{self.name}: to be read backwards it must be kept decoded: leave `cache` on, and "
+                f"let the cache grow (ADAPTUNE_CACHE_GB) where it is too small"
+            )
+        yield from (kept[i] for i in reversed(range(len(kept))))
+
+    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Recordings are played as they were recorded."""
+        return stamps
+
+    def imu(self) -> Imu | None:
+        """Measurements of the IMU in SI units, if one is set.
+
+        Raises
+        ------
+        SequenceError
+            If its topic cannot be read.
+        """
+        if self._imu is None:
+            return None
+        imu = self.source.imu(self._imu.topic)
+        if imu is None:
+            return None
+        T = imu.T_sensor_imu if self._imu.T_sensor_imu is None else self._imu.T_sensor_imu
+        return replace(imu, acceleration=imu.acceleration * self._imu.scale, T_sensor_imu=T)
+
+    def reference(self) -> Trajectory | None:
+        """Poses of the LiDAR, if they are known.
+
+        Raises
+        ------
+        SequenceError
+            If they cannot be read, or say nothing about the time of the scans.
+        """
+        settings = self._reference
+        if isinstance(settings.source, Path):
+            trajectory: Trajectory | None = self._from_file(settings.source)
+        else:
+            trajectory = self.source.poses(settings.source, settings.child_frame)
+        if trajectory is None:
+            return None
+        T = trajectory.T_world_sensor
+        if settings.T_reference_sensor is not None:
+            T = T @ settings.T_reference_sensor
+        stamps = trajectory.stamps + round(settings.clock_offset * 1e9)
+        trajectory = Trajectory(stamps, T, settings.max_gap)
+        self._check(trajectory)
+        return trajectory
+
+    def _from_file(self, path: Path) -> Trajectory:
+        try:
+            if not is_kitti(path):
+                return read_trajectory(path)
+            poses = read_kitti(path)
+        except TrajectoryError as error:
+            raise SequenceError(str(error)) from error
+        stamps = np.array([frame.stamp for frame in self.source.frames()], np.int64)
+        if len(stamps) != len(poses):
+            raise SequenceError(
+                f"{path}: {len(poses)} poses without stamps do not go with {len(stamps)} scans "
+                f"of {self.name}; give a file with stamps (TUM)"
+            )
+        order = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1) > 0)
+        return Trajectory(stamps[order], poses[order])
+
+    def _check(self, trajectory: Trajectory) -> None:
+        span = self.source.span()
+        if span is None:
+            return
+        begin, end = trajectory.stamps[0], trajectory.stamps[-1]
+        if begin <= span[1] and end >= span[0]:
+            _warn_of_jumps(self.name, trajectory)
+            return
+        raise SequenceError(
+            f"{self.name}: the reference tells of {_seconds(begin, end)}, the scans are of "
+            f"{_seconds(*span)}: set `clock_offset` to the seconds to add to the reference's "
+            f"stamps{self._proposal(trajectory)}"
+        )
+
+    def _proposal(self, trajectory: Trajectory) -> str:
+        """What the gyroscope says of the offset, where it says anything."""
+        try:
+            imu = self.source.imu(None if self._imu is None else self._imu.topic)
+        except AdaptuneError:
+            imu = None
+        if imu is not None and (found := clock_offset(trajectory, imu)) is not None:
+            return f" (the gyroscope tells the same motion with clock_offset: {found:.3f})"
+        return ""
+
+
+def _seconds(begin: int, end: int) -> str:
+    return f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s"
+
+
+def _warn_of_jumps(name: str, trajectory: Trajectory) -> None:
+    steps = geometry.steps(trajectory.T_world_sensor)[:, :3, 3]
+    seconds = np.diff(trajectory.stamps) * 1e-9
+    jumps = np.flatnonzero(np.linalg.norm(steps, axis=1) > _FASTEST * np.maximum(seconds, 1e-3))
+    if len(jumps):
+        _log.warning(
+            "%s: the reference jumps %d times, first at %.3f s, faster than %g m/s",
+            name,
+            len(jumps),
+            trajectory.stamps[jumps[0] + 1] * 1e-9,
+            _FASTEST,
+        )

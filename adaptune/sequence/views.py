@@ -1,0 +1,283 @@
+"""Views of a sequence: parts, losses, speeds and disturbances, without a copy of its clouds.
+
+What a view does to a scan depends on the scan and the view's seed alone, so the same scans are
+lost and the same noise is added in every process, in either direction, whatever was cut before.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import geometry
+from adaptune.geometry import Poses
+from adaptune.sequence.imu import Imu
+from adaptune.sequence.scan import Scan
+from adaptune.sequence.sequence import Sequence, SequenceError
+from adaptune.trajectory import Trajectory
+
+Part = tuple[float, float | None]
+"""Seconds since the first scan: [start, stop), to the end where stop is None."""
+
+
+class Reversible(Sequence, Protocol):
+    """A sequence that can be read from its end."""
+
+    def backward(self) -> Iterator[Scan]:
+        """Read the scans, the last one first."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A sequence of which every scan is changed or left out by itself.
+
+    Attributes
+    ----------
+    inner : Reversible
+        What it is a view of.
+    change : callable
+        Gives the scan as seen, or None to leave it out.
+    of_reference, of_imu, of_clock : callable
+        What the view does to poses, to measurements and to the time of arrival.
+    """
+
+    inner: Reversible
+    change: Callable[[Scan], Scan | None] = lambda scan: scan
+    of_reference: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
+    of_imu: Callable[[Imu], Imu] = lambda imu: imu
+    of_clock: Callable[[NDArray[np.int64]], NDArray[np.int64]] = lambda stamps: stamps
+
+    @property
+    def name(self) -> str:
+        """The recording's file."""
+        return self.inner.name
+
+    @property
+    def n_messages(self) -> int:
+        """At least as many as there are scans."""
+        return self.inner.n_messages
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Read the scans.
+
+        Raises
+        ------
+        SequenceError
+            If the view leaves none.
+        """
+        return self._changed(self.inner)
+
+    def backward(self) -> Iterator[Scan]:
+        """Read the scans, the last one first."""
+        return self._changed(self.inner.backward())
+
+    def _changed(self, scans: Iterable[Scan]) -> Iterator[Scan]:
+        none = True
+        for scan in scans:
+            seen = self.change(scan)
+            if seen is not None:
+                none = False
+                yield seen
+        if none:
+            raise SequenceError(f"{self.name}: its views leave no scan")
+
+    def reference(self) -> Trajectory | None:
+        """Poses of the LiDAR as seen."""
+        trajectory = self.inner.reference()
+        return None if trajectory is None else self.of_reference(trajectory)
+
+    def imu(self) -> Imu | None:
+        """Measurements of the IMU as seen."""
+        imu = self.inner.imu()
+        return None if imu is None else self.of_imu(imu)
+
+    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """When what was measured at `stamps` arrives."""
+        return self.of_clock(self.inner.played_at(stamps))
+
+
+class _First:
+    """Stamp of the first scan, read when it is wanted."""
+
+    def __init__(self, sequence: Sequence):
+        self._sequence = sequence
+
+    @cached_property
+    def stamp(self) -> int:
+        return next(iter(self._sequence)).stamp
+
+    def within(self, stamp: int, part: Part) -> bool:
+        seconds = (stamp - self.stamp) * 1e-9
+        start, stop = part
+        return seconds >= start and (stop is None or seconds < stop)
+
+
+def cut(sequence: Reversible, parts: Items[Part]) -> View:
+    """Only these parts of it; stamps stay as they are."""
+    first = _First(sequence)
+    return View(
+        sequence,
+        lambda scan: scan if any(first.within(scan.stamp, part) for part in parts) else None,
+    )
+
+
+def drop(sequence: Reversible, share: float, part: Part, seed: int) -> View:
+    """Lose a share of the scans of a part; each is lost by its own luck."""
+    first = _First(sequence)
+
+    def lose(scan: Scan) -> Scan | None:
+        lost = first.within(scan.stamp, part) and _rng(seed, scan).random() < share
+        return None if lost else scan
+
+    return View(sequence, lose)
+
+
+def speed(sequence: Reversible, factor: float, part: Part) -> View:
+    """A part of it arrives `factor` times faster.
+
+    Scans, stamps and poses are as they were: only `played_at` tells of it, for odometries that
+    run against the clock.
+    """
+    first = _First(sequence)
+
+    def arrival(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        start = first.stamp + round(part[0] * 1e9)
+        # What is later than any stamp can still be subtracted from.
+        stop = 2**62 if part[1] is None else first.stamp + round(part[1] * 1e9)
+        inside = np.clip(stamps, start, stop) - start
+        saved: NDArray[np.int64] = np.rint(inside * (1.0 - 1.0 / factor)).astype(np.int64)
+        return stamps - saved
+
+    return View(sequence, of_clock=arrival)
+
+
+def thin_rings(sequence: Reversible, every: int) -> View:
+    """Keep one ring in `every`, as a LiDAR with fewer lasers sees.
+
+    Raises
+    ------
+    SequenceError
+        While reading, if the points have no rings.
+    """
+
+    def thin(scan: Scan) -> Scan:
+        if scan.rings is None:
+            if not len(scan):
+                return scan
+            raise SequenceError(
+                f"{sequence.name}: its points have no ring, so none can be left out"
+            )
+        return scan.select(scan.rings % every == 0)
+
+    return View(sequence, thin)
+
+
+def add_noise(sequence: Reversible, sigma: float, seed: int) -> View:
+    """Move every point along its ray by a normal error of `sigma` metres."""
+
+    def disturb(scan: Scan) -> Scan:
+        ranges = np.linalg.norm(scan.points, axis=1)
+        error = _rng(seed, scan).normal(0.0, sigma, len(scan)).astype(np.float32)
+        # A point does not come out behind the sensor.
+        scale = np.maximum(1.0 + error / ranges, 1e-3)
+        return replace(scan, points=scan.points * scale[:, None])
+
+    return View(sequence, disturb)
+
+
+def transform(sequence: Reversible, T_seen_sensor: Poses) -> View:
+    """See it from another frame, as if the LiDAR were mounted differently."""
+    R = T_seen_sensor[:3, :3].astype(np.float32)
+    t = T_seen_sensor[:3, 3].astype(np.float32)
+    T_sensor_seen = geometry.invert(T_seen_sensor)
+    return View(
+        sequence,
+        lambda scan: replace(scan, points=scan.points @ R.T + t),
+        lambda poses: replace(poses, T_world_sensor=poses.T_world_sensor @ T_sensor_seen),
+        lambda imu: replace(imu, T_sensor_imu=T_seen_sensor @ imu.T_sensor_imu),
+    )
+
+
+class Reversed:
+    """A sequence played backwards: what was last comes first, and time still goes forward.
+
+    Parameters
+    ----------
+    inner
+        What to reverse.
+    """
+
+    def __init__(self, inner: Reversible):
+        self.inner = inner
+
+    @property
+    def name(self) -> str:
+        """The recording's file."""
+        return self.inner.name
+
+    @property
+    def n_messages(self) -> int:
+        """At least as many as there are scans."""
+        return self.inner.n_messages
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Read the scans."""
+        return map(self._mirror, self.inner.backward())
+
+    def backward(self) -> Iterator[Scan]:
+        """Read the scans, the last one first."""
+        return map(self._mirror, self.inner)
+
+    @cached_property
+    def _sum(self) -> int:
+        """What a moment and its mirror image add up to."""
+        first, last = next(iter(self.inner)), next(self.inner.backward())
+        return first.stamp + last.stamp + _span(last)
+
+    def _mirror(self, scan: Scan) -> Scan:
+        span = _span(scan)
+        times = None if scan.times is None else np.float32(span * 1e-9) - scan.times
+        return replace(
+            scan,
+            stamp=self._sum - scan.stamp - span,
+            times=None if times is None else np.maximum(times, np.float32(0.0)),
+        )
+
+    def reference(self) -> Trajectory | None:
+        """Poses of the LiDAR in mirrored time."""
+        trajectory = self.inner.reference()
+        if trajectory is None:
+            return None
+        stamps = (self._sum - trajectory.stamps)[::-1]
+        return replace(trajectory, stamps=stamps, T_world_sensor=trajectory.T_world_sensor[::-1])
+
+    def imu(self) -> Imu | None:
+        """Measurements in mirrored time: it turns the other way, and accelerates the same."""
+        imu = self.inner.imu()
+        if imu is None:
+            return None
+        return replace(
+            imu,
+            stamps=(self._sum - imu.stamps)[::-1],
+            angular_velocity=-imu.angular_velocity[::-1],
+            acceleration=imu.acceleration[::-1],
+        )
+
+    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """When what was measured at `stamps` arrives."""
+        mirrored: NDArray[np.int64] = self._sum - self.inner.played_at(self._sum - stamps)
+        return mirrored
+
+
+def _span(scan: Scan) -> int:
+    """Nanoseconds from a scan's first point to its last."""
+    return round(float(scan.times.max()) * 1e9) if scan.times is not None and len(scan) else 0
+
+
+def _rng(seed: int, scan: Scan) -> np.random.Generator:
+    return np.random.default_rng([seed, scan.stamp % 2**64])

@@ -1,0 +1,208 @@
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+from rosbags import rosbag1
+from rosbags.typesys import Stores, get_typestore
+
+from adaptune import yaml
+from adaptune.inspect import (
+    inspect,
+    inspection_text,
+    render_cache,
+    write_inspection_png,
+)
+from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
+
+STORE = get_typestore(Stores.ROS1_NOETIC)
+START = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(autouse=True)
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ADAPTUNE_CACHE", str(tmp_path / "cache"))
+
+
+def header(stamp: int) -> Any:
+    time = STORE.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+    return STORE.types["std_msgs/msg/Header"](0, time, "lidar")
+
+
+def cloud(stamp: int, n: int = 200) -> Any:
+    raw = np.zeros((n, 4), "<f4")
+    raw[:, :3] = np.random.default_rng(0).normal(0, 10, (n, 3))
+    raw[:5] = np.nan
+    raw[5:, 3] = np.linspace(0, 0.1, n - 5)
+    field = STORE.types["sensor_msgs/msg/PointField"]
+    fields = [field(name, 4 * i, 7, 1) for i, name in enumerate(("x", "y", "z", "time"))]
+    data = raw.view(np.uint8).ravel()
+    return STORE.types["sensor_msgs/msg/PointCloud2"](
+        header(stamp), 1, n, fields, False, 16, 16 * n, data, True
+    )
+
+
+def pose(stamp: int, x: float) -> Any:
+    types = STORE.types
+    return types["geometry_msgs/msg/PoseStamped"](
+        header(stamp),
+        types["geometry_msgs/msg/Pose"](
+            types["geometry_msgs/msg/Point"](x, 0, 0),
+            types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1),
+        ),
+    )
+
+
+def write(path: Path, messages: list[tuple[str, int, Any]]) -> Path:
+    with rosbag1.Writer(path) as writer:
+        topics: dict[str, Any] = {}
+        for topic, recorded, message in messages:
+            kind = message.__msgtype__
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(topics[topic], recorded, STORE.serialize_ros1(message, kind))
+    return path
+
+
+def drive(path: Path, stamps: list[float], poses: list[tuple[float, float]]) -> Path:
+    messages: list[tuple[str, int, Any]] = [
+        ("/points", START + i * 10**8, cloud(START + round(s * 1e9))) for i, s in enumerate(stamps)
+    ]
+    messages += [("/poses", START, pose(START + round(s * 1e9), x)) for s, x in poses]
+    return write(path, messages)
+
+
+def entry(inspection: Any) -> dict[str, SequenceConfig]:
+    """The proposed entry, read back as a study would."""
+    data = yaml.Document(inspection.entry).data["sequences"]
+    return TypeAdapter(dict[str, SequenceConfig]).validate_python(data)
+
+
+def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path: Path) -> None:
+    seconds = [0.1 * i for i in range(10)]
+    bag = drive(tmp_path / "my drive.bag", seconds, [(s, s) for s in seconds])
+    inspection = inspect(bag)
+    points = next(topic for topic in inspection.topics if topic.name == "/points")
+    assert points.count == 10
+    assert points.rate == pytest.approx(10)
+    assert points.gap == pytest.approx(0.1)
+    assert inspection.layout[3] == ("time", "float32", 12)
+    assert inspection.scan is not None
+    assert len(inspection.scan.scan) == 195
+    assert inspection.scan.recorded == 200
+    assert inspection.scan.span == pytest.approx(0.1)
+    assert inspection.problems == ()
+    assert not inspection.missing["offline"]
+    assert inspection.missing["motion compensation"] == ("an IMU",)
+    ((name, config),) = entry(inspection).items()
+    assert name == "my_drive"
+    sequence = open_sequence(config)
+    assert len(list(sequence)) == 10
+    assert sequence.reference() is not None
+    text = inspection_text(inspection)
+    for expected in ("/points", "195 points of 200", "10.00 Hz", "0.9 m in 0.9 s", str(bag)):
+        assert expected in text.replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    ("stamps", "poses", "told"),
+    [
+        ([0, 0.1, 0.1, 0.3], [], "/points: 1 stamps repeat the one before"),
+        ([0, 0.2, 0.1, 0.3], [], "/points: 1 stamps go back in time"),
+        ([0, 0.1, 0.2, 2.3, 2.4], [], "/points: 1 gaps, the longest of 2.10 s"),
+        ([-100.0, -99.9, -99.8], [], "/points: its clock is 100.000 s behind the recorder's"),
+        ([0, 0.1, 90, 0.3], [], "/points: 1 stamps leap by more than 5 s"),
+        ([0, 0.1], [(0, 0), (0.1, 0), (0.2, 1)], "repeats the pose before it 1 times"),
+        ([0, 0.1], [(0, 0), (0.1, 500)], "the reference jumps 1 times"),
+        ([0, 0.1], [(0, 0), (5, 1)], "the reference has 1 gaps beyond 1 s, the longest of 5.00 s"),
+        ([0, 0.1], [(0, 0)], "the reference holds a single pose"),
+        ([0, 0.1], [(50, 0), (60, 0)], "set `clock_offset`"),
+    ],
+)
+def test_oddities_are_told(
+    tmp_path: Path, stamps: list[float], poses: list[tuple[float, float]], told: str
+) -> None:
+    inspection = inspect(drive(tmp_path / "a.bag", stamps, poses))
+    assert any(told in problem for problem in inspection.problems), inspection.problems
+    assert told[:20] in inspection_text(inspection, width=1000)
+
+
+def test_what_is_missing_is_told(tmp_path: Path) -> None:
+    inspection = inspect(write(tmp_path / "a.bag", [("/poses", START, pose(START, 0))]))
+    assert inspection.missing["online"] == ("point clouds that can be read",)
+    assert inspection.scan is None
+    with pytest.raises(SequenceError, match="no scan can be drawn"):
+        write_inspection_png(inspection, tmp_path / "a.png")
+    inspection_text(inspection)
+
+
+def test_a_cloud_that_cannot_be_decoded_is_a_problem_not_a_crash(tmp_path: Path) -> None:
+    broken = cloud(START)
+    broken.fields = broken.fields[:2]
+    inspection = inspect(write(tmp_path / "a.bag", [("/points", START, broken)]))
+    assert inspection.scan is None
+    assert any("no field z; there is x, y" in problem for problem in inspection.problems)
+
+
+def test_files_that_are_no_recording_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("text")
+    for path, message in [
+        (tmp_path / "none.bag", "there is no such file or folder"),
+        (tmp_path / "a.txt", "not a bag"),
+        (tmp_path, "holds no scan"),
+    ]:
+        with pytest.raises(SequenceError, match=message):
+            inspect(path)
+
+
+def test_folders_are_inspected_too(tmp_path: Path) -> None:
+    for i in range(4):
+        np.save(tmp_path / f"{i}.npy", np.ones((10, 3), np.float32) * (i + 1))
+    inspection = inspect(tmp_path)
+    assert inspection.topics[0].count == 4
+    assert inspection.topics[0].rate == pytest.approx(10)
+    assert not inspection.problems
+    assert len(list(open_sequence(next(iter(entry(inspection).values()))))) == 4
+
+
+def test_the_picture_is_one(tmp_path: Path) -> None:
+    write_inspection_png(inspect(drive(tmp_path / "a.bag", [0, 0.1], [])), tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag", ".png"]
+
+
+def test_the_cache_is_told(tmp_path: Path) -> None:
+    from rich.console import Console
+
+    bag = drive(tmp_path / "a.bag", [0, 0.1], [])
+    list(open_sequence(SequenceConfig(bag=str(bag))))
+    console = Console(width=500)
+    with console.capture() as capture:
+        console.print(render_cache())
+    assert str(bag) in capture.get()
+    assert "GB of at most" in capture.get()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("botanic_garden_scan.bag", SimpleNamespace(points=24_859, rings=16, reference=False)),
+        ("hilti_2022_scan.bag", SimpleNamespace(points=57_456, rings=32, reference=False)),
+        ("hall.bag", SimpleNamespace(points=36_726, rings=None, reference=True)),
+        ("street.bag", SimpleNamespace(points=21_658, rings=32, reference=False)),
+    ],
+)
+def test_recorded_data(name: str, expected: Any) -> None:
+    folder = os.environ.get("ADAPTUNE_TEST_DATA")
+    if not folder:
+        pytest.skip("ADAPTUNE_TEST_DATA is not set: no recorded data to read")
+    inspection = inspect(Path(folder) / name)
+    assert inspection.scan is not None
+    assert len(inspection.scan.scan) == expected.points
+    assert inspection.scan.rings == expected.rings
+    assert (inspection.reference is not None) == expected.reference
+    assert not inspection.problems
+    open_sequence(next(iter(entry(inspection).values())))
