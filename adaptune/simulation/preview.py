@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -59,7 +60,7 @@ class Preview:
         if self._scan is not None and len(self._scan):
             points = self._scan.points
             away = np.linalg.norm(points, axis=1)
-            look = {"c": away, "cmap": "turbo_r", "vmin": 0.0, "vmax": min(60.0, away.max())}
+            look = {"c": away, "cmap": "turbo_r", "norm": LogNorm(1.0, 80.0)}
             panel = panels["scan"]
             panel.scatter(points[:, 0], points[:, 1], s=0.4, linewidths=0, **look)
             span = np.percentile(np.abs(points[:, :2]).max(axis=1), 97)
@@ -68,7 +69,7 @@ class Preview:
             panel = panels["panorama"]
             azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
             elevation = np.degrees(np.arcsin(points[:, 2] / away))
-            drawn = panel.scatter(azimuth, elevation, s=2.5, marker="s", linewidths=0, **look)
+            drawn = panel.scatter(azimuth, elevation, s=9.0, marker="s", linewidths=0, **look)
             panel.set(
                 xlim=(180, -180), facecolor="black", title="the same scan as the sensor sees it"
             )

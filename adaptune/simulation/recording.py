@@ -4,7 +4,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,11 @@ from adaptune import geometry
 from adaptune.files import replacing, write_text
 from adaptune.simulation.course import Course, SimulationError
 from adaptune.simulation.imu import Inertial, measure
-from adaptune.simulation.preview import Preview
 from adaptune.simulation.simulate import Drive, SimulatedScan
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
+
+if TYPE_CHECKING:
+    from adaptune.simulation.preview import Preview
 
 Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
@@ -74,6 +76,9 @@ def record(
     SimulationError
         If there is something at `path` or beside it that is not to be replaced.
     """
+    # matplotlib takes a second to import, which who only describes a course need not spend.
+    from adaptune.simulation.preview import Preview
+
     path = Path(path)
     layout = _layout(path) if layout is None else layout
     stem = path.name if layout in _MARKS else path.stem
@@ -117,7 +122,9 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
         raise SimulationError(f"{path} is a file where a folder shall be written: it stays")
 
 
-def _watched(drive: Drive, preview: Preview, progress: Progress | None) -> Iterator[SimulatedScan]:
+def _watched(
+    drive: Drive, preview: "Preview", progress: Progress | None
+) -> Iterator[SimulatedScan]:
     for number, scan in enumerate(drive.scans(), start=1):
         preview.add(scan)
         yield scan

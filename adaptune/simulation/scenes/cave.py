@@ -35,7 +35,7 @@ def _rooms(s: Floats, seed: int) -> Floats:
     share = np.ones_like(s)
     for n in range(int(np.floor(s.min() / _ROOMS)) - 1, int(np.floor(s.max() / _ROOMS)) + 2):
         rng = np.random.default_rng([seed, 32, n + 1000])
-        middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.45, 0.75)
+        middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.5, 0.8)
         share = np.minimum(
             share, 1.0 - rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4))
         )
@@ -47,13 +47,13 @@ def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
     room = _rooms(s, seed)
     half = 1.0 + room * (2.4 + 0.8 * fractal(along, 9.0, seed + 21).reshape(s.shape))
-    roof = 1.6 + room * (1.2 + 0.9 * fractal(along, 13.0, seed + 22).reshape(s.shape))
+    roof = 1.7 + room * (1.2 + 0.9 * fractal(along, 13.0, seed + 22).reshape(s.shape))
     lean = 0.9 * room * fractal(along, 7.0, seed + 23).reshape(s.shape)
     chamber = room * _chambers(s, angle, seed)
     d, z = (half + chamber) * np.cos(angle), roof * np.sin(angle)
     # Metre-scale bumps, which tell one stretch of wall from the next; a robot fits through.
     places = np.stack(np.broadcast_arrays(s, d, z), axis=-1).reshape(-1, 3)
-    bumps = fractal(places, 2.6, seed + 24, 2).reshape(d.shape) * (0.15 + 0.65 * room)
+    bumps = fractal(places, 2.6, seed + 24, 2).reshape(d.shape) * (0.12 + 0.68 * room)
     return lean + d + bumps * np.cos(angle), z + bumps * np.sin(angle)
 
 
@@ -119,7 +119,7 @@ def _dripstones(tile: Tile) -> list[Mesh]:
 
 def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
     """Let dripstones grow together to columns, which hide what lies behind."""
-    s, d = tile.scatter(0.10, 1.2, 3.6, margin=2.0)
+    s, d = tile.scatter(0.12, 1.6, 3.8, margin=2.0)
     at, n = tile.at(s, d), len(s)
     radius = tile.rng.uniform(0.25, 0.6, n)
     lower = place(cone, at, 0.0, np.column_stack([radius, radius, np.full(n, 2.6)]))

@@ -7,7 +7,7 @@ from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, paved
 
 _HALF, _HEIGHT = 1.5, 2.8
-_DOOR, _RECESS = 1.0, 0.22
+_DOOR, _RECESS = 1.0, 0.35
 
 
 def _relief(spots: Spots, seed: int) -> Floats:  # noqa: ARG001 - a floor is flat, whatever the seed
@@ -36,11 +36,17 @@ def _build(tile: Tile) -> list[Mesh]:
             middle = door + _DOOR / 2
             at = tile.at(middle, side * (_HALF + _RECESS / 2))
             meshes.append(place(merge([lintel, handle]), at, tile.heading(middle)))
+        # Pilasters between the doors, not quite evenly.
+        for station in np.arange(np.ceil(tile.start / 4.5), tile.stop / 4.5) * 4.5:
+            pilaster = box((rng.uniform(0.3, 0.6), 0.25, _HEIGHT), Material.PLASTER)
+            s_pilaster = station + rng.uniform(-0.8, 0.8)
+            at = tile.at(s_pilaster, side * (_HALF - 0.12))
+            meshes.append(place(pilaster, at, tile.heading(s_pilaster)))
     # Beams under the ceiling, extinguishers, and a cupboard now and then.
     for station in np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0:
         beam = box((0.25, 2 * _HALF, 0.22), Material.PLASTER, (0.0, 0.0, _HEIGHT - 0.22))
         meshes.append(place(beam, tile.at(station, 0.0), tile.heading(station)))
-    for size, chance in (((0.18, 0.18, 0.6), 0.6), ((0.9, 0.4, 1.9), 0.5), ((0.4, 0.35, 0.7), 0.5)):
+    for size, chance in (((0.18, 0.18, 0.6), 0.6), ((0.9, 0.4, 1.9), 0.8), ((0.4, 0.35, 0.7), 0.8)):
         if rng.random() < chance:
             station, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
             at = tile.at(station, side * (_HALF - size[1] / 2))

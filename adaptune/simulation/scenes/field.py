@@ -11,13 +11,13 @@ from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, 
 def _relief(spots: Spots, seed: int) -> Floats:
     clods = fractal_plane(spots.x, spots.y, 6.0, seed + 51, 4)
     swell = fractal_plane(spots.x, spots.y, 28.0, seed + 52, 2)
-    return 0.04 * clods + beyond(spots.d, 1.2, 3.0) * (0.4 * clods + 1.2 * swell)
+    return 0.04 * clods + beyond(spots.d, 1.2, 3.0) * (0.55 * clods + 1.2 * swell)
 
 
 def _build(tile: Tile) -> list[Mesh]:
     rng = tile.rng
     boulders = [parts.boulder(v) for v in range(parts.VARIANTS)]
-    s, d = tile.scatter(0.0008, 4.0, 50.0, margin=3.0)
+    s, d = tile.scatter(0.002, 4.0, 50.0, margin=3.0)
     meshes = [parts.strew(tile, boulders, s, d, rng.uniform(0.25, 0.6, len(s)))]
     post = merge(
         [box((0.12, 0.12, 1.5), Material.WOOD), box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))]

@@ -25,16 +25,16 @@ def _build(tile: Tile) -> list[Mesh]:
     trees = [parts.tree(v) for v in range(parts.VARIANTS)]
     meshes = []
     for models, density, near, far, sizes in (
-        (boulders, 0.006, 4.0, 60.0, (0.3, 1.3)),
-        (bushes, 0.007, 4.0, 60.0, (0.6, 1.6)),
-        (trees, 0.0006, 15.0, 50.0, (0.7, 1.2)),
+        (boulders, 0.010, 4.0, 60.0, (0.3, 1.3)),
+        (bushes, 0.010, 4.0, 60.0, (0.6, 1.6)),
+        (trees, 0.0020, 12.0, 50.0, (0.7, 1.2)),
         (trees, 0.004, 50.0, 75.0, (0.8, 1.4)),
     ):
         s, d = tile.scatter(density, near, far, margin=4.0)
         meshes.append(parts.strew(tile, models, s, d, rng.uniform(*sizes, len(s))))
-    if rng.random() < 0.12:
+    if rng.random() < 0.45:
         s = rng.uniform(tile.start, tile.stop, 1)
-        d = rng.choice([-1.0, 1.0], 1) * rng.uniform(28.0, 45.0)
+        d = rng.choice([-1.0, 1.0], 1) * rng.uniform(22.0, 40.0)
         shed = merge(
             [
                 box((12.0, 7.0, 3.6), Material.WOOD),

@@ -101,7 +101,7 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
     slots = np.arange(tile.start + 3.0, tile.stop - 2.0, 5.6)
     if crossing:
         slots = slots[np.abs(slots - (tile.index + 0.5) * 20.0) > 9.0]
-    slots = slots[rng.random(len(slots)) < 0.4] + rng.uniform(-0.3, 0.3)
+    slots = slots[rng.random(len(slots)) < 0.35] + rng.uniform(-0.3, 0.3)
     if len(slots):
         at = tile.at(slots, side * (_KERB - 1.05 + rng.uniform(-0.1, 0.1, len(slots))))
         scale = rng.uniform(0.9, 1.12, (len(slots), 3)) * [1.0, 1.0, rng.choice([1.0, 1.25])]

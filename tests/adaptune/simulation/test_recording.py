@@ -1,0 +1,199 @@
+import itertools
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from adaptune.geometry import invert, rotation_angle, steps
+from adaptune.sequence.config import SequenceConfig, open_sequence
+from adaptune.simulation import Course, SimulationError, record, simulate
+from adaptune.simulation.recording import CLOUD, undistort
+from adaptune.simulation.simulate import Drive
+from adaptune.trajectory import read_kitti, read_tum
+
+COURSE = Course(
+    scenes=("corridor",), length=10.0, sensor="vlp16", columns=60, imu=200, motion="car"
+)
+RECORDINGS = {"ros1": "run.bag", "mcap": "run.mcap", "ros2": "run"}
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return list(simulate(COURSE))
+
+
+@pytest.fixture(scope="module", params=RECORDINGS)
+def recording(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp(request.param) / RECORDINGS[request.param]
+    record(COURSE, path)
+    return path
+
+
+def stamp_ns(header):
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def read(path, topic):
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        return [
+            (t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages(connections)
+        ]
+
+
+def test_clouds_read_back(recording, scans):
+    messages = read(recording, "/velodyne_points")
+    assert len(messages) == len(scans)
+    for (sent, message), scan in zip(messages, scans, strict=True):
+        assert stamp_ns(message.header) == scan.stamp
+        assert sent == scan.stamp + 10**8
+        assert message.header.frame_id == "velodyne"
+        assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
+            *(("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7)),
+            *(("ring", 16, 4), ("time", 18, 7)),
+        ]
+        cloud = message.data.view(CLOUD)
+        assert message.width == len(cloud) == len(scan)
+        np.testing.assert_array_equal(np.stack([cloud[a] for a in "xyz"], 1), scan.points)
+        np.testing.assert_array_equal(cloud["time"], scan.times)
+        np.testing.assert_array_equal(cloud["ring"], scan.rings)
+        np.testing.assert_array_equal(cloud["intensity"], scan.intensities)
+
+
+def test_truth_reads_back(recording, scans):
+    truth = read_tum(recording.with_suffix(".tum"))
+    assert len(truth) == len(scans) + 1
+    messages = read(recording, "/gt_poses")
+    assert [stamp_ns(m.header) for _, m in messages] == truth.stamps.tolist()
+    for i, scan in enumerate(scans):
+        assert truth.stamps[i] == scan.stamp
+        np.testing.assert_allclose(truth.T_world_sensor[i], scan.T_world_sensor, atol=1e-8)
+        p = messages[i][1].pose.position
+        np.testing.assert_array_equal([p.x, p.y, p.z], scan.T_world_sensor[:3, 3])
+
+
+def test_inertial_measurements_read_back(recording, scans):
+    messages = [m for _, m in read(recording, "/imu/data")]
+    stamps = np.array([stamp_ns(m.header) for m in messages])
+    assert stamps[0] == scans[0].stamp
+    assert np.all(np.diff(stamps) == 5_000_000)
+    assert stamps[-1] == scans[-1].stamp + 10**8
+    force = np.array([m.linear_acceleration.z for m in messages])
+    np.testing.assert_allclose(force.mean(), 9.8, atol=0.1)
+    assert messages[0].orientation_covariance[0] == -1.0
+
+
+def test_a_preview_lies_beside(recording):
+    assert recording.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    assert len(list(recording.parent.iterdir())) == 3
+
+
+@pytest.mark.parametrize("stamp", ["start", "end"])
+def test_the_reader_of_sequences_takes_it(tmp_path, scans, stamp):
+    path = tmp_path / "run.bag"
+    record(COURSE.model_copy(update={"stamp": stamp}), path)
+    config = {"bag": str(path), "reference": "/gt_poses", "cache": False}
+    sequence = open_sequence(SequenceConfig.model_validate(config))
+    for found, scan in zip(sequence, scans, strict=True):
+        assert abs(found.stamp - scan.stamp) < 1_000_000
+        np.testing.assert_array_equal(found.points, scan.points)
+        drift = (found.stamp - scan.stamp) * 1e-9
+        np.testing.assert_allclose(found.times + drift, scan.times, atol=1e-6)
+    reference = sequence.reference().at(np.array([scan.stamp for scan in scans]))
+    np.testing.assert_allclose(reference, [s.T_world_sensor for s in scans], atol=1e-9)
+
+
+def test_headers_can_mark_the_end(tmp_path, scans):
+    path = tmp_path / "run.bag"
+    record(COURSE.model_copy(update={"stamp": "end"}), path)
+    for (_, message), scan in zip(read(path, "/velodyne_points"), scans, strict=True):
+        assert stamp_ns(message.header) == scan.stamp + 10**8
+        times = message.data.view(CLOUD)["time"]
+        np.testing.assert_allclose(times, scan.times - 0.1, atol=1e-7)
+
+
+def test_kitti_folder(tmp_path, scans):
+    path = tmp_path / "kitti"
+    record(COURSE, path, layout="kitti")
+    sequence = path / "sequences" / "00"
+    clouds = sorted((sequence / "velodyne").iterdir())
+    assert [c.name for c in clouds[:2]] == ["000000.bin", "000001.bin"]
+    assert len(clouds) == len(scans)
+    drive = Drive(COURSE)
+    found = np.fromfile(clouds[3], "<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(found[:, :3], undistort(drive, scans[3]))
+    assert found[:, 3].max() <= 1.0
+    np.testing.assert_allclose(
+        np.loadtxt(sequence / "times.txt"), np.arange(len(scans)) / 10.0, atol=1e-6
+    )
+    rows = dict(line.split(": ") for line in (sequence / "calib.txt").read_text().splitlines())
+    T_camera_lidar = np.eye(4)
+    T_camera_lidar[:3] = np.array(rows["Tr"].split(), float).reshape(3, 4)
+    T = read_kitti(path / "poses" / "00.txt")
+    np.testing.assert_allclose(T[0], np.eye(4), atol=1e-9)
+    lidar = steps(invert(T_camera_lidar) @ T @ T_camera_lidar)
+    truth = steps(np.array([s.T_world_sensor for s in scans]))
+    np.testing.assert_allclose(lidar, truth, atol=1e-6)
+    # A camera looks along z: that is where the robot goes.
+    assert (T[-1, :3, 3] > 5.0).tolist() == [False, False, True]
+    assert rotation_angle(lidar).max() < 0.1
+
+
+def test_undistorted_points_agree_from_scan_to_scan(scans):
+    # The ground under a fast and turning sensor stays where it is.
+    drive = Drive(COURSE)
+    for scan in scans[:3]:
+        points = undistort(drive, scan)
+        assert np.linalg.norm(points - scan.points, axis=1).max() > 0.05
+        early = scan.times < 1e-3
+        np.testing.assert_allclose(points[early], scan.points[early], atol=0.02)
+
+
+def test_what_is_there_is_not_touched_unasked(tmp_path):
+    path = tmp_path / "run.bag"
+    for name in ("run.bag", "run.tum", "run.png"):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(SimulationError, match=f"{name} exists already; give --overwrite"):
+            record(COURSE, path)
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).rename(tmp_path / "kept")
+    (tmp_path / "run.bag").write_text("old")
+    record(COURSE, path, overwrite=True)
+    assert path.stat().st_size > 1000
+
+
+def test_a_folder_of_something_else_stays(tmp_path):
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    (folder / "chapter.tex").write_text("mine")
+    with pytest.raises(SimulationError, match="no recording of this kind: it stays"):
+        record(COURSE, folder, overwrite=True)
+    for _ in range(2):
+        record(COURSE, tmp_path / "run", overwrite=True)
+    assert (folder / "chapter.tex").read_text() == "mine"
+
+
+@pytest.mark.parametrize("layout", ["ros1", "mcap", "ros2", "kitti"])
+def test_nothing_is_left_of_an_interrupted_recording(tmp_path, layout):
+    def interrupt(done, total):
+        assert total == len(Drive(COURSE))
+        if done == 3:
+            raise KeyboardInterrupt
+
+    path = tmp_path / RECORDINGS.get(layout, "kitti")
+    with pytest.raises(KeyboardInterrupt):
+        record(COURSE, path, layout=layout, progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_counts_every_scan(tmp_path, scans):
+    calls = []
+    record(COURSE, tmp_path / "run.bag", progress=lambda *call: calls.append(call))
+    assert calls == [(i + 1, len(scans)) for i in range(len(scans))]
+
+
+def test_recordings_are_deterministic(tmp_path):
+    for name in ("a", "b"):
+        record(COURSE, tmp_path / f"{name}.bag")
+    assert (tmp_path / "a.bag").read_bytes() == (tmp_path / "b.bag").read_bytes()
+    assert all(a == b for a, b in itertools.pairwise(p.read_text() for p in tmp_path.glob("*.tum")))

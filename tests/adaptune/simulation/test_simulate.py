@@ -1,0 +1,156 @@
+import itertools
+
+import numpy as np
+import pytest
+
+from adaptune import open3d
+from adaptune.geometry import invert
+from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg, simulate
+from adaptune.simulation.movers import populate
+from adaptune.simulation.simulate import EPOCH, Drive
+from adaptune.simulation.world import World
+
+
+def course(*scenes, **given):
+    defaults = {"length": 12.0, "sensor": "vlp16", "columns": 300}
+    return Course.model_validate({"scenes": scenes, **defaults, **given})
+
+
+def some(course, n):
+    return list(itertools.islice(simulate(course), n))
+
+
+def surface(drive, station, reach):
+    """Scene in which the distance to the world's surface can be asked for."""
+    o3d = open3d.load()
+    mesh = World(drive.road).around(station, reach)
+    scene = o3d.t.geometry.RaycastingScene()
+    tensor = o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.copy()))
+    return lambda points: scene.compute_distance(tensor(points.astype(np.float32))).numpy()
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    given = course("street", "garden", moving_objects=True, weather="rain", seed=5)
+    for a, b in zip(some(given, 6), some(given, 6), strict=True):
+        assert a.stamp == b.stamp
+        for name in ("points", "times", "intensities", "rings", "T_world_sensor"):
+            assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+    other = some(given.model_copy(update={"seed": 6}), 1)[0]
+    assert other.points.tobytes() != some(given, 1)[0].points.tobytes()
+
+
+def test_scans_say_what_they_hold():
+    given = course("street", rate=20.0)
+    scans = list(simulate(given))
+    assert len(scans) == len(Drive(given))
+    for number, scan in enumerate(scans):
+        assert scan.stamp == EPOCH + number * 50_000_000
+        n = len(scan)
+        assert n > 1000
+        assert scan.points.shape == (n, 3)
+        assert scan.points.dtype == scan.times.dtype == scan.intensities.dtype == np.float32
+        assert scan.rings.dtype == np.uint16
+        assert np.isfinite(scan.points).all()
+        assert np.all(np.diff(scan.times) >= 0.0)
+        assert 0.0 <= scan.times[0] <= scan.times[-1] < 0.05
+        assert scan.intensities.min() >= 0.0
+        assert scan.intensities.max() <= 255.0
+        elevation = np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1))
+        np.testing.assert_allclose(elevation, SENSORS["vlp16"].elevations[scan.rings], atol=1e-5)
+
+
+def test_every_column_is_seen_from_its_own_pose():
+    drive = Drive(course("street", motion="car"))
+    to_surface = surface(drive, 0.0, 150.0)
+    scans = list(itertools.islice(drive.scans(), 4))
+    T = np.array(
+        [drive.ride.poses((scan.stamp - EPOCH) * 1e-9 + scan.times) for scan in scans[-1:]]
+    )
+    points = scans[-1].points.astype(float)
+    moving = np.einsum("nij,nj->ni", T[0][:, :3, :3], points) + T[0][:, :3, 3]
+    still = points @ scans[-1].T_world_sensor[:3, :3].T + scans[-1].T_world_sensor[:3, 3]
+    # Range noise is 15 mm; the car moves a metre during the scan.
+    assert np.quantile(to_surface(moving), 0.999) < 0.06
+    assert np.quantile(to_surface(still), 0.9) > 0.15
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_scans(name):
+    scan = some(Course(scenes=("corridor",), length=12.0, sensor=name), 1)[0]
+    sensor = SENSORS[name]
+    away = np.linalg.norm(scan.points, axis=1)
+    assert len(scan) > 0.6 * sensor.rings * sensor.columns
+    assert away.min() > sensor.range[0] - 0.1
+    assert away.max() < sensor.range[1] + 0.1
+    assert set(scan.rings.tolist()) == set(range(sensor.rings))
+
+
+def test_movers_are_hit_where_they_are():
+    given = course("street", moving_objects=True, length=20.0, seed=2, columns=450)
+    drive = Drive(given)
+    still = list(Drive(given.model_copy(update={"moving_objects": False})).scans())
+    near = 0
+    for scan, without in zip(drive.scans(), still, strict=True):
+        t = np.array([(scan.stamp - EPOCH) * 1e-9 + 0.05])
+        points = scan.points @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]
+        others = without.points @ without.T_world_sensor[:3, :3].T + without.T_world_sensor[:3, 3]
+        for mover in populate(drive.road):
+            centre = mover.at(drive.road, t)[0][0] + [0.0, 0.0, 0.9]
+            close = [np.sum(np.linalg.norm(p - centre, axis=1) < 0.8) for p in (points, others)]
+            near += close[0] > close[1] + 10
+    assert near > 5
+
+
+def test_weather_thins_the_far_and_fills_the_near():
+    clear, fog = (some(course("open", weather=w, columns=900), 1)[0] for w in ("clear", "fog"))
+    away = [np.linalg.norm(scan.points, axis=1) for scan in (clear, fog)]
+    assert np.sum(away[1] > 20.0) < 0.5 * np.sum(away[0] > 20.0)
+    up = [scan.points[:, 2] > 0.1 * a for scan, a in zip((clear, fog), away, strict=True)]
+    assert up[1].sum() > up[0].sum() + 20
+
+
+def test_only_what_is_near_is_kept():
+    drive = Drive(course("open", length=400.0))
+    world = World(drive.road)
+    sizes = [len(world.around(s, 100.0).triangles) for s in (100.0, 200.0, 300.0)]
+    assert max(sizes) < 1.5 * min(sizes)
+    assert len(world._tiles) <= 11
+
+
+def test_a_tile_looks_the_same_whenever_it_is_built():
+    road = Drive(course("garden", "cave", length=40.0)).road
+    first, second = World(road), World(road)
+    first.around(0.0, 60.0)
+    np.testing.assert_array_equal(first.tile(2).vertices, second.tile(2).vertices)
+
+
+def test_truth_is_the_ride():
+    drive = Drive(course("cave"))
+    scan = next(drive.scans())
+    np.testing.assert_array_equal(scan.T_world_sensor, drive.ride.poses(np.zeros(1))[0])
+    np.testing.assert_allclose(
+        invert(scan.T_world_sensor) @ scan.T_world_sensor, np.eye(4), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_robot_can_drive_through_every_scene_into_every_other(seed):
+    # Every ordered pair of scenes once.
+    names = list(SCENES)
+    order = [names[0]]
+    for step in range(1, len(names)):
+        i = 0
+        for _ in range(len(names)):
+            i = (i + step) % len(names)
+            order.append(names[i])
+    legs = tuple(SceneLeg(scene=name, length=15.0) for name in order)
+    drive = Drive(Course(scenes=legs, seed=seed))
+    to_surface = surface(drive, drive.road.length / 2.0, drive.road.length)
+    t = np.arange(0.0, drive.ride.duration, 0.1)
+    T = drive.ride.poses(t)
+    clearance = to_surface(T[:, :3, 3])
+    worst = int(np.argmin(clearance))
+    station = float(drive.road.station(T[worst, 0, 3]))
+    leg = next(leg for leg in drive.road.legs if leg.start <= station <= leg.stop)
+    assert clearance[worst] > 0.35, (station, leg.scene.summary)
