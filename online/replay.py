@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adaptune.descriptor import ndt_histogram
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
-from adaptune.geometry import Poses, invert
+from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.model import RULES, ErrorModel, Selection
 from adaptune.odometry import Box, HealthCheck
 from adaptune.sequence import Scan
@@ -206,7 +206,8 @@ class _Guard:
             return self._T_previous_current
         T_previous_current = invert(T_odom_previous) @ T_odom_current
         velocity = T_previous_current[:3, 3] / elapsed
-        if self._health.healthy(velocity, self._velocity, self._since):
+        turn_rate = float(rotation_angle(T_previous_current)) / elapsed
+        if self._health.healthy(velocity, self._velocity, self._since, turn_rate):
             self._T_previous_current = T_previous_current
             self._velocity = velocity
             self._since = 0.0

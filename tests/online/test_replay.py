@@ -92,6 +92,19 @@ def test_an_impossible_step_starts_anew_at_the_last_healthy_motion(jump):
     assert start[2:] == pytest.approx((0.5, 0.2))
 
 
+def test_an_impossible_turn_starts_anew():
+    class Turning(Scripted):
+        def register(self, prepared):
+            T = super().register(prepared).T_odom_sensor
+            if prepared == 300_000_000:
+                T[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]  # 900 degrees a second
+            return Registration(T)
+
+    result = replay(scans(np.arange(6) / 10), Turning(), HEALTH)
+    assert np.flatnonzero(result.restarted).tolist() == [3]
+    np.testing.assert_allclose(result.trajectory.T_world_sensor[-1, :3, :3], np.eye(3))
+
+
 def test_a_platform_that_did_change_its_motion_is_believed_in_the_end():
     # From 0.1 to 0.45 m a scan is 3.5 m/s at once; the bound grows with the time unseen.
     box = Scripted([0.1, 0.1, *[0.45] * 6])

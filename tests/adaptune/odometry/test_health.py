@@ -37,6 +37,14 @@ def test_healthy(velocity, last, elapsed, healthy):
     assert CHECK.healthy(np.array(velocity, float), last, elapsed) is healthy
 
 
+@pytest.mark.parametrize(
+    ("degrees", "healthy"), [(0, True), (89, True), (91, False), (np.nan, False)]
+)
+def test_turning(degrees, healthy):
+    check = HealthCheck(max_turn_rate=90.0)
+    assert check.healthy(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees)) is healthy
+
+
 def test_a_vehicle_in_a_town_is_healthy():
     check = HealthCheck()
     assert check.healthy(np.array([16.7, 0.2, 0.0]), np.array([16.2, 0.0, 0.1]), 0.1)
