@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 from functools import cache
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -192,15 +192,20 @@ def _nonsense(T_odom_sensor: Poses) -> str | None:
     return None
 
 
+class _Server(NamedTuple):
+    process: subprocess.Popen[bytes]
+    control: socket.socket
+
+
 @cache
-def _server(name: str) -> socket.socket:
-    """The end of this process of a socket to the server that forks instances of an odometry."""
+def _server(name: str) -> _Server:
+    """What forks instances of an odometry, begun when the first one is wanted."""
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
     # The odometries must not start threads of their own.
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     path = os.pathsep.join(filter(None, sys.path))
     with there:
-        subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-m", "adaptune.odometry.forkserver", str(there.fileno()), name],
             pass_fds=[there.fileno()],
             stdin=subprocess.DEVNULL,
@@ -208,12 +213,15 @@ def _server(name: str) -> socket.socket:
             # Ctrl-C is for the process that drives.
             start_new_session=True,
         )
-    return here
+    return _Server(process, here)
 
 
 def _fork(name: str, limits: Limits) -> BinaryIO:
     """A stream to a fresh process."""
+    if _server(name).process.poll() is not None:
+        _server.cache_clear()
     here, there = socket.socketpair()
     with here, there:
-        socket.send_fds(_server(name), [limits.model_dump_json().encode()], [there.fileno()])
+        request = limits.model_dump_json().encode()
+        socket.send_fds(_server(name).control, [request], [there.fileno()])
         return cast("BinaryIO", here.makefile("rwb"))

@@ -29,14 +29,22 @@ from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.odometry.base import Odometry, OdometryError
 from adaptune.odometry.registry import box_class
 from adaptune.sequence import Scan
+from adaptune.space import nearest
 
 VERSION = 1
+_HOLDS = {
+    "hello": ("version", "odometry", "parameters", "settings"),
+    "start": ("stamp", "points", "pose"),
+    "register": ("stamp", "points"),
+    "configure": ("parameters",),
+}
 _LENGTH = struct.Struct("<I")
 _LONGEST_HEADER = 1 << 24
 
@@ -135,10 +143,10 @@ def serve(reader: Readable, writer: BinaryIO) -> None:
     """
     box: Odometry | None = None
     while (message := receive(reader)) is not None:
-        header = message.header
         try:
-            if header["type"] == "hello":
-                box = _make(header)
+            _check(message)
+            if message.header["type"] == "hello":
+                box = _make(message.header)
                 send(writer, {"type": "done", "version": VERSION, "live": box.live})
             elif box is None:
                 raise OdometryError("the first message must be a hello")
@@ -148,13 +156,26 @@ def serve(reader: Readable, writer: BinaryIO) -> None:
             send(writer, {"type": "refused", "message": str(error)})
 
 
+def _check(message: Message) -> None:
+    kind = message.header.get("type")
+    if kind not in _HOLDS:
+        raise OdometryError(f"there is no message of type {kind!r}; {nearest(str(kind), _HOLDS)}")
+    there = message.header.keys() | message.arrays.keys()
+    if lacking := [name for name in _HOLDS[kind] if name not in there]:
+        raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
+
+
 def _make(hello: Mapping[str, Any]) -> Odometry:
     if hello["version"] != VERSION:
         raise OdometryError(
             f"this adaptune speaks version {VERSION} of the protocol, not {hello['version']}"
         )
     cls = box_class(hello["odometry"])
-    return cls(hello["parameters"], cls.settings_type.model_validate(hello["settings"]))
+    try:
+        settings = cls.settings_type.model_validate(hello["settings"])
+    except ValidationError as error:
+        raise OdometryError(f"settings: {error}") from error
+    return cls(hello["parameters"], settings)
 
 
 def _answer(box: Odometry, message: Message, writer: BinaryIO) -> None:
@@ -168,8 +189,6 @@ def _answer(box: Odometry, message: Message, writer: BinaryIO) -> None:
         # Arrays from the stream are read-only; poses are an odometry's own to keep.
         motion = arrays["motion"].copy() if "motion" in arrays else None
         box.start(box.prepare(_scan(message)), arrays["pose"].copy(), motion)
-    elif header["type"] == "configure":
-        box.configure(header["parameters"])
     else:
-        raise OdometryError(f"there is no message of type {header['type']!r}")
+        box.configure(header["parameters"])
     send(writer, {"type": "done"})

@@ -14,6 +14,7 @@ import turns
 from adaptune.archive import Archive
 from adaptune.odometry import HealthCheck, Isolated, Limits, OdometryError, wire
 from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.isolation import _server
 from adaptune.sequence import Scan
 from adaptune.study import load_study
 from offline.trial import PreparedSequence, run_trials
@@ -75,6 +76,18 @@ def test_one_that_cannot_begin_is_given_up():
         assert np.isnan(box.register(scan(1)).T_odom_sensor).all()
     assert len(box.faults) == 10
     assert time.perf_counter() - begin < 5.0
+
+
+def test_a_server_that_was_killed_is_replaced():
+    box = isolated("none")
+    box.start(scan(0), np.eye(4))
+    _server("faulty:Faulty").process.kill()
+    _server("faulty:Faulty").process.wait()
+    # Those it has forked live on.
+    assert box.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
+    box.start(scan(2), np.eye(4))
+    assert box.register(scan(3)).T_odom_sensor[0, 3] == pytest.approx(0.1)
+    assert not box.faults
 
 
 def test_what_it_refuses_is_an_error():
@@ -215,9 +228,14 @@ def test_a_conversation_with_the_command_line():
 @pytest.mark.parametrize(
     ("first", "message"),
     [
-        ({"type": "register", "stamp": 0}, "the first message must be a hello"),
+        ({"type": "configure", "parameters": {}}, "the first message must be a hello"),
         (HELLO | {"version": 2}, "speaks version 1 of the protocol, not 2"),
         (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
+        (HELLO | {"settings": {"fualt": "hang"}}, "fualt"),
+        ({"type": "hello", "version": 1}, "hello lacks odometry, parameters, settings"),
+        ({"type": "begin"}, "no message of type 'begin'"),
+        ({"type": "start", "stamp": 0}, "start lacks points, pose"),
+        ({}, "no message of type None"),
     ],
 )
 def test_what_a_server_refuses(first, message):
