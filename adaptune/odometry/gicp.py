@@ -86,5 +86,6 @@ def crop(scan: Scan, min_range: float) -> Any:
     """Points no nearer than `min_range` metres, as float64 of shape (n, 3)."""
     points = scan.points.astype(np.float64)
     if min_range > 0:
-        points = points[np.einsum("ij,ij->i", points, points) >= min_range**2]
+        kept = np.flatnonzero(np.einsum("ij,ij->i", points, points) >= min_range**2)
+        points = points.take(kept, axis=0)
     return points
