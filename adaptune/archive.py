@@ -100,6 +100,10 @@ class Archive:
         for unfinished in self.folder.glob("*/.*.npz"):
             unfinished.unlink()
 
+    def has_frames(self, sequence: str) -> bool:
+        """Whether what all trials on a sequence share is there."""
+        return (self.folder / sequence / "frames.npz").exists()
+
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Keep what all trials on a sequence share."""
         path = self.folder / sequence / "frames.npz"
@@ -163,7 +167,13 @@ class Archive:
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials)."""
-        return np.stack([self.read(sequence, n).errors for n in numbers], axis=1).astype(np.float32)
+        errors = [self.read(sequence, n).errors for n in numbers]
+        if len({len(of_trial) for of_trial in errors}) > 1:
+            raise ArchiveError(
+                f"{self.folder / sequence}: trials are of recordings of different lengths; remove "
+                f"the folder and run again"
+            )
+        return np.stack(errors, axis=1).astype(np.float32)
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:

@@ -234,6 +234,8 @@ def offline(
                 "baseline": means[0],
                 "fixed": means[model.fixed],
                 "own best": means[best],
+                "lost, baseline": training.lost[name][0],
+                "lost, fixed": training.lost[name][1],
                 "_own best set": _short(model.sets[best]),
                 "baseline, whole run": training.whole[name][0],
                 "fixed, whole run": training.whole[name][1],
@@ -262,7 +264,7 @@ def validate(
     """Tell whether adapting would pay in places that were not trained on.
 
     Leaves out one training sequence after the other, fits on the rest, and looks up the errors of
-    the sets that would have been chosen, second by second: no odometry is run. Numbers are ratios
+    the sets that would have been chosen, period by period: no odometry is run. Numbers are ratios
     to the error of the fixed set, which is chosen without that sequence too.
     """
     from adaptune import report
@@ -275,7 +277,7 @@ def validate(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",
             rows,
-            "Oracles know the errors: the best set of the sequence, and of every second.",
+            "Oracles know the errors: the best set of the sequence, and of every period.",
         )
     )
     for rule in loaded.config.online.rules:
@@ -303,8 +305,7 @@ def online(
     from online.comparison import run_replays
 
     loaded = load_study(study, override, folder)
-    loaded.open()
-    unpin = pin(0)
+    unpin = pin(os.getpid())
     try:
         with _progress() as progress:
             made = run_replays(loaded, model or loaded.folder / "model.npz", again, progress)
@@ -329,13 +330,14 @@ def compare(
     from online.comparison import compare as compare_replays
 
     loaded = load_study(study, override, folder)
+    loaded.check()
     rows = compare_replays(loaded)
     console.print(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m on test sequences",
             rows,
-            "Intervals: block bootstrap over time, 2000 resamples, seed 0. All: mean RTE, "
-            "geometric mean of the ratios.",
+            "Intervals of 95 %: block bootstrap over time, where the drive is long enough; seed 0. "
+            "`all`: mean RTE, and geometric mean of the ratios.",
         )
     )
     console.print(f"Tables and pictures: {loaded.folder / 'comparison'}/", highlight=False)

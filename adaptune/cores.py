@@ -16,6 +16,7 @@ def pin(core: int) -> Callable[[], None]:
 
     Open3D sums in an order that depends on its threads: only on one core do its results repeat
     bit by bit. Threads that run already keep their cores, so this comes before Open3D's first use.
+    Numbers beyond the last core begin anew at the first.
     """
     if not hasattr(os, "sched_setaffinity"):
         return lambda: None

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,7 +99,13 @@ def write_rows(folder: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> No
     write_text(folder / f"{name}.json", json.dumps(finite, indent=2) + "\n")
 
 
-def draw_tracks(path: Path, title: str, length: float, tracks: Mapping[str, Track]) -> None:
+def draw_tracks(
+    path: Path,
+    title: str,
+    length: float,
+    tracks: Mapping[str, Track],
+    logarithmic: Collection[str] = (),
+) -> None:
     """Draw errors and chosen parameters over time, as PNG.
 
     Parameters
@@ -112,6 +118,8 @@ def draw_tracks(path: Path, title: str, length: float, tracks: Mapping[str, Trac
         Metres of a sub-trajectory.
     tracks
         By mode.
+    logarithmic
+        Names of the parameters to draw in log scale.
     """
     from matplotlib.figure import Figure
 
@@ -143,6 +151,8 @@ def draw_tracks(path: Path, title: str, length: float, tracks: Mapping[str, Trac
             # The last choice holds until the end.
             x = np.append(track.choice_seconds, track.seconds[-1])
             axis.step(x, [*values, values[-1]], where="post", **style)
+            if name in logarithmic:
+                axis.set_yscale("log")
             axis.set_ylabel(name.replace("_", "\n"), fontsize=8)
     axes[0].set_ylabel(f"RTE over {length:g} m [%]")
     if any(np.isfinite(t.errors).any() for t in tracks.values()):

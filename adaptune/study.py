@@ -1,5 +1,6 @@
 """A study: what to tune, on what, and the folder in which everything about it is kept."""
 
+import fcntl
 import json
 import types
 import typing
@@ -7,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import IO, Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -26,6 +27,7 @@ from adaptune.odometry import (
     box_class,
 )
 from adaptune.sequence import SequenceConfig, open_sequence
+from adaptune.sequence.bag import bag_paths
 from adaptune.simulation import Course
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
@@ -50,7 +52,7 @@ class OdometryConfig(_Section):
 
     name: str
     settings: dict[str, Any] = {}
-    parameters: dict[str, dict[str, Any]] | None = None
+    parameters: Annotated[dict[str, dict[str, Any]], Field(min_length=1)] | None = None
 
 
 class OfflineConfig(_Section):
@@ -76,7 +78,7 @@ class OfflineConfig(_Section):
     batch: int = Field(16, ge=1)
     seed: int = Field(0, ge=0)
     workers: int | None = Field(None, ge=1)
-    memory: float = Field(4.0, gt=0)
+    memory: float = Field(4.0, gt=0, allow_inf_nan=False)
 
 
 class SwitchingConfig(_Section):
@@ -111,7 +113,7 @@ class OnlineConfig(_Section):
     switching : SwitchingConfig
     """
 
-    period: float = Field(1.0, gt=0)
+    period: float = Field(1.0, gt=0, allow_inf_nan=False)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
     switching: SwitchingConfig = SwitchingConfig()
 
@@ -144,8 +146,8 @@ class StudyConfig(_Section):
     courses: dict[Name, Course] = {}
     training: tuple[str, ...] = Field(min_length=1)
     test: tuple[str, ...] = ()
-    sub_trajectory: float = Field(25.0, gt=0)
-    lost_track: float = Field(3.0, gt=0)
+    sub_trajectory: float = Field(25.0, gt=0, allow_inf_nan=False)
+    lost_track: float = Field(3.0, gt=0, allow_inf_nan=False)
     health: HealthCheck = HealthCheck()
     isolation: Limits = Limits()
     offline: OfflineConfig = OfflineConfig()
@@ -237,8 +239,24 @@ class Study:
             )
         return open_sequence(self.sequence_config(name))
 
-    def open(self) -> None:
-        """Make the folder, or make sure that what it holds is of this very study.
+    def recording_size(self, name: str) -> list[int] | None:
+        """Bytes of a recording's files, by which another recording in its place is noticed.
+
+        None for simulated courses, which their configuration tells apart, and for folders of many
+        files.
+        """
+        bag = self.sequence_config(name).bag
+        if bag is None or name in self.config.courses:
+            return None
+        files = [
+            file
+            for path in bag_paths((bag,) if isinstance(bag, str) else bag)
+            for file in (sorted(path.iterdir()) if path.is_dir() else [path])
+        ]
+        return [file.stat().st_size for file in files if file.is_file()]
+
+    def check(self) -> None:
+        """Make sure that what the folder holds, if anything, is of this very study.
 
         The number of trials, the number of workers and the replays may change between runs.
 
@@ -248,24 +266,68 @@ class Study:
             Naming the keys that differ from those the folder was begun with.
         """
         path = self.folder / "study.yaml"
-        now = self.config.model_dump(mode="json")
-        if path.exists():
-            before: Any = yaml.Document(path.read_text(encoding="utf-8")).data
-            if differing := sorted(_differences(_lasting(before), _lasting(now))):
+        if not path.exists():
+            return
+        try:
+            data: Any = yaml.Document(path.read_text(encoding="utf-8")).data
+            before = _lasting(data)
+        except (yaml.YamlError, UnicodeDecodeError, AttributeError, KeyError, TypeError) as error:
+            raise ConfigurationError(
+                f"{path}: is damaged ({error}); give this study another folder (--folder), or "
+                f"remove that one"
+            ) from error
+        if differing := sorted(_differences(before, _lasting(self._resolved()))):
+            raise ConfigurationError(
+                f"{self.folder} was begun with other values of {', '.join(differing)}; give "
+                f"this study another folder (--folder), or remove that one"
+            )
+
+    def open(self) -> None:
+        """Make the folder, and keep others from working in it while this process lives.
+
+        Raises
+        ------
+        ConfigurationError
+            If another process is at work in it, or it is another study's (see `check`).
+        """
+        self.check()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if str(self.folder) not in _locks:
+            lock = (self.folder / ".lock").open("w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                lock.close()
                 raise ConfigurationError(
-                    f"{self.folder} was begun with other values of {', '.join(differing)}; give "
-                    f"this study another folder (--folder), or remove that one"
-                )
-        write_text(path, yaml.dump(now))
+                    f"{self.folder}: another adaptune is at work here; wait for it, or give this "
+                    f"study another folder (--folder)"
+                ) from error
+            _locks[str(self.folder)] = lock
+        write_text(self.folder / "study.yaml", yaml.dump(self._resolved()))
+
+    def _resolved(self) -> dict[str, Any]:
+        """The configuration with nothing left to defaults, and what its recordings are."""
+        resolved = self.config.model_dump(mode="json")
+        resolved["odometry"]["settings"] = self.settings.model_dump(mode="json")
+        resolved["odometry"]["parameters"] = self.space.dump()
+        resolved["recordings"] = {name: self.recording_size(name) for name in self.config.training}
+        return resolved
+
+
+_locks: dict[str, IO[str]] = {}
+"""Open files whose locks last as long as the process."""
 
 
 def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
     """What trials depend on: all but what may be changed and added to later."""
     lasting = {key: config.get(key) for key in ("odometry", "sub_trajectory", "lost_track")}
     lasting["training"] = config["training"]
+    lasting["recordings"] = config["recordings"]
     for name in config["training"]:
         for kind in ("sequences", "courses"):
-            lasting[f"{kind}.{name}"] = config.get(kind, {}).get(name)
+            entry = dict(config.get(kind, {}).get(name) or {})
+            entry.pop("cache", None)  # changes nothing but the time it takes
+            lasting[f"{kind}.{name}"] = entry
     offline = config.get("offline", {})
     lasting["offline"] = {k: offline.get(k) for k in ("sampler", "initial", "batch", "seed")}
     return lasting
@@ -373,16 +435,22 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list
 
 
 def _check_roles(data: dict[str, Any], known: set[Any], problems: list[_Problem]) -> None:
+    training = data.get("training")
+    training = training if isinstance(training, list) else []
     for role in ("training", "test"):
         names = data.get(role)
         if not isinstance(names, list):
             continue
         for i, name in enumerate(names):
+            if not isinstance(name, str):
+                continue  # pydantic has told
             if name not in known:
-                help_ = nearest(str(name), map(str, known))
+                help_ = nearest(name, map(str, known))
                 problems.append(((role, i), f"there is no sequence {name!r}: {help_}"))
             elif name in names[:i]:
                 problems.append(((role, i), f"{name!r} is named twice"))
+            elif role == "test" and name in training:
+                problems.append(((role, i), f"{name!r} is trained on, and proves nothing here"))
 
 
 def _check_odometry(data: dict[str, Any], problems: list[_Problem]) -> None:

@@ -36,11 +36,14 @@ class Training(NamedTuple):
     whole : dict
         For every training sequence the mean RTE in percent of the whole run, without new starts at
         the reference, of the baseline and of the fixed set.
+    lost : dict
+        For every training sequence how often the baseline and the fixed set lost track.
     """
 
     model: ErrorModel
     means: dict[str, list[float]]
     whole: dict[str, tuple[float, float]]
+    lost: dict[str, tuple[int, int]]
 
 
 def train(study: Study, progress: Progress = lambda *_: None) -> Training:
@@ -74,7 +77,15 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
     }
     write_text(study.folder / "fixed.yaml", yaml.dump(model.sets[model.fixed]))
     report.write_rows(study.folder, "trials", _rows(model, means))
-    return Training(model, {name: m.tolist() for name, m in means.items()}, whole)
+    lost = {
+        name: (_lost(archive, name, 0), _lost(archive, name, model.fixed))
+        for name in model.sequences
+    }
+    return Training(model, {name: m.tolist() for name, m in means.items()}, whole, lost)
+
+
+def _lost(archive: Archive, name: str, number: int) -> int:
+    return int(archive.read(name, number).restarted.sum())
 
 
 def _rows(model: ErrorModel, means: dict[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
@@ -105,9 +116,10 @@ def _run_batches(
         n_missing = sum(map(len, missing.values()))
         done += len(numbers) * len(names) - n_missing
         progress("trials", done, total)
-        if n_missing:
+        unframed = [name for name in names if not archive.has_frames(name)]
+        if n_missing or unframed:
             sets = propose(study.space, config, batch, history)
-            for task in workers.run(_tasks(missing, sets, first, workers.n)):
+            for task in workers.run(_tasks(missing, unframed, sets, first, workers.n)):
                 done += len(task.numbers)
                 progress("trials", done, total)
         for n in numbers:
@@ -126,10 +138,14 @@ def _run_batches(
 
 
 def _tasks(
-    missing: dict[str, list[int]], sets: list[ParameterSet], first: int, n_workers: int
+    missing: dict[str, list[int]],
+    unframed: list[str],
+    sets: list[ParameterSet],
+    first: int,
+    n_workers: int,
 ) -> list[Task]:
-    """Share every sequence's trials between the workers."""
-    return [
+    """Share every sequence's trials between the workers; reading it again is a task of its own."""
+    return [Task(name, (), ()) for name in unframed if not missing[name]] + [
         Task(name, tuple(some), tuple(sets[n - first] for n in some))
         for name, numbers in missing.items()
         for share in range(n_workers)
@@ -192,6 +208,6 @@ def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
         histograms=np.concatenate(histograms),
         sequence=all_sequences,
         errors=all_errors,
-        provenance={"adaptune": __version__, "study": study.name}
+        provenance={"adaptune": __version__}
         | study.config.offline.model_dump(mode="json", exclude={"workers", "memory"}),
     )

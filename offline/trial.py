@@ -16,6 +16,9 @@ from adaptune.odometry.base import prepared_bytes
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 
+MIN_POINTS = 20
+"""No odometry makes anything of a scan with fewer."""
+
 
 class PreparedSequence:
     """A sequence read, prepared and described once, for all trials of a worker.
@@ -46,8 +49,9 @@ class PreparedSequence:
         self._box = study.odometry()
         self._kept: list[Any] = []
         self.nbytes = 0
-        stamps, histograms, full = [], [], False
+        stamps, histograms, full, enough = [], [], False, False
         for scan in self._sequence:
+            enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
             histograms.append(ndt_histogram(scan.points))
             if full:
@@ -57,6 +61,10 @@ class PreparedSequence:
             if not full:
                 self._kept.append(prepared)
                 self.nbytes += prepared_bytes(prepared)
+        if not enough:
+            raise AdaptuneError(
+                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points"
+            )
         reference = self._sequence.reference()
         if reference is None:
             raise AdaptuneError(

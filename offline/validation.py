@@ -2,7 +2,7 @@
 
 Each training sequence is left out in turn. A fixed set and the selection rules are fitted on the
 others; on the one left out they are given the errors that were recorded for the sets they choose,
-second by second.
+period by period.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from adaptune import report
 from adaptune.archive import Archive
@@ -21,7 +22,8 @@ from adaptune.model import RULES, ErrorModel, Rule, TrainingData
 from adaptune.model.base import mean_errors
 from adaptune.study import Study
 
-RESAMPLES = 2000
+MIN_SEQUENCES = 6
+"""Fewer say too little about places they are not to advise for adapting."""
 NO_WORSE = 1.05
 """A rule may not have more than this much of the fixed set's error on any sequence left out."""
 
@@ -37,15 +39,15 @@ class LabelledSequence:
     Attributes
     ----------
     name : str
-    seconds : ndarray of shape (n,)
-        Whole seconds since the first scan: in each, one selection holds.
+    period : ndarray of shape (n,)
+        Whole periods since the first scan: in each, one selection holds.
     histograms : ndarray of shape (n, 90)
     errors : ndarray of shape (n, n_sets)
         Percent, infinite where the track was lost.
     """
 
     name: str
-    seconds: NDArray[np.int64]
+    period: NDArray[np.int64]
     histograms: NDArray[np.float64]
     errors: NDArray[np.float32]
 
@@ -58,13 +60,13 @@ class LeftOut(NamedTuple):
     name : str
     errors : dict
         For every mode the capped error in percent at each frame, of shape (n,).
-    switches : dict
-        For every rule the share of seconds in which it did not choose the fixed set.
+    adapted : dict
+        For every rule the share of periods in which it did not choose the fixed set.
     """
 
     name: str
     errors: dict[str, NDArray[np.float64]]
-    switches: dict[str, float]
+    adapted: dict[str, float]
 
 
 @dataclass
@@ -88,14 +90,14 @@ class Validation:
             mode: np.array([s.errors[mode].mean() for s in self.left_out]) / fixed for mode in modes
         }
 
-    def summary(self, mode: str, seed: int = 0) -> dict[str, float]:
+    def summary(self, mode: str) -> dict[str, float]:
         """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
 
-        The interval is of a bootstrap over sequences: it speaks of other sequences like these.
+        The interval is Student's, of the logarithms: it speaks of other sequences like these.
         """
         logs = np.log(self.ratios[mode])
-        drawn = np.random.default_rng(seed).integers(0, len(logs), (RESAMPLES, len(logs)))
-        low, high = np.percentile(logs[drawn].mean(axis=1), [2.5, 97.5])
+        margin = stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs)
+        low, high = logs.mean() - margin, logs.mean() + margin
         mean, fixed = (
             np.mean([s.errors[m].mean() for s in self.left_out]) for m in (mode, "fixed")
         )
@@ -111,12 +113,16 @@ class Validation:
         """What to do, in a sentence or two."""
         s = self.summary(rule)
         worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
+        share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
         ratio = (
             f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
-            f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f})"
+            f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
+            f"adapting {share:.0f} % of the time"
         )
         if s["worst"] > NO_WORSE:
             return f"Do not adapt by `{rule}`: {s['worst']:.2f} times on {worst}; {ratio}."
+        if len(self.left_out) < MIN_SEQUENCES:
+            return f"Too few sequences to advise for `{rule}`: {ratio}."
         if s["high"] >= 1.0:
             return f"Nothing shows that `{rule}` pays, nor that it harms: {ratio}."
         return f"Adapt by `{rule}`: {ratio}, and on none more than {s['worst']:.2f} times."
@@ -155,9 +161,10 @@ def validate(
         frames = archive.read_frames(name)
         errors = archive.read_errors(name, range(len(model.sets)))
         labelled = ~np.isnan(errors).any(axis=1)
-        seconds = (frames.stamps[labelled] - frames.stamps[0]) // 10**9
+        since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
+        period = (since // study.config.online.period).astype(np.int64)
         sequences.append(
-            LabelledSequence(name, seconds, frames.histograms[labelled], errors[labelled])
+            LabelledSequence(name, period, frames.histograms[labelled], errors[labelled])
         )
     validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
     rows: list[dict[str, Any]] = []
@@ -231,17 +238,16 @@ def _leave_out(
     data, pca = training_data(others, sets)
     features = pca.transform(sequence.histograms)
     capped = cap(sequence.errors)
-    seconds, first = np.unique(sequence.seconds, return_index=True)
-    second = np.searchsorted(seconds, sequence.seconds)
+    _, first, period = np.unique(sequence.period, return_index=True, return_inverse=True)
     frames = np.arange(len(capped))
     errors = {"baseline": capped[:, 0], "fixed": capped[:, data.fixed]}
-    switches = {}
+    adapted = {}
     for name, make in rules.items():
         rule = make().fit(data)
         chosen = np.array([rule.select(features[i]).set_index for i in first])
-        errors[name] = capped[frames, chosen[second]]
-        switches[name] = float(np.mean(chosen != data.fixed))
+        errors[name] = capped[frames, chosen[period]]
+        adapted[name] = float(np.mean(chosen != data.fixed))
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    per_second = np.array([capped[second == s].mean(axis=0) for s in range(len(seconds))])
-    errors["oracle, second"] = capped[frames, per_second.argmin(axis=1)[second]]
-    return LeftOut(sequence.name, errors, switches)
+    best = np.array([capped[period == p].mean(axis=0).argmin() for p in range(len(first))])
+    errors["oracle, period"] = capped[frames, best[period]]
+    return LeftOut(sequence.name, errors, adapted)

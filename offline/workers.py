@@ -2,6 +2,7 @@
 
 import contextlib
 import multiprocessing as mp
+import os
 import signal
 import traceback
 from collections.abc import Iterator, Sequence
@@ -140,7 +141,7 @@ class Workers:
         here, there = self._context.Pipe()
         memory = self.study.config.offline.memory * 1e9 / self.n
         process = self._context.Process(
-            target=_serve, args=(there, self.study, w, memory), daemon=True
+            target=_serve, args=(there, self.study, os.getpid() + w, memory), daemon=True
         )
         process.start()
         there.close()
@@ -153,10 +154,10 @@ class Workers:
         return worker.process.exitcode
 
 
-def _serve(connection: Connection, study: Study, w: int, memory: float) -> None:
+def _serve(connection: Connection, study: Study, core: int, memory: float) -> None:
     # Ctrl-C reaches the whole group; the driver decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    pin(w)
+    pin(core)
     archive = Archive(study.folder / "trials")
     ready: dict[str, PreparedSequence] = {}
     with contextlib.suppress(EOFError, BrokenPipeError):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptune import report
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import sub_trajectory_rte, window_ends
+from adaptune.metrics import KittiError, kitti_error, sub_trajectory_rte, window_ends
 from adaptune.model import ErrorModel, Selection, portfolio, restrict
 from adaptune.odometry import Bank, Box, HandOver
 from adaptune.report import Track
@@ -27,6 +27,8 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
 
 RESAMPLES = 2000
+MIN_BLOCKS = 10
+"""Independent pieces of a drive below which an interval would only seem to say something."""
 
 
 class ComparisonError(AdaptuneError):
@@ -68,6 +70,7 @@ def run_replays(
     check_model(study, model, model_path)
     if not study.config.test:
         raise ComparisonError("test: name at least one sequence to replay")
+    study.open()
     digest = hashlib.sha256(model_path.read_bytes()).hexdigest()[:16]
     made = 0
     for name in study.config.test:
@@ -97,6 +100,7 @@ def run_replays(
                 study.config.online.period,
                 step,
             )
+            progress(what, n, n)
             if not made_here:
                 _write_reference(folder, sequence.reference(), result.trajectory)
             write_replay(folder / mode, result, about)
@@ -166,19 +170,26 @@ def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -
         parameters = study.space.baseline
     elif mode == "fixed":
         parameters = model.sets[model.fixed]
-    course = study.config.courses.get(name)
     about: dict[str, Any] = {
         "mode": mode,
         "parameters": parameters,
         "model": None if parameters else digest,
-        "period": study.config.online.period,
         "switching": None if parameters else _switching(study),
+    }
+    return about | _setting(study, name)
+
+
+def _setting(study: Study, name: str) -> dict[str, Any]:
+    """What every mode's replay of a sequence depends on."""
+    course = study.config.courses.get(name)
+    return {
+        "period": study.config.online.period,
         "odometry": study.config.odometry.model_dump(mode="json"),
         "health": study.config.health.model_dump(mode="json"),
         "sequence": study.sequence_config(name).model_dump(mode="json"),
         "course": None if course is None else course.model_dump(mode="json"),
+        "recording": study.recording_size(name),
     }
-    return about
 
 
 def _switching(study: Study) -> dict[str, Any]:
@@ -230,6 +241,7 @@ def compare(study: Study) -> list[dict[str, Any]]:
     ComparisonError
         If a replay is missing.
     """
+    check_replays(study)
     rows: list[dict[str, Any]] = []
     ratios: dict[str, list[float]] = {mode: [] for mode in modes(study)}
     for name in study.config.test:
@@ -238,8 +250,8 @@ def compare(study: Study) -> list[dict[str, Any]]:
         errors = {mode: track.errors for mode, track in tracks.items()}
         block = _block(folder, study, errors["fixed"])
         for mode, track in tracks.items():
-            summary = json.loads((folder / mode / "replay.json").read_text(encoding="utf-8"))
-            row = _row(name, mode, track, errors["fixed"], block, summary)
+            summary = _summary(folder / mode)
+            row = _row(name, mode, track, errors["fixed"], block, summary, _kitti(folder, mode))
             rows.append(row)
             if row["vs fixed"] is not None:
                 ratios[mode].append(row["vs fixed"])
@@ -248,6 +260,7 @@ def compare(study: Study) -> list[dict[str, Any]]:
             f"{study.name}: {name}",
             study.config.sub_trajectory,
             tracks,
+            [n for n, p in study.space.parameters.items() if getattr(p, "log", False)],
         )
     if len(ratios["fixed"]) > 1:
         rows += _pooled(rows, ratios)
@@ -255,11 +268,56 @@ def compare(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
-def _track(folder: Path, mode: str, study: Study) -> Track:
-    if not (folder / mode / "replay.json").exists():
+def check_replays(study: Study) -> None:
+    """Refuse replays that are missing, or of another recording or configuration.
+
+    Raises
+    ------
+    ComparisonError
+    """
+    for name in study.config.test:
+        for mode in modes(study):
+            folder = study.folder / "replays" / name / mode
+            made = _summary(folder)["about"]
+            now = _setting(study, name)
+            if differing := [key for key in now if made.get(key) != now[key]]:
+                raise ComparisonError(
+                    f"{folder}: was replayed with another {', '.join(differing)}; run `adaptune "
+                    f"online` with this study"
+                )
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    """What is said of a replay; all its files are there, for this one is written last."""
+    path = folder / "replay.json"
+    if not path.exists():
         raise ComparisonError(
-            f"{folder / mode}: there is no replay; run `adaptune online` with this study first"
+            f"{folder}: there is no replay; run `adaptune online` with this study first"
         )
+    try:
+        summary = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise _damaged(path, error) from error
+    if missing := {"about", "restarts", "poor_scans", "duration_s", "replay_s"} - set(summary):
+        raise _damaged(path, KeyError(*missing))
+    return summary
+
+
+def _damaged(path: Path, error: Exception) -> ComparisonError:
+    return ComparisonError(f"{path}: is damaged ({error}); run `adaptune online --again`")
+
+
+def _kitti(folder: Path, mode: str) -> KittiError:
+    """KITTI's error over 100 to 800 m, where the drive is long enough and the truth is known."""
+    if not (folder / "reference.tum").exists():
+        return KittiError(np.nan, np.nan, ())
+    reference = read_tum(folder / "reference.tum")
+    odometry = read_tum(folder / mode / "trajectory.tum")
+    both = np.isin(odometry.stamps, reference.stamps)
+    return kitti_error(reference.T_world_sensor, odometry.T_world_sensor[both])
+
+
+def _track(folder: Path, mode: str, study: Study) -> Track:
     odometry = read_tum(folder / mode / "trajectory.tum")
     stamps = odometry.stamps
     errors = np.full(len(stamps), np.nan)
@@ -269,11 +327,16 @@ def _track(folder: Path, mode: str, study: Study) -> Track:
             T_ref_sensor, odometry.T_world_sensor, study.config.sub_trajectory
         )
     frames = _columns(folder / mode / "frames.csv")
+    if len(frames.get("restarted", [])) != len(stamps):
+        raise _damaged(folder / mode / "frames.csv", ValueError("not a row for every scan"))
     choices = _columns(folder / mode / "selections.csv")
     chosen: dict[str, Sequence[Any]] = {name: choices.get(name, []) for name in study.space.names}
-    at = np.array([int(s) for s in choices.get("stamp_ns", [])], np.int64)
+    try:
+        at = np.array([int(s) for s in choices.get("stamp_ns", [])], np.int64)
+    except (TypeError, ValueError) as error:
+        raise _damaged(folder / mode / "selections.csv", error) from error
     if not len(at):
-        about = json.loads((folder / mode / "replay.json").read_text(encoding="utf-8"))["about"]
+        about = _summary(folder / mode)["about"]
         chosen = {name: [about["parameters"][name]] for name in study.space.names}
         at = stamps[:1]
     else:
@@ -288,8 +351,11 @@ def _track(folder: Path, mode: str, study: Study) -> Track:
 
 
 def _columns(path: Path) -> dict[str, list[str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise _damaged(path, error) from error
     return {key: [row[key] for row in rows] for key in (rows[0] if rows else {})}
 
 
@@ -317,12 +383,14 @@ def _row(
     fixed: NDArray[np.float64],
     block: int,
     summary: dict[str, Any],
+    kitti: KittiError,
 ) -> dict[str, Any]:
     known = np.isfinite(track.errors) & np.isfinite(fixed)
     mean = low = high = ratio = ratio_low = ratio_high = None
     if known.any():
         mean, ratio, intervals = bootstrap(track.errors[known], fixed[known], block)
-        (low, high), (ratio_low, ratio_high) = intervals
+        if known.sum() >= MIN_BLOCKS * block:
+            (low, high), (ratio_low, ratio_high) = intervals
     switches = 0
     if len(track.choice_seconds) > 1:
         values = list(zip(*track.choices.values(), strict=True))
@@ -341,6 +409,10 @@ def _row(
         "_rte_high": high,
         "_ratio_low": ratio_low,
         "_ratio_high": ratio_high,
+        "_blocks": int(known.sum() // block),
+        "_median": float(np.median(track.errors[known])) if known.any() else None,
+        "_kitti_percent": kitti.translation,
+        "_kitti_deg_per_m": kitti.rotation,
     }
 
 
@@ -381,7 +453,7 @@ def bootstrap(
 
 
 def _pooled(rows: list[dict[str, Any]], ratios: dict[str, list[float]]) -> list[dict[str, Any]]:
-    """Over all sequences: the mean RTE, the geometric mean of the ratios, and their extremes."""
+    """Over all sequences: the mean RTE, and the geometric mean of the ratios."""
     pooled = []
     for mode, of_mode in ratios.items():
         mine = [row for row in rows if row["mode"] == mode and row["RTE [%]"] is not None]

@@ -39,7 +39,7 @@ def test_rules_gain_where_places_tell_the_sets_apart():
         np.testing.assert_allclose(validation.ratios[rule], [0.5] * 4 + [0.4] * 4, rtol=0.05)
         assert validation.verdict(rule).startswith(f"Adapt by `{rule}`")
     np.testing.assert_allclose(
-        validation.ratios["oracle, second"], [0.5] * 4 + [0.4] * 4, rtol=0.05
+        validation.ratios["oracle, period"], [0.5] * 4 + [0.4] * 4, rtol=0.05
     )
     np.testing.assert_allclose(validation.ratios["baseline"], [0.5] * 4 + [3.0] * 4, rtol=0.05)
 
@@ -64,7 +64,7 @@ class Cheat(Rule):
 def test_the_sequence_left_out_is_never_seen():
     sequences = two_kinds(np.random.default_rng(1))
     marked = [
-        LabelledSequence(s.name, s.seconds, s.histograms, s.errors + np.float32(i))
+        LabelledSequence(s.name, s.period, s.histograms, s.errors + np.float32(i))
         for i, s in enumerate(sequences)
     ]
     Cheat.fitted = ()
@@ -97,16 +97,17 @@ def test_the_oracle_is_never_worse_than_anything():
     sequences = [sequence(str(i), rng.lognormal(size=5), i % 3, rng) for i in range(6)]
     ratios = leave_one_out(sequences, SETS).ratios
     for mode in ratios:
-        assert (ratios["oracle, second"] <= ratios[mode] + 1e-12).all()
+        assert (ratios["oracle, period"] <= ratios[mode] + 1e-12).all()
 
 
 @pytest.mark.parametrize(
     ("ratios", "verdict"),
     [
-        ([0.5, 0.6, 0.7, 0.8], "Adapt by"),
-        ([0.5, 0.6, 0.7, 1.2], "Do not adapt by"),
-        ([0.7, 1.04, 1.02, 1.01], "Nothing shows that"),
-        ([1.0, 1.0, 1.0, 1.0], "Nothing shows that"),
+        ([0.5, 0.6, 0.7, 0.8, 0.5, 0.6], "Adapt by"),
+        ([0.5, 0.6, 0.7, 0.8, 0.6], "Too few"),
+        ([0.5, 0.6, 0.7, 0.5, 0.6, 1.2], "Do not adapt by"),
+        ([0.7, 1.04, 1.02, 1.01, 1.0, 1.0], "Nothing shows that"),
+        ([1.0] * 6, "Nothing shows that"),
     ],
 )
 def test_verdicts(ratios, verdict):

@@ -23,7 +23,7 @@ def trained(study_file, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def replayed(trained):
-    assert run_replays(trained, trained.folder / "model.npz") == 4
+    run_replays(trained, trained.folder / "model.npz")
     return trained
 
 
@@ -32,9 +32,10 @@ def test_rows_and_files(replayed):
     assert [(row["sequence"], row["mode"]) for row in rows] == [("three", mode) for mode in MODES]
     of = {row["mode"]: row for row in rows}
     assert of["fixed"]["vs fixed"] == 1.0
-    assert of["fixed"]["95 %"] == "1.00-1.00"
     for row in rows:
-        assert row["_rte_low"] <= row["RTE [%]"] <= row["_rte_high"]
+        # Three blocks of a sub-trajectory's length say nothing of other drives.
+        assert row["_blocks"] < 10
+        assert row["95 %"] is None
         assert row["vs fixed"] == pytest.approx(row["RTE [%]"] / of["fixed"]["RTE [%]"])
     folder = replayed.folder / "comparison"
     with (folder / "comparison.csv").open() as file:
@@ -107,10 +108,18 @@ def test_a_written_reference_is_that_of_the_scans(replayed):
 
 
 def test_rows_over_several_sequences(replayed, study_file):
-    study = load_study(study_file, ["test=[three, two]"], replayed.folder)
+    bag = study_file.parent / "two.bag"
+    study = load_study(
+        study_file,
+        [
+            "test=[three, four]",
+            f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}",
+        ],
+        replayed.folder,
+    )
     run_replays(study, replayed.folder / "model.npz")
     rows = compare(study)
-    assert [row["sequence"] for row in rows] == ["three"] * 4 + ["two"] * 4 + ["all 2"] * 4
+    assert [row["sequence"] for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all 2"] * 4
     a, b, all_ = rows[3], rows[7], rows[11]
     assert all_["RTE [%]"] == pytest.approx((a["RTE [%]"] + b["RTE [%]"]) / 2)
     assert all_["vs fixed"] == pytest.approx((a["vs fixed"] * b["vs fixed"]) ** 0.5)
