@@ -6,6 +6,7 @@ from pathlib import Path
 
 import drives
 import pytest
+from needs import lacking
 
 STUDY = """\
 odometry:
@@ -23,13 +24,6 @@ test: [three]
 sub_trajectory: 3.0
 offline: {trials: 10, initial: 4, batch: 4, seed: 3, workers: 2}
 """
-
-
-def lacking(name: str, reason: str) -> None:
-    """Skip for want of `name`; fail if ADAPTUNE_REQUIRE names it (comma-separated)."""
-    if name in os.environ.get("ADAPTUNE_REQUIRE", "").split(","):
-        pytest.fail(f"ADAPTUNE_REQUIRE names {name}, but {reason}")
-    pytest.skip(reason)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -3,7 +3,7 @@ from functools import cache
 import numpy as np
 import pytest
 import turns
-from conftest import lacking
+from needs import lacking
 
 from adaptune.geometry import invert
 from adaptune.odometry import Isolated, Limits, OdometryError, box_class

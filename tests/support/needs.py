@@ -1,0 +1,12 @@
+"""What tests need that is not in the repository."""
+
+import os
+
+import pytest
+
+
+def lacking(name: str, reason: str) -> None:
+    """Skip for want of `name`; fail if ADAPTUNE_REQUIRE names it (comma-separated)."""
+    if name in os.environ.get("ADAPTUNE_REQUIRE", "").split(","):
+        pytest.fail(f"ADAPTUNE_REQUIRE names {name}, but {reason}")
+    pytest.skip(reason)
