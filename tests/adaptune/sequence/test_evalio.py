@@ -9,7 +9,8 @@ from adaptune.sequence import SequenceConfig, SequenceError, evalio, open_sequen
 
 
 def test_without_evalio_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "evalio", None)
+    for module in ("evalio", *(m for m in sys.modules if m.startswith("evalio."))):
+        monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(SequenceError, match="pip install evalio"):
         open_sequence(SequenceConfig(evalio="botanic_garden/b1005_00"))
 
