@@ -76,7 +76,11 @@ class PairedExpectedRatio(Rule):
         return self.kernel_ @ (weights @ np.array(ratios)), float(weights @ np.array(fixed))
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Rule.predict`."""
+        """See `Rule.predict`.
+
+        For the fixed set too this is the smoothed ratio times its error; `select` tells the error
+        itself.
+        """
         ratio, fixed = self._compare(feature)
         return ratio * fixed
 

@@ -180,3 +180,30 @@ def test_bootstrap_of_a_ratio_is_paired():
     assert mean == pytest.approx(0.5 * fixed.mean())
     assert (ratio, ratio_low, ratio_high) == pytest.approx((0.5, 0.5, 0.5))
     assert low < mean < high
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("replay.json", "{"),
+        ("replay.json", "[]"),
+        ("replay.json", "{}"),
+        ("frames.csv", "a,b\n1,2\n"),
+        ("selections.csv", "stamp_ns\nnone\n"),
+    ],
+)
+def test_a_damaged_replay_is_named(replayed, file, text):
+    path = replayed.folder / "replays/three/paired" / file
+    before = path.read_text()
+    path.write_text(text)
+    try:
+        with pytest.raises(ComparisonError, match=rf"{file}: is damaged .*--again"):
+            compare(replayed)
+    finally:
+        path.write_text(before)
+
+
+def test_replays_of_another_setting_are_refused(replayed, study_file):
+    other = load_study(study_file, ["online.period=2"], replayed.folder)
+    with pytest.raises(ComparisonError, match="was replayed with another period"):
+        compare(other)

@@ -1,0 +1,81 @@
+"""What becomes of a study whose files were damaged, whose recordings changed, or that is in use."""
+
+import subprocess
+import sys
+
+import drives
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.study import ConfigurationError, load_study
+from offline.campaign import train
+
+
+@pytest.fixture
+def study(study_file, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.bag").write_bytes((study_file.parent / f"{name}.bag").read_bytes())
+    (tmp_path / "small.yaml").write_text(
+        study_file.read_text().replace("bag: three.bag", "bag: two.bag")
+    )
+    return load_study(tmp_path / "small.yaml", ["offline.trials=4"], tmp_path / "run")
+
+
+def test_frames_that_are_removed_are_made_again(study):
+    train(study)
+    frames = study.folder / "trials/one/frames.npz"
+    before = frames.read_bytes()
+    frames.write_bytes(before[:100])
+    with pytest.raises(AdaptuneError, match=r"frames\.npz: is damaged .* remove it"):
+        train(study)
+    frames.unlink()
+    train(study)
+    assert frames.read_bytes() == before
+
+
+def test_a_damaged_trial_is_named(study):
+    train(study)
+    trial = study.folder / "trials/two/00002.npz"
+    trial.write_bytes(trial.read_bytes()[:1000])
+    with pytest.raises(AdaptuneError, match=r"00002\.npz: is damaged .* remove it"):
+        train(study)
+    trial.unlink()
+    train(study)
+
+
+def test_another_recording_in_its_place_is_noticed(study, tmp_path):
+    train(study)
+    (tmp_path / "one.bag").unlink()
+    drives.write_bag(tmp_path / "one.bag", drives.scans(7, 40))
+    with pytest.raises(ConfigurationError, match=r"other values of recordings\.one"):
+        train(load_study(tmp_path / "small.yaml", ["offline.trials=4"], study.folder))
+
+
+@pytest.mark.usefixtures("study")
+def test_a_recording_of_empty_clouds_is_refused(tmp_path):
+    empty = [(stamp, points[:3], T) for stamp, points, T in drives.scans(0, 20)]
+    (tmp_path / "two.bag").unlink()
+    drives.write_bag(tmp_path / "two.bag", empty)
+    with pytest.raises(AdaptuneError, match=r"two: none of its 20 scans has 20 points"):
+        train(load_study(tmp_path / "small.yaml", [], tmp_path / "other"))
+
+
+def test_two_cannot_work_in_one_folder(study):
+    study.open()
+    other = (
+        "from pathlib import Path; from adaptune.study import load_study;"
+        f"load_study(Path({str(study.folder.parent / 'small.yaml')!r}), [],"
+        f" Path({str(study.folder)!r})).open()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", other], capture_output=True, text=True, check=False
+    )
+    assert "another adaptune is at work here" in done.stderr
+
+
+@pytest.mark.parametrize("text", ["", "training: [", "\xff", "a: 1\n"])
+def test_a_damaged_configuration_is_named(study, text):
+    study.open()
+    (study.folder / "study.yaml").write_text(text, encoding="latin-1")
+    with pytest.raises(ConfigurationError, match=r"study\.yaml: is damaged"):
+        study.check()
