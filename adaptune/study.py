@@ -508,8 +508,16 @@ def _validated(
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
+        told: set[tuple[str | int, ...]] = set()
         for detail in error.errors(include_url=False):
-            path = tuple(detail["loc"])
+            # Where several types will do, pydantic names each of them in the path.
+            tried = [isinstance(part, str) and "[" in part for part in detail["loc"]]
+            path = tuple(
+                part for part, is_type in zip(detail["loc"], tried, strict=True) if not is_type
+            )
+            if any(tried) and path in told:
+                continue
+            told.add(path)
             message = detail["msg"].removeprefix("Value error, ")
             if detail["type"] == "extra_forbidden":
                 message = f"unknown key; {nearest(str(path[-1]), _keys(model, path[:-1]))}"

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationInfo,
@@ -54,6 +55,16 @@ def resolve(path: str, info: ValidationInfo) -> str:
         raise ValueError(f"the environment variable {unset[0]} is not set")
     folder = (info.context or {}).get("folder", Path())
     return str((Path(folder) / Path(os.path.expandvars(path)).expanduser()).resolve())
+
+
+def _resolve_bags(given: Any, info: ValidationInfo) -> Any:
+    if isinstance(given, str):
+        return resolve(given, info)
+    if given is None:
+        return None
+    if not isinstance(given, list | tuple) or not given or {type(path) for path in given} != {str}:
+        raise ValueError("give the path of a bag, or a list of paths")
+    return tuple(resolve(path, info) for path in given)
 
 
 def _resolve_file(reference: str, info: ValidationInfo) -> str:
@@ -253,11 +264,7 @@ class SequenceConfig(_Part):
         Whether to keep decoded bags on disk.
     """
 
-    bag: (
-        Annotated[str, AfterValidator(resolve)]
-        | Annotated[tuple[Annotated[str, AfterValidator(resolve)], ...], Field(min_length=1)]
-        | None
-    ) = None
+    bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
     kitti: Annotated[str, AfterValidator(resolve)] | None = None
     folder: Annotated[str, AfterValidator(resolve)] | None = None
     evalio: str | None = None

@@ -74,6 +74,8 @@ def test_reads_a_study(study_file, tmp_path):
         ("test=[three, three]", ["test.1", "named twice"]),
         ("sequences.one.bag=four.bag", ["sequences.one", "four.bag", "no such bag"]),
         ("sequences.one.bag=${NO_SUCH_VARIABLE}/a.bag", ["NO_SUCH_VARIABLE"]),
+        ("sequences.one.bag=7", ["sequences.one.bag: give the path of a bag"]),
+        ("sequences.one.bag=['${NO_SUCH_VARIABLE}']", ["sequences.one.bag: the environment"]),
         ("sequences.one.points=/point", ["sequences.one", "'/points'", "/truth"]),
         ("sequences.one.points=/truth", ["sequences.one", "/truth is", "PoseStamped"]),
         ("sequences.one.reference=/points", ["sequences.one", "/points is", "PointCloud2"]),

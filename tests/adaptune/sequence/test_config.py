@@ -43,7 +43,7 @@ def test_a_configuration_survives_its_own_dump(tmp_path: Path) -> None:
     [
         ({}, "give one of bag, kitti, folder, evalio, not none"),
         ({"bag": "a.bag", "kitti": "b"}, "not bag and kitti"),
-        ({"bag": []}, "at least 1 item"),
+        ({"bag": []}, "a list of paths"),
         ({"kitti": "b", "points": "/p"}, "`points` names a topic of a bag; kitti has none"),
         ({"bag": "a", "start": 3, "stop": 2}, r"start \(3\) must be less than stop \(2\)"),
         ({"bag": "a", "stride": 0}, "greater than or equal to 1"),
