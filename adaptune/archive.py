@@ -1,8 +1,6 @@
 """Trials on disk: what was run, where it went, and how wrong it was at every frame."""
 
 import json
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.files import replacing
+from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.geometry import Poses
 from adaptune.metrics import cap
 from adaptune.space import ParameterSet
-
-_DAMAGE = (OSError, ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What numpy and zipfile raise on files that are not what they say."""
 
 
 class ArchiveError(AdaptuneError):
@@ -182,5 +177,5 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
             return dict(file)
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: there is no such file; run `adaptune offline`") from error
-    except _DAMAGE as error:
+    except DAMAGED_NPZ as error:
         raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error

@@ -33,7 +33,41 @@ class _Parameter(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Float(_Parameter):
+class _Range(_Parameter):
+    """What real and whole numbers share: bounds, and a scale between them."""
+
+    low: float
+    high: float
+    baseline: float
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low ({self.low:g}) must be less than high ({self.high:g})")
+        if not self.low <= self.baseline <= self.high:
+            raise ValueError(
+                f"baseline ({self.baseline:g}) must lie between low ({self.low:g}) "
+                f"and high ({self.high:g})"
+            )
+        if self.log and self.low <= 0:
+            raise ValueError(f"a log scale needs low ({self.low:g}) above 0")
+        return self
+
+    def to_unit(self, value: Any) -> float:
+        """Map a value to [0, 1], a whole number to the middle of its share."""
+        low, high = self._bounds()
+        return (self._scale(float(value)) - low) / (high - low)
+
+    def _scale(self, value: float) -> float:
+        return math.log(value) if self.log else value
+
+    def _bounds(self) -> tuple[float, float]:
+        """Ends of the unit interval, scaled."""
+        return self._scale(self.low), self._scale(self.high)
+
+
+class Float(_Range):
     """A real number from `low` to `high`, both included; `log` spaces it evenly in ratio."""
 
     type: Literal["float"] = "float"
@@ -41,11 +75,6 @@ class Float(_Parameter):
     high: float = Field(allow_inf_nan=False)
     baseline: float
     log: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _check_range(self)
-        return self
 
     def contains(self, value: object) -> bool:
         """Whether `value` is a number in the range."""
@@ -55,11 +84,6 @@ class Float(_Parameter):
             and self.low <= value <= self.high
         )
 
-    def to_unit(self, value: Any) -> float:
-        """Map a value to [0, 1]."""
-        low, high = self._bounds()
-        return (self._scale(float(value)) - low) / (high - low)
-
     def from_unit(self, unit: float) -> float:
         """Map from [0, 1] to a value."""
         low, high = self._bounds()
@@ -67,14 +91,8 @@ class Float(_Parameter):
         # The exponential may overshoot a bound by a rounding error.
         return min(max(math.exp(value) if self.log else value, self.low), self.high)
 
-    def _scale(self, value: float) -> float:
-        return math.log(value) if self.log else value
 
-    def _bounds(self) -> tuple[float, float]:
-        return self._scale(self.low), self._scale(self.high)
-
-
-class Integer(_Parameter):
+class Integer(_Range):
     """A whole number from `low` to `high`, both included."""
 
     type: Literal["integer"] = "integer"
@@ -82,11 +100,6 @@ class Integer(_Parameter):
     high: int
     baseline: int
     log: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _check_range(self)
-        return self
 
     def contains(self, value: object) -> bool:
         """Whether `value` is a whole number in the range."""
@@ -96,20 +109,12 @@ class Integer(_Parameter):
             and self.low <= value <= self.high
         )
 
-    def to_unit(self, value: Any) -> float:
-        """Map a value to the middle of its share of [0, 1]."""
-        low, high = self._bounds()
-        return (self._scale(float(value)) - low) / (high - low)
-
     def from_unit(self, unit: float) -> int:
         """Map from [0, 1] to the value whose share it falls in."""
         low, high = self._bounds()
         scaled = low + min(max(unit, 0.0), 1.0) * (high - low)
         value = round(math.exp(scaled) if self.log else scaled)
         return min(max(value, self.low), self.high)
-
-    def _scale(self, value: float) -> float:
-        return math.log(value) if self.log else value
 
     def _bounds(self) -> tuple[float, float]:
         # Half a step on either side gives the first and the last value a whole share.
@@ -145,18 +150,6 @@ class Categorical(_Parameter):
         """Map from [0, 1] to the choice whose share it falls in."""
         n = len(self.choices)
         return self.choices[min(int(min(max(unit, 0.0), 1.0) * n), n - 1)]
-
-
-def _check_range(parameter: Float | Integer) -> None:
-    if not parameter.low < parameter.high:
-        raise ValueError(f"low ({parameter.low:g}) must be less than high ({parameter.high:g})")
-    if not parameter.low <= parameter.baseline <= parameter.high:
-        raise ValueError(
-            f"baseline ({parameter.baseline:g}) must lie between low ({parameter.low:g}) "
-            f"and high ({parameter.high:g})"
-        )
-    if parameter.log and parameter.low <= 0:
-        raise ValueError(f"a log scale needs low ({parameter.low:g}) above 0")
 
 
 Parameter = Annotated[Float | Integer | Categorical, Field(discriminator="type")]

@@ -11,6 +11,7 @@ from adaptune import __version__, report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
 from adaptune.files import write_text
+from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.model.base import mean_errors
 from adaptune.space import ParameterSet
@@ -72,7 +73,7 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
         whole = _run_whole(archive, workers, model, progress)
     model.save(study.folder / "model.npz")
     means = {
-        name: mean_errors(model.errors[model.sequence == s], np.zeros((model.sequence == s).sum()))
+        name: cap(model.errors[model.sequence == s]).mean(axis=0)
         for s, name in enumerate(model.sequences)
     }
     write_text(study.folder / "fixed.yaml", yaml.dump(model.sets[model.fixed]))

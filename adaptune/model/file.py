@@ -1,8 +1,6 @@
 """The error model as a file: what passes from training to the robot."""
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 from adaptune import __version__
 from adaptune.descriptor import N_FEATURES, ScaledPCA
 from adaptune.errors import AdaptuneError
-from adaptune.files import replacing
+from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.model.base import TrainingData
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
@@ -21,19 +19,8 @@ FORMAT = 1
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 
-_DAMAGE = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    EOFError,
-    AttributeError,
-    RuntimeError,
-    SpaceError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What numpy, zipfile and json raise on files that are not what they say."""
+_DAMAGED = (*DAMAGED_NPZ, KeyError, AttributeError, SpaceError)
+"""What is raised, besides, on a header that is not a model's."""
 
 
 class ModelError(AdaptuneError):
@@ -148,7 +135,7 @@ class ErrorModel:
                 model.check()
         except FileNotFoundError as error:
             raise ModelError(f"{path}: there is no such model") from error
-        except _DAMAGE as error:
+        except _DAMAGED as error:
             raise ModelError(f"{path}: is not an error model, or damaged ({error})") from error
         return model
 
