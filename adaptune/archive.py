@@ -1,16 +1,18 @@
 """Trials on disk: what was run, where it went, and how wrong it was at every frame."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.files import DAMAGED_NPZ, replacing
+from adaptune.files import DAMAGED_NPZ, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import cap
 from adaptune.space import ParameterSet
@@ -74,8 +76,76 @@ class Trial:
         return float(np.nanmean(cap(self.errors)))
 
 
+@dataclass(frozen=True)
+class Summary:
+    """What the driver keeps in memory of a finished trial.
+
+    Attributes
+    ----------
+    parameters : dict
+    mean_error : float
+        See `Trial.mean_error`.
+    lost : int
+        How often the odometry lost track.
+    faults : int
+        How often its process ended, or it gave no pose.
+    ms : float
+        Milliseconds that the odometry took for a scan.
+    """
+
+    parameters: ParameterSet
+    mean_error: float
+    lost: int
+    faults: int
+    ms: float
+
+
+def summarise(trial: Trial) -> Summary:
+    """Summarise a trial; it is the same before it is written and after it is read."""
+    errors = trial.errors.astype(np.float32).astype(np.float64)
+    seconds = trial.seconds[1:].astype(np.float32)  # the first scan starts the odometry
+    return Summary(
+        trial.parameters,
+        float(np.nanmean(cap(errors))),
+        int(trial.restarted.sum()),
+        len(trial.faults),
+        float(1e3 * seconds.mean(dtype=np.float64)) if len(seconds) else 0.0,
+    )
+
+
+class _Entry(NamedTuple):
+    """A line of the index: a summary, and by what a change of its file is noticed."""
+
+    sequence: str
+    trial: int
+    size: int
+    mtime_ns: int
+    summary: Summary
+
+    def dump(self) -> str:
+        """The line."""
+        return json.dumps(self._asdict() | {"summary": asdict(self.summary)}) + "\n"
+
+    @classmethod
+    def load(cls, line: str) -> "_Entry | None":
+        """Parse a line; None for one that is damaged."""
+        try:
+            data = json.loads(line)
+            return cls(**data | {"summary": Summary(**data["summary"])})
+        except (ValueError, TypeError, KeyError):
+            return None
+
+
+INDEX = "index.jsonl"
+_TRIAL = re.compile(r"\d{5,}\.npz")
+
+
 class Archive:
     """The trials of a study, a file for each trial and sequence.
+
+    The files are the truth. The index of their summaries, ``index.jsonl``, only spares opening
+    them all: a line whose file has changed since, or is gone, does not count, and what it lacks
+    is read from the file.
 
     Parameters
     ----------
@@ -85,15 +155,61 @@ class Archive:
 
     def __init__(self, folder: Path):
         self.folder = folder
+        self._finished: dict[str, dict[int, Summary]] | None = None
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
         """File of a trial; of its whole run, without new starts at the reference, if `whole`."""
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
     def tidy(self) -> None:
-        """Remove what a killed process was writing; no other must be writing now."""
-        for unfinished in self.folder.glob("*/.*.npz"):
+        """Remove what a killed process was writing, and mend the index; none must be writing now.
+
+        Raises
+        ------
+        ArchiveError
+            If a trial that the index lacks is damaged.
+        """
+        for unfinished in (*self.folder.glob("*/.*.npz"), *self.folder.glob(".index.*")):
             unfinished.unlink()
+        index = "".join(entry.dump() for entry in self._entries())
+        if index != self._index():
+            write_text(self.folder / INDEX, index)
+
+    def finished(self, sequence: str) -> Mapping[int, Summary]:
+        """The finished trials on a sequence by number, without the whole runs.
+
+        It grows as trials are written.
+
+        Raises
+        ------
+        ArchiveError
+            If a trial that the index lacks is damaged.
+        """
+        if self._finished is None:
+            self._finished = {}
+            for entry in self._entries():
+                self._finished.setdefault(entry.sequence, {})[entry.trial] = entry.summary
+        return self._finished.setdefault(sequence, {})
+
+    def _entries(self) -> Iterator[_Entry]:
+        """What the index should say."""
+        indexed = {
+            entry[:4]: entry for line in self._index().splitlines() if (entry := _Entry.load(line))
+        }
+        for path in sorted(self.folder.glob("*/")):
+            with os.scandir(path) as files:
+                trials = sorted(
+                    (int(f.name[:-4]), f.stat()) for f in files if _TRIAL.fullmatch(f.name)
+                )
+            for number, status in trials:
+                key = (path.name, number, status.st_size, status.st_mtime_ns)
+                yield indexed.get(key) or _Entry(*key, summarise(self.read(path.name, number)))
+
+    def _index(self) -> str:
+        try:
+            return (self.folder / INDEX).read_text("utf-8", errors="replace")
+        except FileNotFoundError:
+            return ""
 
     def has_frames(self, sequence: str) -> bool:
         """Whether what all trials on a sequence share is there."""
@@ -137,6 +253,14 @@ class Archive:
                 seconds=trial.seconds.astype(np.float32),
                 faults=np.frombuffer(json.dumps(trial.faults).encode(), np.uint8),
             )
+        if whole:
+            return
+        status, summary = path.stat(), summarise(trial)
+        entry = _Entry(sequence, number, status.st_size, status.st_mtime_ns, summary)
+        with (self.folder / INDEX).open("a", encoding="utf-8") as file:
+            file.write(entry.dump())
+        if self._finished is not None:
+            self._finished.setdefault(sequence, {})[number] = summary
 
     def read(self, sequence: str, number: int, whole: bool = False) -> Trial:
         """Read a trial.
@@ -162,19 +286,30 @@ class Archive:
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials)."""
-        errors = [self.read(sequence, n).errors for n in numbers]
-        if len({len(of_trial) for of_trial in errors}) > 1:
-            raise ArchiveError(
-                f"{self.folder / sequence}: trials are of recordings of different lengths; remove "
-                f"the folder and run again"
-            )
-        return np.stack(errors, axis=1).astype(np.float32)
+        read: NDArray[np.float32] | None = None
+        for i, number in enumerate(numbers):
+            path = self.trial_path(sequence, number)
+            try:
+                # Arrays are loaded when they are asked for: poses, most of the file, are not.
+                errors = _read(path, ["errors"])["errors"]
+            except KeyError as error:
+                raise ArchiveError(f"{path}: lacks {error}; remove it and run again") from error
+            if read is None:
+                read = np.empty((len(errors), len(numbers)), np.float32)
+            if len(errors) != len(read):
+                raise ArchiveError(
+                    f"{self.folder / sequence}: trials are of recordings of different lengths; "
+                    f"remove the folder and run again"
+                )
+            read[:, i] = errors
+        return np.empty((0, 0), np.float32) if read is None else read
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]]:
+def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Arrays of a file: those named, or all."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+            return {name: file[name] for name in names or file}
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: there is no such file; run `adaptune offline`") from error
     except DAMAGED_NPZ as error:

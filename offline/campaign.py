@@ -1,7 +1,7 @@
 """The offline stage: run trials batch by batch, then fit the error model."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from adaptune.model.base import mean_errors
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from offline.samplers import propose
-from offline.workers import Task, Workers
+from offline.workers import Task, Workers, run
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -79,14 +79,11 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
     write_text(study.folder / "fixed.yaml", yaml.dump(model.sets[model.fixed]))
     report.write_rows(study.folder, "trials", _rows(model, means))
     lost = {
-        name: (_lost(archive, name, 0), _lost(archive, name, model.fixed))
+        name: (finished[0].lost, finished[model.fixed].lost)
         for name in model.sequences
+        if (finished := archive.finished(name))
     }
     return Training(model, {name: m.tolist() for name, m in means.items()}, whole, lost)
-
-
-def _lost(archive: Archive, name: str, number: int) -> int:
-    return int(archive.read(name, number).restarted.sum())
 
 
 def _rows(model: ErrorModel, means: dict[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
@@ -104,6 +101,7 @@ def _run_batches(
 ) -> list[ParameterSet]:
     config = study.config.offline
     names = study.config.training
+    finished = {name: archive.finished(name) for name in names}
     history: list[tuple[ParameterSet, float]] = []
     total = config.trials * len(names)
     done = 0
@@ -111,20 +109,19 @@ def _run_batches(
     for batch in range(-(-config.trials // config.batch)):
         first = batch * config.batch
         numbers = range(first, min(first + config.batch, config.trials))
-        missing = {
-            name: [n for n in numbers if not archive.trial_path(name, n).exists()] for name in names
-        }
+        missing = {name: [n for n in numbers if n not in finished[name]] for name in names}
         n_missing = sum(map(len, missing.values()))
         done += len(numbers) * len(names) - n_missing
         progress("trials", done, total)
         unframed = [name for name in names if not archive.has_frames(name)]
         if n_missing or unframed:
             sets = propose(study.space, config, batch, history)
-            for task in workers.run(_tasks(missing, unframed, sets, first, workers.n)):
+            tasks = _tasks(missing, unframed, sets, first, workers.n)
+            for task in _run(archive, workers, tasks):
                 done += len(task.numbers)
                 progress("trials", done, total)
         for n in numbers:
-            trials = [archive.read(name, n) for name in names]
+            trials = [finished[name][n] for name in names]
             error = float(np.mean([trial.mean_error for trial in trials]))
             history.append((trials[0].parameters, error))
         best = min(range(len(history)), key=lambda i: history[i][1])
@@ -146,12 +143,22 @@ def _tasks(
     n_workers: int,
 ) -> list[Task]:
     """Share every sequence's trials between the workers; reading it again is a task of its own."""
-    return [Task(name, (), ()) for name in unframed if not missing[name]] + [
-        Task(name, tuple(some), tuple(sets[n - first] for n in some))
+    return [Task(name, (), (), frames=True) for name in unframed if not missing[name]] + [
+        Task(name, tuple(some), tuple(sets[n - first] for n in some), frames=name in unframed)
         for name, numbers in missing.items()
         for share in range(n_workers)
         if (some := numbers[share::n_workers])
     ]
+
+
+def _run(archive: Archive, workers: Workers, tasks: list[Task]) -> Iterator[Task]:
+    """Run tasks, and yield each when its results are in the archive."""
+    for task, result in run(workers, tasks):
+        if result.frames is not None:
+            archive.write_frames(task.sequence, result.frames)
+        for number, trial in zip(task.numbers, result.trials, strict=True):
+            archive.write(task.sequence, number, trial, task.whole)
+        yield task
 
 
 def _run_whole(
@@ -165,7 +172,7 @@ def _run_whole(
         for n in sorted(set(numbers))
         if not archive.trial_path(name, n, whole=True).exists()
     ]
-    for done, _ in enumerate(workers.run(tasks), start=1):
+    for done, _ in enumerate(_run(archive, workers, tasks), start=1):
         progress("whole runs", done, len(tasks))
     means = {
         (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))

@@ -5,17 +5,20 @@ import multiprocessing as mp
 import os
 import signal
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self, TypeVar
 
-from adaptune.archive import Archive
+from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from offline.trial import PreparedSequence, run_trials
+
+MOST_DEATHS = 3
+"""Of workers at the same task."""
 
 
 class WorkerError(AdaptuneError):
@@ -34,12 +37,154 @@ class Task(NamedTuple):
         Their parameter sets.
     whole : bool
         Run them without new starts at the reference.
+    frames : bool
+        Tell what all trials on the sequence share, too.
     """
 
     sequence: str
     numbers: tuple[int, ...]
     sets: tuple[ParameterSet, ...]
     whole: bool = False
+    frames: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"
+
+
+class Result(NamedTuple):
+    """What came of a task.
+
+    Attributes
+    ----------
+    trials : list of Trial
+    frames : Frames, optional
+        If they were asked for.
+    """
+
+    trials: list[Trial]
+    frames: Frames | None
+
+
+class Death(NamedTuple):
+    """Of a worker at its task, with what is known of it."""
+
+    cause: str
+
+
+Outcome = Result | AdaptuneError | Death
+
+
+W = TypeVar("W", bound=Hashable)
+"""What tells the workers of a pool apart."""
+
+
+class Pool(Protocol[W]):
+    """Workers that do one task at a time, wherever they are."""
+
+    def workers(self) -> Collection[W]:
+        """Those that are there, or come when they are given a task."""
+        ...
+
+    def start(self, worker: W, task: Task) -> None:
+        """Give an idle worker a task."""
+        ...
+
+    def wait(self) -> list[tuple[W, Outcome]]:
+        """Wait for some of the tasks, and tell what came of them; at times of none."""
+        ...
+
+
+def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result]]:
+    """Run tasks, and yield each with its result as it comes.
+
+    Tasks go to workers that have their sequence prepared, where there are such. What a worker
+    died at is run again by another.
+
+    Raises
+    ------
+    AdaptuneError
+        What a task raised.
+    WorkerError
+        If several workers died at the same task.
+    """
+    waiting = list(tasks)
+    running: dict[W, Task] = {}
+    deaths: dict[int, int] = {}
+    near: dict[W, set[str]] = {}
+    while waiting or running:
+        for worker in pool.workers():
+            if waiting and worker not in running:
+                task = _pick(waiting, near, worker)
+                waiting.remove(task)
+                near.setdefault(worker, set()).add(task.sequence)
+                running[worker] = task
+                pool.start(worker, task)
+        for worker, outcome in pool.wait():
+            task = running.pop(worker)
+            if isinstance(outcome, AdaptuneError):
+                raise outcome
+            if isinstance(outcome, Result):
+                yield task, outcome
+                continue
+            del near[worker]
+            deaths[id(task)] = deaths.get(id(task), 0) + 1
+            if deaths[id(task)] == MOST_DEATHS:
+                raise WorkerError(
+                    f"{MOST_DEATHS} workers died ({outcome.cause}) on {task}; if they were out of "
+                    f"memory, lower offline.memory or offline.workers"
+                )
+            waiting.insert(0, task)
+
+
+def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
+    """A task on a sequence that is ready here, else on one that is ready nowhere."""
+    here = near.get(worker, set())
+    elsewhere = set().union(*near.values()) - here
+    return min(waiting, key=lambda t: (t.sequence not in here, t.sequence in elsewhere))
+
+
+class Sequences:
+    """The sequences that a worker has prepared, as many as its memory holds.
+
+    Parameters
+    ----------
+    study
+        The study.
+    memory
+        Bytes that prepared scans may take.
+    """
+
+    def __init__(self, study: Study, memory: float):
+        self._study = study
+        self._memory = memory
+        self._ready: dict[str, PreparedSequence] = {}
+
+    def run(self, task: Task) -> Result:
+        """Do a task."""
+        sequence = self._prepared(task.sequence)
+        trials = run_trials(self._study, sequence, task.sets, task.whole)
+        return Result(trials, sequence.frames if task.frames else None)
+
+    def _prepared(self, name: str) -> PreparedSequence:
+        sequence = self._ready.pop(name, None)
+        if sequence is None:
+            # Make room for the newcomer by letting go of those not used for longest.
+            while self._ready and sum(s.nbytes for s in self._ready.values()) > self._memory / 2:
+                del self._ready[next(iter(self._ready))]
+            free = self._memory - sum(s.nbytes for s in self._ready.values())
+            sequence = PreparedSequence(self._study, name, free)
+        self._ready[name] = sequence
+        return sequence
+
+
+def attempt(sequences: Sequences, task: Task) -> Result | AdaptuneError:
+    """Do a task, and return what it raises."""
+    try:
+        return sequences.run(task)
+    except AdaptuneError as error:
+        return error
+    except Exception:
+        return WorkerError(f"{task}:\n{traceback.format_exc()}")
 
 
 class _Worker(NamedTuple):
@@ -48,7 +193,7 @@ class _Worker(NamedTuple):
 
 
 class Workers:
-    """A pool whose processes are given tasks on sequences they have already prepared.
+    """Processes on this machine.
 
     Use it as a context: leaving it ends the processes.
 
@@ -67,75 +212,45 @@ class Workers:
         # has imported what workers need starts in milliseconds.
         self._context = mp.get_context("forkserver")
         self._context.set_forkserver_preload(["offline.trial"])
-        self._workers: list[_Worker] = []
+        self._workers: dict[int, _Worker] = {}
+        self._busy: set[int] = set()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for worker in self._workers:
+        for worker in self._workers.values():
             worker.process.terminate()
             worker.connection.close()
-        for worker in self._workers:
+        for worker in self._workers.values():
             worker.process.join()
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[Task]:
-        """Run tasks, and yield each when its results are in the archive.
+    def workers(self) -> Collection[int]:
+        """See `Pool`."""
+        return range(self.n)
 
-        Raises
-        ------
-        AdaptuneError
-            What a task raised.
-        WorkerError
-            If a worker died twice at the same task.
-        """
-        waiting = list(tasks)
-        idle = list(range(self.n))
-        running: dict[int, Task] = {}
-        deaths: dict[int, int] = {}
-        near: list[set[str]] = [set() for _ in idle]
-        while waiting or running:
-            while idle and waiting:
-                w = idle.pop(0)
-                task = self._pick(waiting, near, w)
-                waiting.remove(task)
-                near[w].add(task.sequence)
-                running[w] = task
-                with contextlib.suppress(BrokenPipeError):  # reading from it will tell
-                    self._connection(w).send(task)
-            ready = wait([self._workers[w].connection for w in running])
-            for w in [w for w in running if self._workers[w].connection in ready]:
-                task = running.pop(w)
-                idle.append(w)
-                try:
-                    failure = self._workers[w].connection.recv()
-                except (EOFError, OSError):
-                    code = self._bury(w)
-                    near[w] = set()
-                    deaths[id(task)] = deaths.get(id(task), 0) + 1
-                    if deaths[id(task)] > 1:
-                        raise WorkerError(
-                            f"a worker died twice (exit code {code}) on {task.sequence}, trials "
-                            f"{', '.join(map(str, task.numbers))}; if it was out of memory, lower "
-                            f"offline.memory or offline.workers"
-                        ) from None
-                    waiting.insert(0, task)
-                    continue
-                if failure is not None:
-                    raise failure
-                yield task
+    def start(self, worker: int, task: Task) -> None:
+        """See `Pool`."""
+        if worker not in self._workers or not self._workers[worker].process.is_alive():
+            self._workers[worker] = self._spawn(worker)
+        self._busy.add(worker)
+        with contextlib.suppress(BrokenPipeError):  # reading from it will tell
+            self._workers[worker].connection.send(task)
 
-    def _pick(self, waiting: list[Task], near: list[set[str]], w: int) -> Task:
-        """A task on a sequence that is ready here, else on one that is ready nowhere."""
-        elsewhere = set().union(*near) - near[w]
-        return min(waiting, key=lambda t: (t.sequence not in near[w], t.sequence in elsewhere))
-
-    def _connection(self, w: int) -> Connection:
-        while len(self._workers) <= w:
-            self._workers.append(self._spawn(len(self._workers)))
-        if not self._workers[w].process.is_alive():
-            self._workers[w] = self._spawn(w)
-        return self._workers[w].connection
+    def wait(self) -> list[tuple[int, Outcome]]:
+        """See `Pool`."""
+        ready = wait([self._workers[w].connection for w in self._busy])
+        outcomes: list[tuple[int, Outcome]] = []
+        for w in [w for w in self._busy if self._workers[w].connection in ready]:
+            self._busy.remove(w)
+            process, connection = self._workers[w]
+            try:
+                outcomes.append((w, connection.recv()))
+            except (EOFError, OSError):
+                connection.close()
+                process.join()
+                outcomes.append((w, Death(f"exit code {process.exitcode}")))
+        return outcomes
 
     def _spawn(self, w: int) -> _Worker:
         here, there = self._context.Pipe()
@@ -147,47 +262,12 @@ class Workers:
         there.close()
         return _Worker(process, here)
 
-    def _bury(self, w: int) -> int | None:
-        worker = self._workers[w]
-        worker.connection.close()
-        worker.process.join()
-        return worker.process.exitcode
-
 
 def _serve(connection: Connection, study: Study, core: int, memory: float) -> None:
     # Ctrl-C reaches the whole group; the driver decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pin(core)
-    archive = Archive(study.folder / "trials")
-    ready: dict[str, PreparedSequence] = {}
+    sequences = Sequences(study, memory)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            task: Task = connection.recv()
-            failure: AdaptuneError | None = None
-            try:
-                _do(task, study, archive, ready, memory)
-            except AdaptuneError as error:
-                failure = error
-            except Exception:
-                failure = WorkerError(
-                    f"{task.sequence}, trials {', '.join(map(str, task.numbers))}:\n"
-                    f"{traceback.format_exc()}"
-                )
-            connection.send(failure)
-
-
-def _do(
-    task: Task, study: Study, archive: Archive, ready: dict[str, PreparedSequence], memory: float
-) -> None:
-    sequence = ready.pop(task.sequence, None)
-    if sequence is None:
-        # Make room for the newcomer by letting go of those not used for longest.
-        while ready and sum(s.nbytes for s in ready.values()) > memory / 2:
-            del ready[next(iter(ready))]
-        free = memory - sum(s.nbytes for s in ready.values())
-        sequence = PreparedSequence(study, task.sequence, free)
-        archive.write_frames(task.sequence, sequence.frames)
-    ready[task.sequence] = sequence
-    trials = run_trials(study, sequence, task.sets, task.whole)
-    for number, trial in zip(task.numbers, trials, strict=True):
-        archive.write(task.sequence, number, trial, task.whole)
+            connection.send(attempt(sequences, connection.recv()))

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive, ArchiveError, Frames, Trial
+from adaptune.archive import INDEX, Archive, ArchiveError, Frames, Trial, summarise
 
 N = 40
 PARAMETERS = {"distance": 0.1 + 0.2, "points": 7, "kernel": "Huber", "deskew": True}
@@ -54,6 +54,7 @@ def test_trials_survive(tmp_path):
     assert again.trial_path("cave", 12).is_file()
     assert again.trial_path("cave", 12) != again.trial_path("cave", 12, whole=True)
     assert len(list((tmp_path / "trials" / "cave").iterdir())) == 2
+    assert list(again.finished("cave")) == [12]
 
 
 def test_frames_survive(tmp_path):
@@ -76,6 +77,72 @@ def test_errors_of_several_trials(tmp_path):
     errors = archive.read_errors("cave", [3, 1])
     assert errors.dtype == np.float32
     np.testing.assert_array_equal(errors, np.stack([random_trial(n).errors for n in (3, 1)], 1))
+
+
+def fill(folder, n=4):
+    archive = Archive(folder)
+    for number in range(n):
+        archive.write("cave", number, random_trial(number))
+    archive.write("cave", 1, random_trial(9), whole=True)
+    archive.write("street", 0, random_trial(7))
+    return archive
+
+
+def test_finished_trials_are_told_from_the_index_as_from_the_files(tmp_path, monkeypatch):
+    archive = fill(tmp_path)
+    written = archive.finished("cave")
+    assert written == {n: summarise(random_trial(n)) for n in range(4)}
+    (tmp_path / INDEX).rename(tmp_path / "aside")
+    assert Archive(tmp_path).finished("cave") == written
+    (tmp_path / "aside").rename(tmp_path / INDEX)
+    monkeypatch.setattr(Archive, "read", None)
+    again = Archive(tmp_path)
+    assert again.finished("cave") == written
+    assert again.finished("street") == {0: summarise(random_trial(7))}
+    assert again.finished("none") == {}
+
+
+def test_what_is_written_is_finished(tmp_path):
+    archive = fill(tmp_path)
+    finished = archive.finished("cave")
+    archive.write("cave", 12, random_trial(12))
+    assert list(finished) == [0, 1, 2, 3, 12]
+
+
+def cut_short(index, _):
+    index.write_bytes(index.read_bytes()[:-30])
+
+
+def garble(index, _):
+    index.write_bytes(b"\xff\x00{}\n[1]\n" + index.read_bytes())
+
+
+def repeat(index, _):
+    index.write_bytes(2 * index.read_bytes())
+
+
+def lose(index, _):
+    index.unlink()
+
+
+def remove_trial(_, archive):
+    archive.trial_path("cave", 2).unlink()
+
+
+def replace_trial(_, archive):
+    Archive(archive.folder / "other").write("cave", 2, random_trial(77))
+    archive.trial_path("other/cave", 2).replace(archive.trial_path("cave", 2))
+
+
+@pytest.mark.parametrize("harm", [cut_short, garble, repeat, lose, remove_trial, replace_trial])
+def test_the_files_are_the_truth(tmp_path, harm):
+    harm(tmp_path / INDEX, fill(tmp_path))
+    Archive(tmp_path).tidy()
+    archive = Archive(tmp_path)
+    present = [n for n in range(4) if archive.trial_path("cave", n).exists()]
+    assert archive.finished("cave") == {n: summarise(archive.read("cave", n)) for n in present}
+    lines = (tmp_path / INDEX).read_text().splitlines()
+    assert len(lines) == len(present) + 1
 
 
 def test_mean_error_counts_a_lost_track_as_30_and_the_unknown_not_at_all():

@@ -118,7 +118,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
     monkeypatch.setattr(Workers, "_spawn", remember)
 
     def kill(_what, done, _total):
-        if done and len(spawned) == 2:
+        if done and len(spawned) == 2 and spawned[0].is_alive():
             os.kill(spawned[0].pid, signal.SIGKILL)
             time.sleep(0.05)
 
@@ -127,7 +127,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
     assert files(again.folder) == files(study.folder)
 
 
-def test_a_task_that_kills_its_worker_twice_is_told(study_file, tmp_path, monkeypatch):
+def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatch):
     study = load_study(study_file, ["offline.workers=1"], tmp_path / "study")
     spawn = Workers._spawn
 
@@ -138,7 +138,7 @@ def test_a_task_that_kills_its_worker_twice_is_told(study_file, tmp_path, monkey
         return worker
 
     monkeypatch.setattr(Workers, "_spawn", doomed)
-    with pytest.raises(WorkerError, match=r"died twice \(exit code -9\) on one, trials 0, 1, 2, 3"):
+    with pytest.raises(WorkerError, match=r"died \(exit code -9\) on one, trials 0, 1, 2, 3"):
         train(study)
 
 
