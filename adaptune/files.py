@@ -50,6 +50,29 @@ def replacing(path: Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Fill a folder beside its place and rename it there when all went well.
+
+    Parameters
+    ----------
+    path
+        Where the folder shall be; one that is there is replaced.
+
+    Yields
+    ------
+    Path
+        An unused name in the same folder, for the block to make a folder of.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:
+        beside = Path(name) / "new"
+        yield beside
+        if path.exists():
+            path.rename(Path(name) / "old")
+        beside.rename(path)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` in UTF-8, whole or not at all."""
     with replacing(path) as beside:

@@ -2,19 +2,17 @@
 
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
 
 from adaptune import geometry
-from adaptune.files import replacing, write_text
+from adaptune.files import replacing, replacing_folder
+from adaptune.sequence.export import Message, Messages, write_kitti_times
 from adaptune.simulation.course import Course, SimulationError
 from adaptune.simulation.imu import Inertial, measure
 from adaptune.simulation.simulate import Drive, SimulatedScan
@@ -93,13 +91,13 @@ def record(
         preview_beside = stack.enter_context(replacing(preview))
         scans = _watched(drive, picture := Preview(drive), progress)
         if layout == "kitti":
-            _write_kitti(drive, scans, stack.enter_context(_replacing_folder(path)))
+            _write_kitti(drive, scans, stack.enter_context(replacing_folder(path)))
         elif layout == "ros1":
             _write_ros1(drive, scans, stack.enter_context(replacing(path)))
         elif layout == "mcap":
             _write_mcap(drive, scans, stack.enter_context(replacing(path)))
         else:
-            folder = stack.enter_context(_replacing_folder(path))
+            folder = stack.enter_context(replacing_folder(path))
             _write_ros2(drive, scans, folder, StoragePlugin.SQLITE3)
         stamps = drive.stamps()
         write_tum(truth_beside, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
@@ -132,46 +130,12 @@ def _watched(
             progress(number, len(drive))
 
 
-@contextmanager
-def _replacing_folder(path: Path) -> Iterator[Path]:
-    """Fill a folder beside its place and rename it there when all went well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:
-        beside = Path(name) / "new"
-        yield beside
-        if path.exists():
-            path.rename(Path(name) / "old")
-        beside.rename(path)
-
-
-Message = tuple[str, int, Any]
-"""Topic, nanoseconds at which it is sent, content."""
-
-
-class _Composer:
+class _Composer(Messages):
     """Makes ROS messages of what a drive yields."""
 
     def __init__(self, drive: Drive, version: Literal[1, 2]) -> None:
-        store = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
-        self.typestore = get_typestore(store)
-        self._types = self.typestore.types
-        # Only a ROS 1 header counts its messages.
-        self._counts: dict[str, int] | None = (
-            {POINTS: 0, POSES: 0, IMU: 0} if version == 1 else None
-        )
+        super().__init__(version)
         self._drive = drive
-        fields = self._types["sensor_msgs/msg/PointField"]
-        offsets: Any = CLOUD.fields
-        kinds = {"<f4": 7, "<u2": 4}
-        self._fields = [
-            fields(
-                name=name,
-                offset=offsets[name][1],
-                datatype=kinds[offsets[name][0].str],
-                count=1,
-            )
-            for name in CLOUD.names or ()
-        ]
 
     @property
     def topics(self) -> dict[str, str]:
@@ -194,7 +158,8 @@ class _Composer:
             end = int(stamps[i + 1])
             while sent < len(inertial_stamps) and inertial_stamps[sent] <= end:
                 stamp = int(inertial_stamps[sent])
-                yield IMU, stamp, self._imu(stamp, inertial.gyro[sent], inertial.accel[sent])
+                header = self.header(IMU, stamp, "imu")
+                yield IMU, stamp, self.imu(header, inertial.gyro[sent], inertial.accel[sent])
                 sent += 1
             yield POSES, end, self._pose(end, T_world_sensor[i + 1], quaternions[i + 1])
             yield POINTS, end, self._cloud(scan, end)
@@ -208,40 +173,14 @@ class _Composer:
         stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
         return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
 
-    def _header(self, topic: str, stamp: int, frame: str) -> Any:
-        time = self._types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
-        header = self._types["std_msgs/msg/Header"]
-        if self._counts is None:
-            return header(stamp=time, frame_id=frame)
-        self._counts[topic] += 1
-        return header(seq=self._counts[topic] - 1, stamp=time, frame_id=frame)
-
-    def _vector(self, values: NDArray[np.float64]) -> Any:
-        return self._types["geometry_msgs/msg/Vector3"](*values.tolist())
-
     def _pose(self, stamp: int, T: geometry.Poses, quaternion: NDArray[np.float64]) -> Any:
-        t = self._types
+        t = self.types
         pose = t["geometry_msgs/msg/Pose"](
             position=t["geometry_msgs/msg/Point"](*T[:3, 3].tolist()),
             orientation=t["geometry_msgs/msg/Quaternion"](*quaternion.tolist()),
         )
-        header = self._header(POSES, stamp, "map")
+        header = self.header(POSES, stamp, "map")
         return t["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
-
-    def _imu(self, stamp: int, gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> Any:
-        t = self._types
-        unknown = np.zeros(9)
-        # As the message's definition has it: no orientation is estimated.
-        unoriented = np.array([-1.0, *np.zeros(8)])
-        return t["sensor_msgs/msg/Imu"](
-            header=self._header(IMU, stamp, "imu"),
-            orientation=t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-            orientation_covariance=unoriented,
-            angular_velocity=self._vector(gyro),
-            angular_velocity_covariance=unknown,
-            linear_acceleration=self._vector(accel),
-            linear_acceleration_covariance=unknown,
-        )
 
     def _cloud(self, scan: SimulatedScan, end: int) -> Any:
         at_end = self._drive.course.stamp == "end"
@@ -252,47 +191,21 @@ class _Composer:
         cloud["time"] = scan.times
         if at_end:
             cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
-        return self._types["sensor_msgs/msg/PointCloud2"](
-            header=self._header(POINTS, stamp, "velodyne"),
-            height=1,
-            width=len(cloud),
-            fields=self._fields,
-            is_bigendian=False,
-            point_step=CLOUD.itemsize,
-            row_step=cloud.nbytes,
-            data=cloud.view(np.uint8),
-            is_dense=True,
-        )
+        return self.cloud(self.header(POINTS, stamp, "velodyne"), cloud)
 
 
 def _write_ros1(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
     composer = _Composer(drive, 1)
     # The writer wants to make the file itself.
     path.unlink()
-    with Writer1(path) as writer:
-        types = composer.topics
-        topics = {
-            topic: writer.add_connection(topic, kind, typestore=composer.typestore)
-            for topic, kind in types.items()
-        }
-        for topic, stamp, message in composer.messages(scans):
-            data = composer.typestore.serialize_ros1(message, types[topic])
-            writer.write(topics[topic], stamp, data)
+    composer.write(path, composer.topics, composer.messages(scans))
 
 
 def _write_ros2(
     drive: Drive, scans: Iterator[SimulatedScan], folder: Path, storage: StoragePlugin
 ) -> None:
     composer = _Composer(drive, 2)
-    with Writer2(folder, version=9, storage_plugin=storage) as writer:
-        types = composer.topics
-        topics = {
-            topic: writer.add_connection(topic, kind, typestore=composer.typestore)
-            for topic, kind in types.items()
-        }
-        for topic, stamp, message in composer.messages(scans):
-            data = composer.typestore.serialize_cdr(message, types[topic])
-            writer.write(topics[topic], stamp, data)
+    composer.write(folder, composer.topics, composer.messages(scans), storage)
 
 
 def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
@@ -321,11 +234,7 @@ def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> 
     T = np.array(T_world_lidar)
     write_kitti(folder / "poses" / "00.txt", _TR @ geometry.invert(T[0]) @ T @ geometry.invert(_TR))
     seconds = drive.seconds(drive.stamps()[:-1])
-    write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
-    rows = " ".join(f"{v:.12e}" for v in _TR[:3].ravel())
-    camera = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
-    lines = [*(f"P{i}: {camera}\n" for i in range(4)), f"Tr: {rows}\n"]
-    write_text(sequence / "calib.txt", "".join(lines))
+    write_kitti_times(sequence, seconds, _TR)
 
 
 def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:
