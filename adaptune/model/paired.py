@@ -5,7 +5,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.metrics import cap
+from adaptune.metrics import FAILURE
 from adaptune.model.base import Rule, Selection, TrainingData
 from adaptune.model.knn import nearest_frames
 
@@ -49,11 +49,11 @@ class PairedExpectedRatio(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        errors = cap(data.errors)
-        fixed = errors[:, data.fixed, None]
-        self.ratios_ = (errors + ERROR_FLOOR) / (fixed + ERROR_FLOOR)
-        self.fixed_errors_ = fixed[:, 0]
+        # Ratios of all frames would take twice the memory, and seconds.
+        self.errors_ = np.minimum(data.errors, np.float32(FAILURE))
+        self.fixed_errors_ = self.errors_[:, data.fixed].astype(np.float64)
         self.sequences_ = [np.flatnonzero(data.sequence == s) for s in np.unique(data.sequence)]
+        self.features_ = [data.features[members] for members in self.sequences_]
         squared = ((data.sets[:, None, :] - data.sets[None, :, :]) ** 2).sum(axis=2)
         kernel = np.exp(-0.5 * squared / self.width**2)
         self.kernel_ = kernel / kernel.sum(axis=1, keepdims=True)
@@ -62,12 +62,14 @@ class PairedExpectedRatio(Rule):
     def _compare(self, feature: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
         """Expected ratio of every set, of shape (n_sets,), and the fixed set's error in percent."""
         distances, ratios, fixed = [], [], []
-        for members in self.sequences_:
-            squared, near = nearest_frames(self.data_.features[members], feature, self.n_frames)
+        for members, features in zip(self.sequences_, self.features_, strict=True):
+            squared, near = nearest_frames(features, feature, self.n_frames)
             frames = members[near]
             distances.append(squared.mean())
-            ratios.append(self.ratios_[frames].mean(axis=0))
-            fixed.append(self.fixed_errors_[frames].mean())
+            of_fixed = self.fixed_errors_[frames]
+            errors = self.errors_[frames].astype(np.float64)
+            ratios.append((1.0 / (of_fixed + ERROR_FLOOR)) @ (errors + ERROR_FLOOR) / len(frames))
+            fixed.append(of_fixed.mean())
         a = np.array(distances)
         # With the median at zero every sequence has the very same place in it.
         spread = float(np.median(a)) or 1.0
