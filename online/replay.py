@@ -83,14 +83,13 @@ def adaptive(model: ErrorModel, rule: str) -> Policy:
     """
     pca = model.describe()
     fitted = RULES[rule]().fit(model.training_data(pca))
+
+    def select(points: NDArray[np.float32]) -> Selection:
+        return fitted.select(pca.transform(ndt_histogram(points)[None])[0])
+
     # The first call loads compiled code; the robot should not wait for that.
-    ndt_histogram(np.zeros((0, 3), np.float32))
-
-    def select(scan: Scan) -> Selection:
-        histogram = ndt_histogram(scan.points)
-        return fitted.select(pca.transform(histogram[None])[0])
-
-    return select
+    select(np.zeros((0, 3), np.float32))
+    return lambda scan: select(scan.points)
 
 
 def replay(

@@ -2,7 +2,7 @@
 
 from adaptune.model.base import Rule, Selection, TrainingData
 from adaptune.model.file import ErrorModel, ModelError
-from adaptune.model.knn import NearestNeighbours
+from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 from adaptune.model.paired import PairedExpectedRatio
 from adaptune.model.portfolio import portfolio, restrict
 
@@ -15,6 +15,7 @@ __all__ = [
     "ModelError",
     "NearestNeighbours",
     "PairedExpectedRatio",
+    "ProductKNeighborsRegressor",
     "Rule",
     "Selection",
     "TrainingData",

@@ -12,7 +12,7 @@ from adaptune.metrics import cap
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Errors of the same parameter sets on the frames of several sequences.
+    """Errors of parameter sets on the frames of several sequences.
 
     Attributes
     ----------
@@ -21,7 +21,8 @@ class TrainingData:
     sequence : ndarray of shape (n_frames,)
         Number of the sequence that each frame belongs to.
     errors : ndarray of shape (n_frames, n_sets)
-        Sub-trajectory RTE in percent, infinite where the track was lost. Frames without a
+        Sub-trajectory RTE in percent, infinite where the track was lost, NaN where the set was
+        never run: usually on all frames of a sequence, or on none. Frames without a
         sub-trajectory are left out.
     sets : ndarray of shape (n_sets, n_parameters)
         The parameter sets in the unit cube.
@@ -42,17 +43,29 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     Parameters
     ----------
     errors
-        Percent, of shape (n_frames, n_sets).
+        Percent, of shape (n_frames, n_sets); NaN where a set was never run.
     sequence
         Number of the sequence of each frame, of shape (n_frames,).
 
     Returns
     -------
     ndarray of shape (n_sets,)
-        Percent. The *fixed* set is where this is least; of equal ones, the first.
+        Percent. The *fixed* set is where this is least; of equal ones, the first. A set's frames
+        without an error do not count. If a whole sequence is without, the mean is infinite, for
+        sequences differ more than sets, and means over different ones cannot be compared: such a
+        set cannot be the fixed one.
     """
     capped = cap(errors)
-    means = [capped[sequence == s].mean(axis=0) for s in np.unique(sequence)]
+    means = []
+    for s in np.unique(sequence):
+        of_sequence = capped[sequence == s]
+        known = ~np.isnan(of_sequence)
+        if known.all():
+            means.append(of_sequence.mean(axis=0))
+            continue
+        number = known.sum(axis=0)
+        total = np.where(known, of_sequence, 0.0).sum(axis=0)
+        means.append(np.where(number > 0, total / np.maximum(number, 1), np.inf))
     return np.asarray(np.mean(means, axis=0))
 
 

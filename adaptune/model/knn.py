@@ -1,12 +1,178 @@
 """The published selection: k nearest neighbours over descriptors and parameters."""
 
-from typing import Self
+from typing import Any, Self
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
-from adaptune.metrics import cap
+from adaptune.metrics import FAILURE
 from adaptune.model.base import Rule, Selection, TrainingData
+
+
+class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
+    """k-nearest-neighbour regression over pairs of a frame and a parameter set.
+
+    What `sklearn.neighbors.KNeighborsRegressor` predicts when it is fitted on a row
+    ``[frame, set]`` for every pair that was run, with none of these rows made. A squared distance
+    between rows is that between the frames plus that between the sets. So among frames that have
+    seen the same sets, the k nearest pairs are made of the k nearest frames and the k nearest
+    sets; frames that have seen others are searched apart, and their best pairs merged.
+
+    Of pairs at the same distance, the one with the nearer frame comes first, then the one with the
+    earlier frame, then that with the earlier set. (scikit-learn leaves the order to its search.)
+    Where there are fewer than k pairs, all are averaged.
+
+    Parameters
+    ----------
+    sets : array-like of shape (n_sets, n_parameters), optional
+        The parameter sets, in units that are comparable to the frames'. Without them all sets are
+        at one place, as if each frame had been run once with several outcomes.
+    n_neighbors : int
+        k.
+
+    Attributes
+    ----------
+    n_features_in_ : int
+        Numbers that describe a frame.
+    near_squared_, near_sets_ : ndarray of shape (n_groups, n_sets, k)
+        For each group of frames that have seen the same sets, and for each set to be predicted:
+        the nearest of the sets that they have seen. There are as many groups as different
+        patterns of missing pairs; usually a sequence has one.
+    """
+
+    def __init__(self, sets: Any = None, n_neighbors: int = 5):
+        self.sets = sets
+        self.n_neighbors = n_neighbors
+
+    def fit(self, X: Any, y: Any) -> Self:
+        """Learn, and find what does not depend on the frame that is asked for.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, n_features)
+            The frames.
+        y : array-like of shape (n_frames, n_sets) or (n_frames,)
+            Target of every pair, NaN where it was never run.
+
+        Raises
+        ------
+        ValueError
+            If the shapes do not go together, or there is no pair at all.
+        """
+        if self.n_neighbors < 1:
+            raise ValueError(f"n_neighbors must be 1 or more, not {self.n_neighbors}")
+        X, y = validate_data(
+            self,
+            X,
+            y,
+            validate_separately=(
+                {"dtype": np.float64},
+                {
+                    "dtype": (np.float64, np.float32),
+                    "ensure_all_finite": "allow-nan",
+                    "ensure_2d": False,
+                },
+            ),
+        )
+        self._one_set = y.ndim == 1
+        y = y.reshape(len(y), -1)
+        if len(X) != len(y):
+            raise ValueError(f"X has {len(X)} frames, y has {len(y)}: inconsistent numbers")
+        sets = np.zeros((y.shape[1], 1)) if self.sets is None else check_array(self.sets)
+        if len(sets) != y.shape[1]:
+            raise ValueError(f"there are {len(sets)} sets, and targets of {y.shape[1]}")
+        self._sets = np.asarray(sets, np.float64)
+        seen = ~np.isnan(y)
+        if not seen.any():
+            raise ValueError("y holds no target")
+        # Frames of a group lie together, each group's in their order.
+        patterns: dict[bytes, list[int]] = {}
+        for frame, pattern in enumerate(np.packbits(seen, axis=1)):
+            patterns.setdefault(pattern.tobytes(), []).append(frame)
+        groups = [frames for frames in patterns.values() if seen[frames[0]].any()]
+        self._members = np.concatenate(groups)
+        self._bounds = np.cumsum([0, *map(len, groups)])
+        self._seen = [np.flatnonzero(seen[frames[0]]) for frames in groups]
+        self._X = X[self._members]
+        self._y = np.ascontiguousarray(y)
+        self.near_squared_, self.near_sets_ = self._near(self._sets)
+        return self
+
+    def _near(self, candidates: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.intp]]:
+        """For each group and candidate the nearest sets, of shape (n_groups, n_candidates, k).
+
+        Where a group has seen fewer sets the distance is infinite.
+        """
+        squared = np.zeros((len(candidates), len(self._sets)))
+        for p in range(self._sets.shape[1]):
+            squared += (candidates[:, p, None] - self._sets[:, p]) ** 2
+        k = min(self.n_neighbors, len(self._sets))
+        near_squared = np.full((len(self._seen), len(candidates), k), np.inf)
+        near_sets = np.zeros(near_squared.shape, np.intp)
+        for g, seen in enumerate(self._seen):
+            of_group = squared if len(seen) == len(self._sets) else squared[:, seen]
+            order = np.argsort(of_group, axis=1, kind="stable")[:, :k]
+            n = order.shape[1]
+            near_squared[g, :, :n] = np.take_along_axis(of_group, order, axis=1)
+            near_sets[g, :, :n] = seen[order]
+        return near_squared, near_sets
+
+    def predict(self, X: Any) -> NDArray[np.float64]:
+        """Predict the targets of all sets.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_queries, n_features)
+
+        Returns
+        -------
+        ndarray of shape (n_queries, n_sets), or (n_queries,) where `y` was of shape (n_frames,)
+        """
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
+        predicted = np.array([self._predict(x, self.near_squared_, self.near_sets_) for x in X])
+        return predicted[:, 0] if self._one_set else predicted
+
+    def predict_one(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Predict the targets of all sets for one frame of shape (n_features,), unchecked."""
+        return self._predict(x, self.near_squared_, self.near_sets_)
+
+    def predict_at(self, x: NDArray[np.float64], sets: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Predict the targets of other sets.
+
+        Parameters
+        ----------
+        x
+            One frame, of shape (n_features,).
+        sets
+            Of shape (n_candidates, n_parameters); they need not be among those fitted on.
+
+        Returns
+        -------
+        ndarray of shape (n_candidates,)
+        """
+        return self._predict(x, *self._near(sets))
+
+    def _predict(
+        self, x: NDArray[np.float64], near_squared: NDArray[Any], near_sets: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
+        squared, members, group = _nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
+        frames = self._members[members]
+        # Of equally near frames the earlier one first, whatever group it is of.
+        order = np.lexsort((frames, squared))
+        predicted: NDArray[np.float64] = _mean_of_nearest(
+            squared[order],
+            frames[order],
+            group[order],
+            near_squared,
+            near_sets,
+            self._y,
+            self.n_neighbors,
+        )
+        return predicted
 
 
 class NearestNeighbours(Rule):
@@ -15,10 +181,6 @@ class NearestNeighbours(Rule):
     After Koide et al., IROS 2021: a k-nearest-neighbour regressor on the concatenation of
     descriptor and parameters, here with the parameters in the unit cube, divided by the mean of
     their standard deviations as the descriptor's components are.
-
-    All frames have seen all sets, so the k nearest pairs are among the k nearest frames and the
-    k nearest sets: rows for frames x sets need not exist. Of pairs at the same distance, those
-    with the nearer frame come first.
 
     Parameters
     ----------
@@ -32,25 +194,15 @@ class NearestNeighbours(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        self.errors_ = cap(data.errors)
-        sets = data.sets / (float(data.sets.std(axis=0).mean()) or 1.0)
-        squared = ((sets[:, None, :] - sets[None, :, :]) ** 2).sum(axis=2)
-        k = min(self.k, len(sets))
-        self.near_sets_ = np.argsort(squared, axis=1, kind="stable")[:, :k]
-        self.near_squared_ = np.take_along_axis(squared, self.near_sets_, axis=1)
+        scale = float(data.sets.std(axis=0).mean()) or 1.0
+        self.regressor_ = ProductKNeighborsRegressor(data.sets / scale, self.k).fit(
+            data.features, np.minimum(data.errors, np.float32(FAILURE))
+        )
         return self
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`."""
-        squared, frames = nearest_frames(self.data_.features, feature, self.k)
-        # (n_sets, frames, near sets), flattened: a handful of pairs for every candidate.
-        pairs = squared[None, :, None] + self.near_squared_[:, None, :]
-        errors = self.errors_[frames[None, :, None], self.near_sets_[:, None, :]]
-        pairs = pairs.reshape(len(pairs), -1)
-        k = min(self.k, pairs.shape[1])
-        order = np.argsort(pairs, axis=1, kind="stable")[:, :k]
-        near = np.take_along_axis(errors.reshape(len(pairs), -1), order, axis=1)
-        return np.asarray(near.mean(axis=1))
+        return self.regressor_.predict_one(feature)
 
     def select(self, feature: NDArray[np.float64]) -> Selection:
         """See `Rule.select`."""
@@ -79,13 +231,94 @@ def nearest_frames(
         Squared distances, rising; of equal ones, the earlier frame comes first.
     frames : ndarray of shape (k,)
     """
-    difference = features - feature
-    squared = np.einsum("ij,ij->i", difference, difference)
-    if k < len(squared):
-        # Partitioning is linear; ties at the border are settled among all who share it.
-        border = np.partition(squared, k - 1)[k - 1]
-        frames = np.flatnonzero(squared <= border)
-    else:
-        frames = np.arange(len(squared))
-    frames = frames[np.argsort(squared[frames], kind="stable")[:k]]
-    return squared[frames], frames
+    squared, frames, _ = _nearest_of_groups(features, np.array([0, len(features)]), feature, k)
+    return squared, frames
+
+
+@numba.njit(cache=True)
+def _nearest_of_groups(
+    X: NDArray[np.float64], bounds: NDArray[np.intp], x: NDArray[np.float64], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
+    """The `k` rows of every group that are nearest to `x`: their squared distances, and groups.
+
+    Group g is rows bounds[g] to bounds[g + 1]. In each, distances rise, and of equal ones the
+    earlier row comes first.
+    """
+    n_groups = len(bounds) - 1
+    size = 0
+    for g in range(n_groups):
+        size += min(k, bounds[g + 1] - bounds[g])
+    squared = np.empty(size)
+    rows = np.empty(size, np.intp)
+    group = np.empty(size, np.intp)
+    first = 0
+    for g in range(n_groups):
+        last = first + min(k, bounds[g + 1] - bounds[g])
+        end = first
+        for row in range(bounds[g], bounds[g + 1]):
+            distance = 0.0
+            for f in range(X.shape[1]):
+                difference = X[row, f] - x[f]
+                distance += difference * difference
+            if end == last:
+                if not distance < squared[last - 1]:
+                    continue
+            else:
+                end += 1
+            at = end - 1
+            while at > first and distance < squared[at - 1]:
+                squared[at], rows[at] = squared[at - 1], rows[at - 1]
+                at -= 1
+            squared[at], rows[at] = distance, row
+        group[first:last] = g
+        first = last
+    return squared, rows, group
+
+
+@numba.njit(cache=True)
+def _mean_of_nearest(
+    squared: NDArray[np.float64],
+    frames: NDArray[np.intp],
+    group: NDArray[np.intp],
+    near_squared: NDArray[np.float64],
+    near_sets: NDArray[np.intp],
+    y: NDArray[np.floating],
+    k: int,
+) -> NDArray[np.float64]:
+    """Mean target of the `k` nearest pairs, for every candidate.
+
+    Parameters
+    ----------
+    squared, frames, group
+        Near frames by rising distance, of shape (n,).
+    near_squared, near_sets
+        Near sets by rising distance, of shape (n_groups, n_candidates, n_near).
+    y
+        Targets of shape (n_frames, n_sets).
+    k
+        Number of pairs.
+    """
+    n_candidates, n_near = near_sets.shape[1:]
+    means = np.empty(n_candidates)
+    best = np.empty(k)
+    target = np.empty(k)
+    for c in range(n_candidates):
+        n = 0
+        for i in range(len(frames)):
+            if n == k and squared[i] >= best[k - 1]:
+                break
+            g = group[i]
+            for j in range(n_near):
+                distance = squared[i] + near_squared[g, c, j]
+                # Neither is there anything nearer with this frame.
+                if distance == np.inf or (n == k and distance >= best[k - 1]):
+                    break
+                if n < k:
+                    n += 1
+                at = n - 1
+                while at > 0 and distance < best[at - 1]:
+                    best[at], target[at] = best[at - 1], target[at - 1]
+                    at -= 1
+                best[at], target[at] = distance, y[frames[i], near_sets[g, c, j]]
+        means[c] = target[:n].sum() / n
+    return means

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.neighbors import KNeighborsRegressor
+from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from adaptune.model import NearestNeighbours, TrainingData
 from adaptune.model.base import mean_errors
-from adaptune.model.knn import nearest_frames
+from adaptune.model.knn import ProductKNeighborsRegressor, nearest_frames
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -132,3 +133,110 @@ def test_the_same_scan_again_finds_its_own_frame(n_frames):
         np.testing.assert_allclose(
             rule.predict(data.features[i]), np.minimum(data.errors[i], 30.0), rtol=1e-6
         )
+
+
+@parametrize_with_checks([ProductKNeighborsRegressor()])
+def test_it_is_a_regressor_of_scikit_learn(estimator, check):
+    check(estimator)
+
+
+def product(seed, n_frames, n_sets, missing, whole=False):
+    """Frames, sets, and targets of which some are missing: of any pair, or sequence by sequence."""
+    rng = np.random.default_rng(seed)
+    targets = rng.normal(size=(n_frames, n_sets))
+    if missing == "pairs":
+        targets[rng.random(targets.shape) < 0.4] = np.nan
+    elif missing == "blocks":
+        sequence = rng.integers(0, 3, n_frames)
+        targets[(rng.random((3, n_sets)) < 0.5)[sequence]] = np.nan
+    targets[rng.integers(n_frames), rng.integers(n_sets)] = 1.0
+
+    def draw(n, m):
+        # Whole numbers are often at the same distance, which is then exact.
+        return rng.integers(0, 3, (n, m)).astype(float) if whole else rng.normal(size=(n, m))
+
+    return draw(n_frames, 3), draw(n_sets, 2), targets, draw(4, 3), draw(5, 2)
+
+
+def pairs(frames, sets, targets):
+    """A row and a target for every pair that was run."""
+    i, j = np.nonzero(~np.isnan(targets))
+    return np.hstack([frames[i], sets[j]]), targets[i, j]
+
+
+shapes = st.tuples(
+    seeds, st.integers(1, 25), st.integers(1, 9), st.sampled_from(["none", "pairs", "blocks"])
+)
+
+
+@modest
+@given(shapes, st.integers(1, 8))
+def test_pairs_that_were_never_run_are_no_neighbours(shape, k):
+    frames, sets, targets, queries, others = product(*shape)
+    rows, y = pairs(frames, sets, targets)
+    want = KNeighborsRegressor(min(k, len(y)), algorithm="kd_tree").fit(rows, y)
+    regressor = ProductKNeighborsRegressor(sets, k).fit(frames, targets)
+    predicted = regressor.predict(queries)
+    assert predicted.shape == (len(queries), len(sets))
+    for query, of_query in zip(queries, predicted, strict=True):
+        for candidates, ours in ((sets, of_query), (others, regressor.predict_at(query, others))):
+            asked = np.hstack([np.tile(query, (len(candidates), 1)), candidates])
+            np.testing.assert_allclose(ours, want.predict(asked), rtol=1e-9, atol=1e-12)
+
+
+@modest
+@given(shapes, st.integers(1, 8))
+def test_ties_fall_to_the_nearer_frame_then_to_the_earlier_pair(shape, k):
+    frames, sets, targets, queries, _ = product(*shape, whole=True)
+    predicted = ProductKNeighborsRegressor(sets, k).fit(frames, targets).predict(queries)
+    for query, of_query in zip(queries, predicted, strict=True):
+        near = ((frames - query) ** 2).sum(axis=1)
+        for j, s in enumerate(sets):
+            known = sorted(
+                (near[i] + ((sets[m] - s) ** 2).sum(), near[i], i, m)
+                for i, m in zip(*np.nonzero(~np.isnan(targets)), strict=True)
+            )
+            want = np.mean([targets[i, m] for *_, i, m in known[:k]])
+            assert of_query[j] == pytest.approx(want, rel=1e-12, abs=1e-12)
+
+
+def test_frames_and_sets_without_any_pair_change_nothing():
+    frames, sets, targets, queries, _ = product(3, 12, 5, "pairs")
+    more = np.full((14, 6), np.nan)
+    more[:12, :5] = targets
+    regressor = ProductKNeighborsRegressor(np.vstack([sets, [[0.0, 0.0]]]), 4)
+    regressor.fit(np.vstack([frames, queries[:2]]), more)
+    want = ProductKNeighborsRegressor(sets, 4).fit(frames, targets).predict(queries)
+    np.testing.assert_array_equal(regressor.predict(queries)[:, :5], want)
+
+
+@pytest.mark.parametrize(
+    ("sets", "y", "k", "message"),
+    [
+        (np.zeros((2, 1)), np.zeros((3, 4)), 5, "2 sets, and targets of 4"),
+        (np.zeros((4, 1)), np.zeros((2, 4)), 5, "3 frames, y has 2"),
+        (np.zeros((4, 1)), np.full((3, 4), np.nan), 5, "no target"),
+        (np.zeros((4, 1)), np.full((3, 4), np.inf), 5, "infinity"),
+        (np.full((4, 1), np.nan), np.zeros((3, 4)), 5, "NaN"),
+        (np.zeros((4, 1)), np.zeros((3, 4)), 0, "n_neighbors"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(sets, y, k, message):
+    with pytest.raises(ValueError, match=message):
+        ProductKNeighborsRegressor(sets, k).fit(np.zeros((3, 2)), y)
+
+
+def test_sets_that_a_sequence_lacks():
+    data = random_data(7, 40, 8)
+    data.errors[data.sequence == 1, 3:6] = np.nan
+    rule, feature = NearestNeighbours().fit(data), np.zeros(4)
+    assert np.isfinite(rule.predict(feature)).all()
+    means = mean_errors(data.errors, data.sequence)
+    # Nothing can be said of all sequences for a set that one of them lacks.
+    assert np.isinf(means[3:6]).all()
+    assert np.isfinite(np.delete(means, [3, 4, 5])).all()
+
+
+def test_frames_that_lack_a_set_do_not_count_for_it():
+    errors = np.array([[1, 4], [3, np.nan], [5, 10]], np.float32)
+    np.testing.assert_allclose(mean_errors(errors, np.array([0, 0, 1])), [3.5, 7.0])
