@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import re
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,7 +11,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_serializer,
+)
 
 from adaptune import yaml
 from adaptune.cores import available
@@ -28,6 +36,7 @@ from adaptune.odometry import (
 )
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
+from adaptune.sequence.config import expand
 from adaptune.simulation import Course
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
@@ -70,6 +79,9 @@ class OfflineConfig(_Section):
         Processes; one a core when left out.
     memory : float
         Gigabytes that prepared scans may take, in all workers together.
+    storage : str, optional
+        URL of a database to mirror the trials in; a journal file in the study's folder when left
+        out.
     """
 
     sampler: Literal["tpe", "sobol", "random"] = "tpe"
@@ -79,6 +91,11 @@ class OfflineConfig(_Section):
     seed: int = Field(0, ge=0)
     workers: int | None = Field(None, ge=1)
     memory: float = Field(4.0, gt=0, allow_inf_nan=False)
+    storage: Annotated[str, Field(pattern="://"), AfterValidator(expand)] | None = None
+
+    @field_serializer("storage")
+    def _hide_password(self, storage: str | None) -> str | None:
+        return storage and re.sub(r"(://[^:/@]*):[^@]*@", r"\1@", storage)
 
 
 class SwitchingConfig(_Section):

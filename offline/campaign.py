@@ -17,6 +17,7 @@ from adaptune.model.base import mean_errors
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from offline.samplers import propose
+from offline.storage import Told, open_mirror
 from offline.workers import Task, Workers, run
 
 Progress = Callable[[str, int, int], None]
@@ -102,7 +103,16 @@ def _run_batches(
     config = study.config.offline
     names = study.config.training
     finished = {name: archive.finished(name) for name in names}
+    mirror = open_mirror(study, {n: s.parameters for n, s in finished[names[0]].items()})
     history: list[tuple[ParameterSet, float]] = []
+
+    def told(number: int) -> Told:
+        trials = {name: finished[name][number] for name in names}
+        attributes = {name: trial.mean_error for name, trial in trials.items()}
+        attributes["lost"] = sum(trial.lost for trial in trials.values())
+        attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
+        return Told(*history[number], attributes)
+
     total = config.trials * len(names)
     done = 0
     progress("trials", 0, total)
@@ -124,6 +134,7 @@ def _run_batches(
             trials = [finished[name][n] for name in names]
             error = float(np.mean([trial.mean_error for trial in trials]))
             history.append((trials[0].parameters, error))
+        mirror.tell(len(history), told)
         best = min(range(len(history)), key=lambda i: history[i][1])
         _log.info(
             "trials %d to %d done; best so far: trial %d with %.3f %%",
@@ -217,5 +228,5 @@ def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
         sequence=all_sequences,
         errors=all_errors,
         provenance={"adaptune": __version__}
-        | study.config.offline.model_dump(mode="json", exclude={"workers", "memory"}),
+        | study.config.offline.model_dump(mode="json", exclude={"workers", "memory", "storage"}),
     )

@@ -43,6 +43,19 @@ _SOURCES = ("bag", "kitti", "folder", "evalio")
 _STANDARD_GRAVITY = 9.80665
 
 
+def expand(text: str) -> str:
+    """Replace ``${VARIABLE}`` by what the environment says.
+
+    Raises
+    ------
+    ValueError
+        Naming the environment variable that is not set.
+    """
+    if unset := [v for v in re.findall(r"\$\{(\w+)\}", text) if v not in os.environ]:
+        raise ValueError(f"the environment variable {unset[0]} is not set")
+    return os.path.expandvars(text)
+
+
 def resolve(path: str, info: ValidationInfo) -> str:
     """Make a path absolute: variables and ~ replaced, relative to the folder of the study's file.
 
@@ -51,10 +64,8 @@ def resolve(path: str, info: ValidationInfo) -> str:
     ValueError
         Naming the environment variable that is not set.
     """
-    if unset := [v for v in re.findall(r"\$\{(\w+)\}", path) if v not in os.environ]:
-        raise ValueError(f"the environment variable {unset[0]} is not set")
     folder = (info.context or {}).get("folder", Path())
-    return str((Path(folder) / Path(os.path.expandvars(path)).expanduser()).resolve())
+    return str((Path(folder) / Path(expand(path)).expanduser()).resolve())
 
 
 def _resolve_bags(given: Any, info: ValidationInfo) -> Any:

