@@ -32,13 +32,16 @@ class Frames:
         Nanoseconds.
     T_ref_sensor : ndarray of shape (n, 4, 4)
         Reference poses, NaN where there is none.
-    histograms : ndarray of shape (n, 90)
-        Environment descriptors.
+    descriptors : ndarray of shape (n, n_features)
+        float32.
+    blocks : dict
+        By name, in order, how many of the features are each descriptor's.
     """
 
     stamps: NDArray[np.int64]
     T_ref_sensor: Poses
-    histograms: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+    blocks: dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,9 +214,12 @@ class Archive:
         except FileNotFoundError:
             return ""
 
-    def has_frames(self, sequence: str) -> bool:
-        """Whether what all trials on a sequence share is there."""
-        return (self.folder / sequence / "frames.npz").exists()
+    def has_frames(self, sequence: str, names: Sequence[str]) -> bool:
+        """Whether what all trials on a sequence share is there, with these descriptors."""
+        try:
+            return list(self.read_frames(sequence).blocks) == list(names)
+        except ArchiveError:
+            return False
 
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Keep what all trials on a sequence share."""
@@ -223,7 +229,8 @@ class Archive:
                 file,
                 stamps=frames.stamps,
                 T_ref_sensor=frames.T_ref_sensor,
-                histograms=frames.histograms.astype(np.uint16),
+                descriptors=compact(frames.descriptors),
+                blocks=np.frombuffer(json.dumps(frames.blocks).encode(), np.uint8),
             )
 
     def read_frames(self, sequence: str) -> Frames:
@@ -233,11 +240,19 @@ class Archive:
         ------
         ArchiveError
         """
-        data = _read(self.folder / sequence / "frames.npz")
+        path = self.folder / sequence / "frames.npz"
+        data = _read(path)
         try:
-            return Frames(data["stamps"], data["T_ref_sensor"], data["histograms"].astype(float))
+            return Frames(
+                data["stamps"],
+                data["T_ref_sensor"],
+                data["descriptors"].astype(np.float32),
+                dict(json.loads(data["blocks"].tobytes())),
+            )
         except KeyError as error:
-            raise ArchiveError(f"{self.folder / sequence / 'frames.npz'}: lacks {error}") from error
+            raise ArchiveError(f"{path}: lacks {error}; run `adaptune offline`") from error
+        except (ValueError, TypeError) as error:
+            raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error
 
     def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
         """Keep a trial."""
@@ -303,6 +318,13 @@ class Archive:
                 )
             read[:, i] = errors
         return np.empty((0, 0), np.float32) if read is None else read
+
+
+def compact(descriptors: NDArray[np.float32]) -> NDArray[Any]:
+    """Descriptors for a file: counts as whole numbers, which take less room, others as they are."""
+    with np.errstate(invalid="ignore"):
+        counts = descriptors.astype(np.uint16)
+    return counts if (counts == descriptors).all() else descriptors
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:

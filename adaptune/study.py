@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import math
 import re
 import types
 import typing
@@ -18,10 +19,13 @@ from pydantic import (
     Field,
     ValidationError,
     field_serializer,
+    field_validator,
+    model_validator,
 )
 
 from adaptune import yaml
 from adaptune.cores import available
+from adaptune.descriptor import DescriptorError, descriptor
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.odometry import (
@@ -98,6 +102,45 @@ class OfflineConfig(_Section):
         return storage and re.sub(r"(://[^:/@]*):[^@]*@", r"\1@", storage)
 
 
+def _known_descriptor(name: str) -> str:
+    try:
+        descriptor(name)
+    except DescriptorError as error:
+        raise ValueError(str(error)) from error
+    return name
+
+
+class DescriptorConfig(_Section):
+    """What a scan is known by.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the descriptors, see `adaptune.descriptor`.
+    window : float
+        Seconds: the mean is taken over the selections that were made in so long a time.
+    """
+
+    names: Annotated[
+        tuple[Annotated[str, AfterValidator(_known_descriptor)], ...], Field(min_length=1)
+    ] = ("ndt",)
+    window: float = Field(0.0, ge=0, allow_inf_nan=False)
+
+    @field_validator("names")
+    @classmethod
+    def _once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("a descriptor is named twice")
+        return names
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_alone(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"names": (data,)}
+        return {"names": data} if isinstance(data, list) else data
+
+
 class SwitchingConfig(_Section):
     """How an odometry comes by other parameters on the way.
 
@@ -167,6 +210,7 @@ class StudyConfig(_Section):
     lost_track: float = Field(3.0, gt=0, allow_inf_nan=False)
     health: HealthCheck = HealthCheck()
     isolation: Limits = Limits()
+    descriptor: DescriptorConfig = DescriptorConfig()
     offline: OfflineConfig = OfflineConfig()
     online: OnlineConfig = OnlineConfig()
 
@@ -216,6 +260,11 @@ class Study:
         if self.box.clean:
             return self.box(given, self.settings)
         return Isolated(self.config.odometry.name, given, self.settings, self.config.isolation)
+
+    @property
+    def window(self) -> int:
+        """How many descriptors are averaged, a selection's and those of the selections before."""
+        return max(1, math.ceil(self.config.descriptor.window / self.config.online.period))
 
     @cached_property
     def mechanism(self) -> Literal["live", "hand_over", "bank"]:

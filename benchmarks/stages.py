@@ -17,7 +17,7 @@ import numpy as np
 import small_gicp
 
 from adaptune import cores
-from adaptune.descriptor import ndt_histogram
+from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection

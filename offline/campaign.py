@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adaptune import __version__, report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
+from adaptune.descriptor import averaged
 from adaptune.files import write_text
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
@@ -101,7 +102,7 @@ def _run_batches(
     study: Study, archive: Archive, workers: Workers, progress: Progress
 ) -> list[ParameterSet]:
     config = study.config.offline
-    names = study.config.training
+    names, described = study.config.training, study.config.descriptor.names
     finished = {name: archive.finished(name) for name in names}
     mirror = open_mirror(study, {n: s.parameters for n, s in finished[names[0]].items()})
     history: list[tuple[ParameterSet, float]] = []
@@ -123,7 +124,7 @@ def _run_batches(
         n_missing = sum(map(len, missing.values()))
         done += len(numbers) * len(names) - n_missing
         progress("trials", done, total)
-        unframed = [name for name in names if not archive.has_frames(name)]
+        unframed = [name for name in names if not archive.has_frames(name, described)]
         if n_missing or unframed:
             sets = propose(study.space, config, batch, history)
             tasks = _tasks(missing, unframed, sets, first, workers.n)
@@ -205,12 +206,16 @@ def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
     sets
         The parameter sets.
     """
-    histograms, sequence, errors = [], [], []
+    descriptors, sequence, errors = [], [], []
+    window = study.window
     for s, name in enumerate(study.config.training):
         of_sequence = archive.read_errors(name, range(len(sets)))
         # Whether there is a sub-trajectory depends on the reference alone.
-        labelled = ~np.isnan(of_sequence).any(axis=1)
-        histograms.append(archive.read_frames(name).histograms[labelled])
+        labelled = ~np.isnan(of_sequence).all(axis=1)
+        frames = archive.read_frames(name)
+        period = study.config.online.period
+        described = averaged(frames.descriptors, frames.stamps, window, period)
+        descriptors.append(described[labelled])
         sequence.append(np.full(labelled.sum(), s))
         errors.append(of_sequence[labelled])
     all_errors, all_sequences = np.concatenate(errors), np.concatenate(sequence)
@@ -224,7 +229,9 @@ def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
         fixed=int(np.argmin(mean_errors(all_errors, all_sequences))),
         length=study.config.sub_trajectory,
         sequences=list(study.config.training),
-        histograms=np.concatenate(histograms),
+        blocks=frames.blocks,
+        window=window,
+        descriptors=np.concatenate(descriptors),
         sequence=all_sequences,
         errors=all_errors,
         provenance={"adaptune": __version__}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adaptune.archive import Frames, Trial
-from adaptune.descriptor import ndt_histogram
+from adaptune.descriptor import Describer
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import sub_trajectory_rte, window_ends
@@ -49,11 +49,12 @@ class PreparedSequence:
         self._box = study.odometry()
         self._kept: list[Any] = []
         self.nbytes = 0
-        stamps, histograms, full, enough = [], [], False, False
+        describe = Describer(study.config.descriptor.names)
+        stamps, descriptors, full, enough = [], [], False, False
         for scan in self._sequence:
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
-            histograms.append(ndt_histogram(scan.points))
+            descriptors.append(describe(scan))
             if full:
                 continue
             prepared = self._box.prepare(scan)
@@ -74,7 +75,7 @@ class PreparedSequence:
         at = np.array(stamps, np.int64)
         T_ref_sensor = reference.at(at)
         check_reference(study, name, T_ref_sensor)
-        self.frames = Frames(at, T_ref_sensor, np.array(histograms))
+        self.frames = Frames(at, T_ref_sensor, np.array(descriptors), describe.blocks)
 
     def __iter__(self) -> Iterator[Any]:
         yield from self._kept

@@ -15,7 +15,7 @@ from scipy import stats
 
 from adaptune import report
 from adaptune.archive import Archive
-from adaptune.descriptor import ScaledPCA
+from adaptune.descriptor import ScaledPCA, averaged
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import RULES, ErrorModel, Rule, TrainingData
@@ -41,15 +41,18 @@ class LabelledSequence:
     name : str
     period : ndarray of shape (n,)
         Whole periods since the first scan: in each, one selection holds.
-    histograms : ndarray of shape (n, 90)
+    descriptors : ndarray of shape (n, n_features)
     errors : ndarray of shape (n, n_sets)
         Percent, infinite where the track was lost.
+    blocks : tuple of int, optional
+        Lengths of the descriptors; one when left out.
     """
 
     name: str
     period: NDArray[np.int64]
-    histograms: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
     errors: NDArray[np.float32]
+    blocks: tuple[int, ...] | None = None
 
 
 class LeftOut(NamedTuple):
@@ -160,11 +163,15 @@ def validate(
     for name in model.sequences:
         frames = archive.read_frames(name)
         errors = archive.read_errors(name, range(len(model.sets)))
-        labelled = ~np.isnan(errors).any(axis=1)
+        labelled = ~np.isnan(errors).all(axis=1)
+        described = averaged(
+            frames.descriptors, frames.stamps, model.window, study.config.online.period
+        )
+        blocks = tuple(frames.blocks.values())
         since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
         period = (since // study.config.online.period).astype(np.int64)
         sequences.append(
-            LabelledSequence(name, period, frames.histograms[labelled], errors[labelled])
+            LabelledSequence(name, period, described[labelled], errors[labelled], blocks)
         )
     validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
     rows: list[dict[str, Any]] = []
@@ -221,12 +228,12 @@ def training_data(
     sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]
 ) -> tuple[TrainingData, ScaledPCA]:
     """What rules learn from these sequences, and how to describe a scan for them."""
-    histograms = np.concatenate([s.histograms for s in sequences])
+    descriptors = np.concatenate([s.descriptors for s in sequences])
     errors = np.concatenate([s.errors for s in sequences])
     number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
-    pca = ScaledPCA().fit(histograms)
+    pca = ScaledPCA(blocks=sequences[0].blocks).fit(descriptors)
     fixed = int(np.argmin(mean_errors(errors, number)))
-    return TrainingData(pca.transform(histograms), number, errors, sets, fixed), pca
+    return TrainingData(pca.transform(descriptors), number, errors, sets, fixed), pca
 
 
 def _leave_out(
@@ -236,7 +243,7 @@ def _leave_out(
     rules: dict[str, Callable[[], Rule]] | dict[str, type[Rule]],
 ) -> LeftOut:
     data, pca = training_data(others, sets)
-    features = pca.transform(sequence.histograms)
+    features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)
     _, first, period = np.unique(sequence.period, return_index=True, return_inverse=True)
     frames = np.arange(len(capped))

@@ -1,7 +1,6 @@
 """Baseline, fixed and adaptive, on sequences that nothing was trained on."""
 
 import csv
-import hashlib
 import itertools
 import json
 from collections.abc import Callable, Sequence
@@ -71,7 +70,7 @@ def run_replays(
     if not study.config.test:
         raise ComparisonError("test: name at least one sequence to replay")
     study.open()
-    digest = hashlib.sha256(model_path.read_bytes()).hexdigest()[:16]
+    digest = model.digest
     made = 0
     for name in study.config.test:
         folder = study.folder / "replays" / name

@@ -3,6 +3,7 @@
 import csv
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.descriptor import ndt_histogram
+from adaptune.descriptor import Describer, DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert, rotation_angle
@@ -81,15 +82,25 @@ def adaptive(model: ErrorModel, rule: str) -> Policy:
     rule
         One of `adaptune.model.RULES`.
     """
-    pca = model.describe()
+    pca = model.pca()
     fitted = RULES[rule]().fit(model.training_data(pca))
+    describe = Describer(model.blocks)
+    if describe.blocks != model.blocks:
+        raise DescriptorError(
+            f"the model was fitted to descriptors of {model.blocks} numbers, these have "
+            f"{describe.blocks}; run `adaptune offline` again"
+        )
+    last: deque[NDArray[np.float32]] = deque(maxlen=model.window)
 
-    def select(points: NDArray[np.float32]) -> Selection:
-        return fitted.select(pca.transform(ndt_histogram(points)[None])[0])
+    def select(scan: Scan) -> Selection:
+        last.append(describe(scan))
+        mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
+        return fitted.select(pca.transform(mean.astype(np.float32))[0])
 
     # The first call loads compiled code; the robot should not wait for that.
-    select(np.zeros((0, 3), np.float32))
-    return lambda scan: select(scan.points)
+    select(Scan(0, np.zeros((0, 3), np.float32)))
+    last.clear()
+    return select
 
 
 def replay(

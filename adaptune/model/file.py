@@ -1,30 +1,60 @@
 """The error model as a file: what passes from training to the robot."""
 
+import hashlib
+import io
 import json
-from dataclasses import dataclass
+import math
+import zipfile
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from adaptune import __version__
-from adaptune.descriptor import N_FEATURES, ScaledPCA
+from adaptune.archive import compact
+from adaptune.descriptor import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.model.base import TrainingData
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
-FORMAT = 1
+FORMAT = 2
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
+_TYPES = {
+    "header": ("|u1",),
+    "descriptors": ("<u2", "<f4"),
+    "sequence": ("<u4",),
+    "errors": ("<f4",),
+}
+"""The arrays in a file, and what numbers they may be of."""
 
-_DAMAGED = (*DAMAGED_NPZ, KeyError, AttributeError, SpaceError)
-"""What is raised, besides, on a header that is not a model's."""
+_DAMAGED = (*DAMAGED_NPZ, KeyError, OverflowError, SpaceError)
+"""What is raised on a file that is not what it says."""
 
 
 class ModelError(AdaptuneError):
     """A model file that cannot be used."""
+
+
+class _Header(BaseModel):
+    """What is said of the arrays. Later versions may say more in the same format."""
+
+    model_config = ConfigDict(strict=True)
+
+    odometry: dict[str, Any]
+    space: dict[str, Any]
+    sets: list[dict[str, Any]]
+    fixed: int
+    length: float = Field(gt=0, allow_inf_nan=False)
+    sequences: list[str]
+    blocks: dict[str, PositiveInt]
+    window: PositiveInt
+    provenance: dict[str, Any]
+    validation: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +75,20 @@ class ErrorModel:
         Metres of a sub-trajectory.
     sequences : list of str
         Names of the training sequences.
-    histograms : ndarray of shape (n_frames, 90)
+    blocks : dict
+        By name, in order, how many of the features are each descriptor's.
+    window : int
+        How many descriptors are averaged, a selection's and those of the selections before.
+    descriptors : ndarray of shape (n_frames, n_features)
+        float32, averaged.
     sequence : ndarray of shape (n_frames,)
         Number of each frame's sequence.
     errors : ndarray of shape (n_frames, n_sets)
-        float32 percent, infinite where the track was lost.
+        float32 percent, infinite where the track was lost, NaN where the set was never run.
     provenance : dict
         Where the model comes from, for people.
+    validation : dict
+        By selection rule what `adaptune validate` found, for people; empty before.
     """
 
     odometry: dict[str, Any]
@@ -60,83 +97,105 @@ class ErrorModel:
     fixed: int
     length: float
     sequences: list[str]
-    histograms: NDArray[np.float64]
+    blocks: dict[str, int]
+    window: int
+    descriptors: NDArray[np.float32]
     sequence: NDArray[np.intp]
     errors: NDArray[np.float32]
     provenance: dict[str, Any]
+    validation: dict[str, Any] = field(default_factory=dict)
 
-    def describe(self) -> ScaledPCA:
-        """Principal components of the training frames' histograms."""
-        return ScaledPCA().fit(self.histograms)
+    def pca(self) -> ScaledPCA:
+        """Principal components of the training frames' descriptors."""
+        return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
 
     def training_data(self, pca: ScaledPCA) -> TrainingData:
         """What selection rules learn from."""
         return TrainingData(
-            pca.transform(self.histograms),
+            pca.transform(self.descriptors),
             self.sequence,
             self.errors,
             self.space.to_unit(self.sets),
             self.fixed,
         )
 
-    def save(self, path: Path) -> None:
-        """Write the model to one ``.npz`` file, without pickle."""
-        header = {
-            "format": FORMAT,
-            "adaptune": __version__,
+    def _arrays(self) -> dict[str, Any]:
+        return {
+            "descriptors": np.ascontiguousarray(compact(self.descriptors)),
+            "sequence": self.sequence.astype(np.uint32),
+            "errors": np.ascontiguousarray(self.errors, np.float32),
+        }
+
+    def _header(self) -> dict[str, Any]:
+        return {
             "odometry": self.odometry,
             "space": self.space.dump(),
+            "sets": self.sets,
             "fixed": self.fixed,
             "length": self.length,
             "sequences": self.sequences,
-            "provenance": self.provenance,
-            "sets": self.sets,
+            "blocks": self.blocks,
+            "window": self.window,
         }
+
+    @property
+    def digest(self) -> str:
+        """Of everything that selections depend on."""
+        digest = hashlib.sha256(json.dumps(self._header()).encode())
+        for array in self._arrays().values():
+            digest.update(array.data)
+        return digest.hexdigest()[:16]
+
+    def save(self, path: Path) -> None:
+        """Write the model to one ``.npz`` file: plain arrays and JSON, neither pickled nor packed.
+
+        Numbers keep all their bits. A packed file would be a tenth smaller, take ten times as long
+        to load, and could ask for a thousand times its size in memory.
+        """
+        header = {"format": FORMAT, "adaptune": __version__} | self._header()
+        header |= {"provenance": self.provenance, "validation": self.validation}
         # numpy adds a suffix to a name, but not to an open file.
         with replacing(path) as beside, beside.open("wb") as file:
-            np.savez_compressed(
-                file,
-                header=np.frombuffer(json.dumps(header).encode(), np.uint8),
-                # Counts of cells are small whole numbers.
-                histograms=self.histograms.astype(np.uint16),
-                sequence=self.sequence.astype(np.uint32),
-                errors=self.errors,
-            )
+            np.savez(file, header=_bytes(header), **self._arrays())
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a model.
 
+        It takes about as much memory as the file is large, whatever the file says.
+
         Raises
         ------
         ModelError
-            If there is none, or it is damaged, or of a newer adaptune.
+            If there is none, or it is damaged, or of a newer or older adaptune.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
-                header = json.loads(file["header"].tobytes())
-                if header["format"] > FORMAT:
-                    raise ModelError(
-                        f"{path}: written by adaptune {header['adaptune']}, which is newer than "
-                        f"this ({__version__}); update adaptune or fit the model again"
-                    )
+            with path.open("rb") as stream, zipfile.ZipFile(stream) as file:
+                size = stream.seek(0, io.SEEK_END)
+                said = json.loads(_read(file, size, "header").tobytes())
+                _check_format(path, int(said["format"]), str(said["adaptune"]))
+                header = _Header.model_validate(said)
                 model = cls(
-                    odometry=header["odometry"],
-                    space=ParameterSpace.load(header["space"]),
-                    sets=header["sets"],
-                    fixed=header["fixed"],
-                    length=header["length"],
-                    sequences=header["sequences"],
-                    histograms=file["histograms"].astype(np.float64),
-                    sequence=file["sequence"].astype(np.intp),
-                    errors=file["errors"],
-                    provenance=header["provenance"],
+                    odometry=header.odometry,
+                    space=ParameterSpace.load(header.space),
+                    sets=header.sets,
+                    fixed=header.fixed,
+                    length=header.length,
+                    sequences=header.sequences,
+                    blocks=header.blocks,
+                    window=header.window,
+                    descriptors=_read(file, size, "descriptors").astype(np.float32),
+                    sequence=_read(file, size, "sequence").astype(np.intp),
+                    errors=_read(file, size, "errors"),
+                    provenance=header.provenance,
+                    validation=header.validation,
                 )
                 model.check()
         except FileNotFoundError as error:
-            raise ModelError(f"{path}: there is no such model") from error
+            raise ModelError(f"{path}: there is no such model; run `adaptune offline`") from error
         except _DAMAGED as error:
-            raise ModelError(f"{path}: is not an error model, or damaged ({error})") from error
+            lines = " ".join(str(error).split())
+            raise ModelError(f"{path}: is not an error model, or damaged ({lines})") from error
         return model
 
     def check(self) -> None:
@@ -148,11 +207,58 @@ class ErrorModel:
         SpaceError
         """
         n_frames, n_sets = self.errors.shape
-        if self.histograms.shape != (n_frames, N_FEATURES) or self.sequence.shape != (n_frames,):
-            raise ValueError("histograms, sequence numbers and errors differ in length")
+        if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
+            raise ValueError("the errors are not of as many frames as the descriptors")
+        if self.sequence.shape != (n_frames,):
+            raise ValueError("the errors are not of as many frames as the sequence numbers")
         if not n_frames or len(self.sets) != n_sets or not 0 <= self.fixed < n_sets:
             raise ValueError("errors and parameter sets do not go together")
-        if self.sequence.max() >= len(self.sequences) or np.isnan(self.errors).any():
-            raise ValueError("a frame is of no sequence, or has no error")
+        if not 0 <= self.sequence.min() <= self.sequence.max() < len(self.sequences):
+            raise ValueError("a frame is of no sequence")
+        # Not a number is neither; both are true of most files, and make no copy of the errors.
+        if not np.isfinite(self.descriptors).all() or np.nanmin(self.errors, initial=0.0) < 0.0:
+            raise ValueError("there are descriptors or errors that cannot be")
+        if np.isnan(self.errors).all(axis=1).any():
+            raise ValueError("a frame has no error at all")
         for parameters in self.sets:
             self.space.check(parameters)
+
+
+def _bytes(data: Any) -> NDArray[np.uint8]:
+    return np.frombuffer(json.dumps(data).encode(), np.uint8)
+
+
+def _check_format(path: Path, found: int, version: str) -> None:
+    if found > FORMAT:
+        raise ModelError(
+            f"{path}: written by adaptune {version}, which is newer than this ({__version__}); "
+            f"update adaptune or fit the model again"
+        )
+    if found < FORMAT:
+        raise ModelError(
+            f"{path}: written by an older adaptune ({version}); run `adaptune offline` again, "
+            f"which fits the model to the trials there are"
+        )
+
+
+def _read(file: zipfile.ZipFile, size: int, name: str) -> NDArray[Any]:
+    """Read an array, of which nothing is believed that the file's `size` does not bear out.
+
+    It cannot be written to.
+    """
+    member = file.getinfo(f"{name}.npy")
+    if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
+        raise ValueError(f"{name} is packed, as other programs and older versions do")
+    if member.file_size > size:
+        raise ValueError(f"{name} is said to be longer than the file")
+    data = file.read(member)
+    stream = io.BytesIO(data)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError(f"{name} is of another version of numpy's format")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    begin = stream.tell()
+    if dtype.str not in _TYPES[name] or fortran:
+        raise ValueError(f"{name} holds {dtype}, not {' or '.join(_TYPES[name])}")
+    if math.prod(shape) * dtype.itemsize != len(data) - begin:
+        raise ValueError(f"{name} is not as long as it says")
+    return np.frombuffer(data, dtype, offset=begin).reshape(shape)

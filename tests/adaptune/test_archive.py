@@ -31,7 +31,8 @@ def random_frames(seed=0):
     T_ref_sensor = rng.normal(size=(N, 4, 4))
     T_ref_sensor[2] = np.nan
     stamps = 1_700_000_000_123_456_789 + np.arange(N) * 100_000_001
-    return Frames(stamps, T_ref_sensor, rng.integers(0, 1000, (N, 90)).astype(float))
+    counts = rng.integers(0, 1000, (N, 90)).astype(np.float32)
+    return Frames(stamps, T_ref_sensor, counts, {"ndt": 90})
 
 
 def assert_same(a, b):
@@ -61,6 +62,18 @@ def test_frames_survive(tmp_path):
     frames = random_frames()
     Archive(tmp_path).write_frames("street", frames)
     assert_same(Archive(tmp_path).read_frames("street"), frames)
+
+
+def test_frames_count_with_their_descriptors_only(tmp_path):
+    archive = Archive(tmp_path)
+    shares = np.random.default_rng(0).random((N, 92), np.float32)
+    frames = dataclasses.replace(random_frames(), descriptors=shares, blocks={"ndt": 90, "b": 2})
+    assert not archive.has_frames("street", ["ndt", "b"])
+    archive.write_frames("street", frames)
+    assert_same(archive.read_frames("street"), frames)
+    assert archive.has_frames("street", ["ndt", "b"])
+    assert not archive.has_frames("street", ["b", "ndt"])
+    assert not archive.has_frames("street", ["ndt"])
 
 
 def test_a_trial_is_replaced(tmp_path):

@@ -71,7 +71,7 @@ def test_the_model_is_that_of_the_trials(trained):
     assert model.sequences == ["one", "two"]
     assert model.errors.shape == (58, 10)
     frames = Archive(study.folder / "trials").read_frames("two")
-    np.testing.assert_array_equal(model.histograms[29:], frames.histograms[:29])
+    np.testing.assert_array_equal(model.descriptors[29:], frames.descriptors[:29])
 
 
 def test_number_of_workers_changes_nothing(trained, study_file, tmp_path):

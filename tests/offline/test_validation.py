@@ -64,7 +64,7 @@ class Cheat(Rule):
 def test_the_sequence_left_out_is_never_seen():
     sequences = two_kinds(np.random.default_rng(1))
     marked = [
-        LabelledSequence(s.name, s.period, s.histograms, s.errors + np.float32(i))
+        LabelledSequence(s.name, s.period, s.descriptors, s.errors + np.float32(i))
         for i, s in enumerate(sequences)
     ]
     Cheat.fitted = ()

@@ -1,10 +1,15 @@
 """The error model as a file."""
 
 import dataclasses
+import io
 import json
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from adaptune.model import RULES, ErrorModel, ModelError
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
@@ -29,7 +34,9 @@ def random_model(seed=0, n_frames=50, n_sets=6):
         fixed=2,
         length=25.0,
         sequences=["cave", "Straße"],
-        histograms=rng.integers(0, 500, (n_frames, 90)).astype(float),
+        blocks={"ndt": 90},
+        window=1,
+        descriptors=rng.integers(0, 500, (n_frames, 90)).astype(np.float32),
         sequence=rng.integers(0, 2, n_frames),
         errors=errors,
         provenance={"trials": n_sets, "note": None},
@@ -56,7 +63,8 @@ def saved(folder, **changes):
 
 def rewrite(path, arrays=None, **header):
     """Change parts of a file as somebody could who knows the format."""
-    parts = dict(np.load(path))
+    with np.load(path) as file:
+        parts = dict(file)
     changed = json.loads(parts["header"].tobytes()) | header
     parts["header"] = np.frombuffer(json.dumps(changed).encode(), np.uint8)
     np.savez(path, **parts | (arrays or {}))
@@ -82,9 +90,9 @@ def test_a_model_survives_bit_for_bit(tmp_path):
 
 def test_a_loaded_model_chooses_as_the_saved_one_did(tmp_path):
     model, loaded = random_model(), ErrorModel.load(saved(tmp_path))
-    np.testing.assert_array_equal(loaded.describe().components_, model.describe().components_)
+    np.testing.assert_array_equal(loaded.pca().components_, model.pca().components_)
     for rule in RULES.values():
-        a, b = (rule().fit(m.training_data(m.describe())) for m in (model, loaded))
+        a, b = (rule().fit(m.training_data(m.pca())) for m in (model, loaded))
         for feature in np.random.default_rng(1).normal(size=(5, 10)):
             np.testing.assert_array_equal(a.predict(feature), b.predict(feature))
             assert a.select(feature) == b.select(feature)
@@ -92,13 +100,38 @@ def test_a_loaded_model_chooses_as_the_saved_one_did(tmp_path):
 
 def test_training_data_is_the_model_in_numbers():
     model = random_model()
-    pca = model.describe()
+    pca = model.pca()
     data = model.training_data(pca)
-    np.testing.assert_array_equal(data.features, pca.transform(model.histograms))
+    np.testing.assert_array_equal(data.features, pca.transform(model.descriptors))
     np.testing.assert_array_equal(data.sets, SPACE.to_unit(model.sets))
     np.testing.assert_array_equal(data.errors, model.errors)
     np.testing.assert_array_equal(data.sequence, model.sequence)
     assert data.fixed == 2
+
+
+def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_path):
+    model = random_model()
+    model.errors[model.sequence == 1, 3:] = np.nan
+    model = dataclasses.replace(
+        model,
+        blocks={"mine:shape": 88, "two": 2},
+        window=3,
+        descriptors=np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
+        validation={"paired": {"geometric": 0.6, "verdict": "Adapt."}},
+    )
+    model.save(tmp_path / "model.npz")
+    assert_same(ErrorModel.load(tmp_path / "model.npz"), model)
+
+
+def test_the_digest_is_of_what_selections_depend_on(tmp_path):
+    model = random_model()
+    assert ErrorModel.load(saved(tmp_path)).digest == model.digest
+    for same in ({"validation": {"paired": {}}}, {"provenance": {}}):
+        assert dataclasses.replace(model, **same).digest == model.digest
+    errors = model.errors.copy()
+    errors[3, 4] += 1
+    for other in ({"fixed": 1}, {"window": 2}, {"errors": errors}, {"blocks": {"mine": 90}}):
+        assert dataclasses.replace(model, **other).digest != model.digest
 
 
 def test_a_missing_model(tmp_path):
@@ -163,7 +196,7 @@ class Trap:
         return (pytest.fail, ("a pickle was loaded",))
 
 
-@pytest.mark.parametrize("name", ["header", "histograms", "sequence", "errors"])
+@pytest.mark.parametrize("name", ["header", "descriptors", "sequence", "errors"])
 def test_a_pickle_inside_is_refused(tmp_path, name):
     path = saved(tmp_path)
     rewrite(path, {name: np.array([Trap()], object)})
@@ -177,9 +210,15 @@ def test_a_pickle_is_refused(tmp_path):
     refused(path)
 
 
+def test_an_older_format_is_refused_by_name(tmp_path):
+    path = saved(tmp_path)
+    rewrite(path, adaptune="0.0.1", format=1)
+    assert "older adaptune (0.0.1)" in refused(path)
+
+
 def test_a_newer_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
-    rewrite(path, adaptune="7.8.9", format=2)
+    rewrite(path, adaptune="7.8.9", format=3)
     message = refused(path)
     assert "7.8.9" in message
     assert "newer" in message
@@ -204,6 +243,17 @@ def test_what_a_newer_file_adds_does_not_hurt_while_the_format_is_the_same(tmp_p
         {"sets": [{"distance": 99.0, "points": 3, "kernel": "none"}] * 6},
         {"space": {"distance": {"type": "float", "low": 3}}},
         {"space": {}},
+        {"length": 0.0},
+        {"length": "25"},
+        {"length": float("nan")},
+        {"blocks": {"ndt": 80}},
+        {"blocks": {"ndt": 90, "more": 0}},
+        {"blocks": {"ndt": 90.0}},
+        {"window": 0},
+        {"sequences": "ab"},
+        {"provenance": []},
+        {"sets": [[1]] * 6},
+        {"odometry": None},
     ],
 )
 def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
@@ -215,13 +265,18 @@ def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
 @pytest.mark.parametrize(
     "arrays",
     [
-        {"histograms": np.zeros((49, 90), np.uint16)},
-        {"histograms": np.zeros((50, 80), np.uint16)},
+        {"descriptors": np.zeros((49, 90), np.uint16)},
+        {"descriptors": np.zeros((50, 80), np.uint16)},
         {"sequence": np.zeros(49, np.uint32)},
         {"sequence": np.full(50, 2, np.uint32)},
         {"errors": np.zeros((50, 5), np.float32)},
         {"errors": np.zeros(50, np.float32)},
         {"errors": np.full((50, 6), np.nan, np.float32)},
+        {"errors": np.full((50, 6), -1.0, np.float32)},
+        {"errors": np.zeros((50, 6))},
+        {"errors": np.zeros((6, 50), np.float32).T},
+        {"errors": np.zeros((50, 6), ">f4")},
+        {"descriptors": np.full((50, 90), np.nan, np.float32)},
         {"errors": np.full((50, 6), "x")},
     ],
 )
@@ -234,7 +289,7 @@ def test_arrays_that_do_not_go_together_are_refused(tmp_path, arrays):
 def test_an_empty_model_is_refused(tmp_path):
     path = saved(
         tmp_path,
-        histograms=np.zeros((0, 90)),
+        descriptors=np.zeros((0, 90), np.float32),
         sequence=np.zeros(0, int),
         errors=np.zeros((0, 6), np.float32),
     )
@@ -253,3 +308,108 @@ def test_a_model_keeps_the_name_it_is_given(tmp_path, name):
     random_model().save(path)
     assert list(tmp_path.iterdir()) == [path]
     assert_same(ErrorModel.load(path), random_model())
+
+
+def member(shape, data=b"", dtype="<f4"):
+    """An array as numpy writes it, whose header may lie about what follows."""
+    stream = io.BytesIO()
+    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(stream, header)
+    return stream.getvalue() + data
+
+
+def repacked(path, name, data, compression=zipfile.ZIP_STORED):
+    """Replace a member of a saved model."""
+    with zipfile.ZipFile(path) as file:
+        members = {info.filename: file.read(info) for info in file.infolist()}
+    with zipfile.ZipFile(path, "w", compression) as file:
+        for filename, content in (members | {f"{name}.npy": data}).items():
+            file.writestr(filename, content)
+
+
+def peak(path):
+    """Bytes taken at most while a file is loaded, or refused."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ModelError):
+            ErrorModel.load(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [(10**6, 10**6), (2**31, 2), (-1, 6), (-2, -150), (2**64, 2**64), (50, 7), (300,), (), (50, 0)],
+)
+def test_shapes_that_the_file_does_not_bear_out_are_refused(tmp_path, shape):
+    path = saved(tmp_path)
+    repacked(path, "errors", member(shape, bytes(50 * 6 * 4)))
+    assert peak(path) < 2_000_000
+
+
+def test_a_packed_file_is_not_unpacked(tmp_path):
+    path = saved(tmp_path)
+    repacked(path, "errors", member((10**4, 10**3), bytes(4 * 10**7)), zipfile.ZIP_DEFLATED)
+    assert path.stat().st_size < 100_000
+    assert peak(path) < 2_000_000
+
+
+def test_a_member_that_is_said_to_be_longer_than_the_file_is_refused(tmp_path):
+    path = saved(tmp_path)
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"errors.npy")
+    # Both sizes of the last entry in the directory.
+    data[at - 26 : at - 18] = (2**31).to_bytes(4, "little") * 2
+    path.write_bytes(data)
+    assert peak(path) < 2_000_000
+
+
+def attempt(path):
+    """A model, or the sentence that refuses it, in which the file is named."""
+    try:
+        return ErrorModel.load(path), str(path)
+    except ModelError as error:
+        return None, str(error)
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+def test_whatever_happens_to_the_bytes_a_sentence_is_all_that_comes_of_it(tmp_path, data):
+    path = saved(tmp_path)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        # Most of a file is numbers: the ends of it, and of its header, are where it is fragile.
+        at = data.draw(st.integers(0, len(content)) | st.integers(len(content) - 700, len(content)))
+        length = data.draw(st.integers(0, 40))
+        content[at : at + length] = data.draw(st.binary(max_size=40))
+    path.write_bytes(content)
+    tracemalloc.start()
+    loaded, message = attempt(path)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert taken < 4_000_000
+    assert str(path) in message
+    assert "\n" not in message
+    if loaded is not None:
+        assert_same(loaded, random_model())
+
+
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+def test_any_header_is_understood_or_refused(tmp_path, data):
+    """Checksums keep most damage away from the header; here it is somebody's who mends them."""
+    path = saved(tmp_path)
+    json_values = st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+        max_leaves=5,
+    )
+    keys = ["format", "space", "sets", "fixed", "length", "sequences", "blocks", "window"]
+    rewrite(path, **{data.draw(st.sampled_from(keys)): data.draw(json_values)})
+    _, message = attempt(path)
+    assert str(path) in message

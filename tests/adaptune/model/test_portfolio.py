@@ -1,6 +1,5 @@
 import numpy as np
 
-from adaptune.descriptor import N_FEATURES
 from adaptune.model import ErrorModel, portfolio, restrict
 from adaptune.space import Float, ParameterSpace
 
@@ -14,7 +13,9 @@ def model(errors, sequence, fixed):
         fixed=fixed,
         length=10.0,
         sequences=["a", "b"],
-        histograms=np.zeros((len(errors), N_FEATURES)),
+        blocks={"ndt": 1},
+        window=1,
+        descriptors=np.zeros((len(errors), 1), np.float32),
         sequence=np.array(sequence, np.intp),
         errors=np.array(errors, np.float32),
         provenance={},

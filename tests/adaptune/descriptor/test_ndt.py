@@ -8,7 +8,8 @@ from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 
-from adaptune.descriptor import NdtHistogram, ScaledPCA, ndt_histogram
+from adaptune.descriptor import ScaledPCA
+from adaptune.descriptor.ndt import NdtHistogram, ndt_histogram
 
 modest = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -307,6 +308,6 @@ def test_scans_that_are_all_the_same():
 
 def test_they_are_sklearn_estimators():
     pca = clone(ScaledPCA(n_components=4))
-    assert pca.get_params() == {"n_components": 4}
+    assert pca.get_params() == {"n_components": 4, "blocks": None}
     scans = [street(seed, 1500) for seed in range(8)]
     assert make_pipeline(NdtHistogram(), pca).fit_transform(scans).shape == (8, 4)

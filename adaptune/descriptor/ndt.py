@@ -1,4 +1,4 @@
-"""What a scan's surroundings look like: a histogram of the shapes of its NDT cells.
+"""The histogram of the shapes of a scan's NDT cells.
 
 After Magnusson, Andreasson, Nüchter and Lilienthal, *Appearance-based loop detection from 3D laser
 data using the normal distributions transform*, ICRA 2009, and Koide et al., IROS 2021. The papers
@@ -12,7 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
-from sklearn.decomposition import PCA
+
+from adaptune.sequence import Scan
 
 CELL_SIZE = 1.0
 """Metres; a cell has an edge at the origin."""
@@ -186,6 +187,11 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     return histogram
 
 
+def describe(scan: Scan) -> NDArray[np.float64]:
+    """`ndt_histogram` of a scan."""
+    return ndt_histogram(scan.points)
+
+
 class NdtHistogram(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """`ndt_histogram` of many scans, as a scikit-learn transformer without state."""
 
@@ -209,39 +215,3 @@ class NdtHistogram(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def __sklearn_is_fitted__(self) -> bool:
         return True
-
-
-class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Principal components, divided by the mean of their standard deviations.
-
-    One divisor for all keeps the components' shares in a distance, and gives distances a size that
-    does not depend on the sensor's number of points.
-
-    Parameters
-    ----------
-    n_components
-        At most; fewer where there are fewer scans.
-
-    Attributes
-    ----------
-    mean_ : ndarray of shape (n_features,)
-    components_ : ndarray of shape (n_components, n_features)
-    scale_ : float
-    """
-
-    def __init__(self, n_components: int = 10):
-        self.n_components = n_components
-
-    def fit(self, X: NDArray[np.float64], y: Any = None) -> Self:  # noqa: ARG002
-        """Learn from histograms of shape (n_scans, n_features)."""
-        pca = PCA(min(self.n_components, *np.shape(X)), svd_solver="full")
-        deviations = pca.fit_transform(X).std(axis=0)
-        self.mean_ = pca.mean_
-        self.components_ = pca.components_
-        self.scale_ = float(deviations.mean()) or 1.0
-        return self
-
-    def transform(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map histograms to shape (n_scans, n_components)."""
-        projected: NDArray[np.float64] = (X - self.mean_) @ self.components_.T / self.scale_
-        return projected

@@ -1,0 +1,21 @@
+"""What a scan's surroundings look like, in numbers."""
+
+from adaptune.descriptor.base import (
+    DESCRIPTORS,
+    Describer,
+    Descriptor,
+    DescriptorError,
+    ScaledPCA,
+    averaged,
+    descriptor,
+)
+
+__all__ = [
+    "DESCRIPTORS",
+    "Describer",
+    "Descriptor",
+    "DescriptorError",
+    "ScaledPCA",
+    "averaged",
+    "descriptor",
+]

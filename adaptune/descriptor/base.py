@@ -1,0 +1,180 @@
+"""Descriptors by name, one or several of them, and what is learnt to compare them by."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.decomposition import PCA
+
+from adaptune import plugins
+from adaptune.errors import AdaptuneError
+from adaptune.sequence import Scan
+
+Descriptor = Callable[[Scan], NDArray[np.floating]]
+"""Describes any scan, even an empty one, by the same number of finite numbers."""
+
+ENTRY_POINTS = "adaptune.descriptors"
+"""Group in which other packages announce their descriptors, each by its name."""
+
+DESCRIPTORS = {
+    "ndt": "adaptune.descriptor.ndt:describe",
+}
+
+
+class DescriptorError(AdaptuneError):
+    """A descriptor that there is not, or that describes nothing."""
+
+
+def descriptor(name: str) -> Descriptor:
+    """Function of a descriptor.
+
+    Parameters
+    ----------
+    name
+        One of `DESCRIPTORS`, one that an installed package announces in the entry-point group
+        ``adaptune.descriptors``, or ``module:function``.
+
+    Raises
+    ------
+    DescriptorError
+    """
+    try:
+        found = plugins.load(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
+    except plugins.PluginError as error:
+        raise DescriptorError(str(error)) from error
+    if not callable(found):
+        raise DescriptorError(f"{name}: is not a function from a scan to an array")
+    describe: Descriptor = found
+    return describe
+
+
+class Describer:
+    """Describes scans by one or several descriptors.
+
+    Parameters
+    ----------
+    names
+        Of the descriptors, see `descriptor`.
+
+    Attributes
+    ----------
+    blocks : dict
+        By name, in order, how many numbers each descriptor has.
+
+    Raises
+    ------
+    DescriptorError
+    """
+
+    def __init__(self, names: Iterable[str]):
+        self._functions = {name: descriptor(name) for name in names}
+        self.blocks: dict[str, int] = {}
+        # This loads compiled code, too, which a robot should not wait for.
+        nothing = Scan(0, np.empty((0, 3), np.float32))
+        self.blocks = {name: len(self._describe(name, nothing)) for name in self._functions}
+
+    def __call__(self, scan: Scan) -> NDArray[np.float32]:
+        """The descriptors one after the other, of shape (n_features,).
+
+        Raises
+        ------
+        DescriptorError
+            If one of them is not what it was for other scans.
+        """
+        return np.concatenate([self._describe(name, scan) for name in self._functions])
+
+    def _describe(self, name: str, scan: Scan) -> NDArray[np.float32]:
+        found = np.asarray(self._functions[name](scan), np.float32)
+        if found.ndim != 1 or len(found) != self.blocks.get(name, len(found)):
+            want = f"({self.blocks[name]},)" if name in self.blocks else "one axis"
+            raise DescriptorError(
+                f"{name}: described scan {scan.stamp} by an array of shape {found.shape}, "
+                f"instead of {want}"
+            )
+        if not np.isfinite(found).all():
+            raise DescriptorError(f"{name}: described scan {scan.stamp} by NaN or infinity")
+        return found
+
+
+class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Principal components, divided by the mean of their standard deviations.
+
+    One divisor for all keeps the components' shares in a distance, and gives distances a size that
+    does not depend on the sensor's number of points.
+
+    Parameters
+    ----------
+    n_components
+        At most; fewer where there are fewer scans.
+    blocks
+        Lengths of the descriptors of which each scan's consists; each has components and a divisor
+        of its own. One block when left out.
+
+    Attributes
+    ----------
+    mean_ : ndarray of shape (n_features,)
+    components_ : ndarray of shape (n_components, n_features)
+        Those of each block, zero elsewhere.
+    scale_ : ndarray of shape (n_components,)
+    """
+
+    def __init__(self, n_components: int = 10, blocks: Sequence[int] | None = None):
+        self.n_components = n_components
+        self.blocks = blocks
+
+    def fit(self, X: NDArray[np.floating], y: Any = None) -> Self:  # noqa: ARG002
+        """Learn from descriptors of shape (n_scans, n_features)."""
+        X = np.asarray(X, np.float64)
+        ends = np.cumsum(X.shape[1:] if self.blocks is None else self.blocks)
+        self.mean_ = np.empty(X.shape[1])
+        components, scales = [], []
+        for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+            block = X[:, begin:end]
+            pca = PCA(min(self.n_components, *block.shape), svd_solver="full")
+            deviations = pca.fit_transform(block).std(axis=0)
+            self.mean_[begin:end] = pca.mean_
+            components.append(np.zeros((len(deviations), X.shape[1])))
+            components[-1][:, begin:end] = pca.components_
+            scales.append(np.full(len(deviations), float(deviations.mean()) or 1.0))
+        self.components_ = np.concatenate(components)
+        self.scale_ = np.concatenate(scales)
+        return self
+
+    def transform(self, X: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Map descriptors to shape (n_scans, n_components)."""
+        projected: NDArray[np.float64] = (X - self.mean_) @ self.components_.T / self.scale_
+        return projected
+
+
+def averaged(
+    descriptors: NDArray[np.float32], stamps: NDArray[np.int64], n: int, period: float
+) -> NDArray[np.float32]:
+    """Mean of each frame's descriptor and of those a period before, two periods before, and so on.
+
+    It is what a selector has seen that describes one scan each period, and remembers the last `n`.
+
+    Parameters
+    ----------
+    descriptors
+        Of shape (n_frames, n_features), along a sequence.
+    stamps
+        Nanoseconds, rising, of shape (n_frames,).
+    n
+        How many to average; fewer near the sequence's start.
+    period
+        Seconds.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_features)
+    """
+    total = descriptors.astype(np.float64)
+    number = np.ones(len(stamps))
+    for k in range(1, n):
+        before = np.searchsorted(stamps, stamps - round(k * period * 1e9), side="right") - 1
+        there = before >= 0
+        total[there] += descriptors[before[there]]
+        number += there
+    return (total / number[:, None]).astype(np.float32)

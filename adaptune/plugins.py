@@ -1,0 +1,57 @@
+"""What users add under a name: of ours, of another package's, or as ``module:attribute``."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from adaptune.errors import AdaptuneError
+from adaptune.space import nearest
+
+
+class PluginError(AdaptuneError):
+    """A name that leads to nothing."""
+
+
+def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> Any:
+    """Import what a name stands for.
+
+    Parameters
+    ----------
+    name
+        One of `ours`, one that an installed package announces in the entry-point group, or
+        ``module:attribute``.
+    kind
+        What it is, for the message: an odometry, say.
+    ours
+        By name, where each is, as ``module:attribute``.
+    group
+        Of entry points.
+    sort
+        Of Python object: ``Class``, or ``function``.
+
+    Raises
+    ------
+    PluginError
+        Naming the nearest name there is, or telling what cannot be imported.
+    """
+    path = ours.get(name) or (name if ":" in name else None)
+    if path is None:
+        announced = {point.name: point.value for point in entry_points(group=group)}
+        if name not in announced:
+            help_ = nearest(name, [*ours, *announced])
+            raise PluginError(
+                f"there is no {kind} {name!r}: {help_} (a {sort.lower()} of your own is "
+                f"module:{sort})"
+            )
+        path = announced[name]
+    module, _, attribute = path.partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except ImportError as error:
+        raise PluginError(
+            f"{name}: cannot import {module} ({error}); install it, or name its folder in "
+            f"PYTHONPATH"
+        ) from error
+    except AttributeError as error:
+        raise PluginError(f"{name}: {module} has no {attribute or sort.lower()}") from error
