@@ -41,7 +41,8 @@ from adaptune.odometry import (
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
 from adaptune.sequence.config import expand
-from adaptune.simulation import Course
+from adaptune.sequence.views import WithImu
+from adaptune.simulation import Course, as_sequence
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
@@ -284,9 +285,7 @@ class Study:
         """What is known of a sequence or a course."""
         if name in self.config.sequences:
             return self.config.sequences[name]
-        return SequenceConfig(
-            bag=str(self.recording(name)), points="/velodyne_points", reference="/gt_poses"
-        )
+        return as_sequence(self.config.courses[name], self.recording(name))
 
     def sequence(self, name: str) -> Any:
         """Open a sequence or a recorded course.
@@ -303,7 +302,8 @@ class Study:
                 f"{self.recording(name)}: the course {name} is not recorded yet; run "
                 f"`adaptune simulate` with this study first"
             )
-        return open_sequence(self.sequence_config(name))
+        sequence = open_sequence(self.sequence_config(name))
+        return WithImu(sequence) if self.box.needs_imu else sequence
 
     def recording_size(self, name: str) -> list[int] | None:
         """Bytes of a recording's files, by which another recording in its place is noticed.
@@ -482,7 +482,7 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list
     if isinstance(odometry := data.get("odometry"), dict):
         _check_odometry(odometry, problems)
     if config is not None:
-        _check_switching(config, problems)
+        _check_box(config, problems)
     sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
         return None, problems
@@ -544,12 +544,22 @@ def _check_odometry(data: dict[str, Any], problems: list[_Problem]) -> None:
             _validated(type(default), _complete(box.space, parameter, given), key, problems)
 
 
-def _check_switching(config: StudyConfig, problems: list[_Problem]) -> None:
+def _check_box(config: StudyConfig, problems: list[_Problem]) -> None:
+    """Find what is asked of the odometry that it cannot do, and what it lacks."""
     try:
-        live = box_class(config.odometry.name).live
+        box = box_class(config.odometry.name)
     except OdometryError:
         return
-    if config.online.switching.mechanism == "live" and not live:
+    if box.needs_imu:
+        needs = f"{config.odometry.name} needs an IMU"
+        for name, sequence in config.sequences.items():
+            if sequence.imu is None:
+                help_ = "name its topic and its place, imu: {topic: ..., extrinsic: ...}"
+                problems.append((("sequences", name), f"{needs}; {help_}"))
+        for name, course in config.courses.items():
+            if course.imu is None:
+                problems.append((("courses", name), f"{needs}; simulate one, imu: 200"))
+    if config.online.switching.mechanism == "live" and not box.live:
         problems.append(
             (
                 ("online", "switching", "mechanism"),

@@ -72,6 +72,8 @@ class Odometry(ABC):
         Whether a second instance in the same process knows nothing of the first, and no scan ends
         the process; class attribute. One that is not known to be clean runs in a process of its
         own.
+    needs_imu : bool
+        Whether scans must bring along what an IMU measured; class attribute.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -93,6 +95,7 @@ class Odometry(ABC):
     settings_type: ClassVar[type[BaseSettings]] = BaseSettings
     live: ClassVar[bool]
     clean: ClassVar[bool] = False
+    needs_imu: ClassVar[bool] = False
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -154,7 +157,7 @@ class Odometry(ABC):
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
     if isinstance(prepared, Scan):
-        prepared = (prepared.points, prepared.times, prepared.rings)
+        prepared = (prepared.points, prepared.times, prepared.rings, prepared.imu)
     if isinstance(prepared, tuple):
         return sum(map(prepared_bytes, prepared))
     if prepared is None:

@@ -1,4 +1,4 @@
-r"""Messages between a program and an odometry in another process, version 1.
+r"""Messages between a program and an odometry in another process, version 2.
 
 Each message is a JSON header and the raw bytes of arrays::
 
@@ -12,14 +12,17 @@ The odometry answers each message with one of its own:
 type           holds                                                    answer
 =============  =======================================================  =========================
 ``hello``      version, odometry, parameters, settings                  ``done``: version, live
-``start``      stamp, points, times?, rings?, pose, motion?             ``done``
-``register``   stamp, points, times?, rings?                            ``pose``: registered, pose
+``start``      stamp, points, times?, rings?, imu..?, pose, motion?     ``done``
+``register``   stamp, points, times?, rings?, imu..?                    ``pose``: registered, pose
 ``configure``  parameters                                               ``done``
 =============  =======================================================  =========================
 
 or with ``refused`` and a ``message``, where it cannot do what is asked. Points are float32 of
 shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16, poses and motions
-float64 of shape (4, 4), stamps integer nanoseconds. The other side ends by closing the stream.
+float64 of shape (4, 4), stamps integer nanoseconds. What an IMU measured since the scan before are
+four arrays: imu_stamps, int64; imu, float64 of shape (n, 6), rad/s and m/s^2; imu_pose, its pose in
+the LiDAR's frame; imu_noise, float64 of shape (4,), see `adaptune.sequence.imu.ImuNoise`. The other
+side ends by closing the stream.
 """
 
 import json
@@ -35,10 +38,11 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.odometry.base import Odometry, OdometryError
 from adaptune.odometry.registry import box_class
-from adaptune.sequence import Scan
+from adaptune.sequence import Imu, Scan
+from adaptune.sequence.imu import ImuNoise
 from adaptune.space import nearest
 
-VERSION = 1
+VERSION = 2
 _HOLDS = {
     "hello": ("version", "odometry", "parameters", "settings"),
     "start": ("stamp", "points", "pose"),
@@ -120,12 +124,29 @@ def _exactly(stream: Readable, size: int) -> bytes:
 
 def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
     """What a message holds of a scan beside its stamp."""
-    return {"points": scan.points, "times": scan.times, "rings": scan.rings}
+    arrays: dict[str, NDArray[Any] | None] = {
+        "points": scan.points,
+        "times": scan.times,
+        "rings": scan.rings,
+    }
+    if scan.imu is not None:
+        arrays["imu_stamps"] = scan.imu.stamps
+        arrays["imu"] = np.hstack([scan.imu.angular_velocity, scan.imu.acceleration])
+        arrays["imu_pose"] = scan.imu.T_sensor_imu
+        arrays["imu_noise"] = np.array(scan.imu.noise)
+    return arrays
 
 
-def _scan(message: Message) -> Scan:
+def to_scan(message: Message) -> Scan:
+    """The scan that a message holds."""
     arrays = message.arrays
-    return Scan(message.header["stamp"], arrays["points"], arrays.get("times"), arrays.get("rings"))
+    imu = None
+    if "imu" in arrays:
+        gyro, acceleration = np.hsplit(arrays["imu"], 2)
+        noise = ImuNoise(*arrays["imu_noise"].tolist())
+        imu = Imu(arrays["imu_stamps"], gyro, acceleration, arrays["imu_pose"], noise)
+    points, times, rings = arrays["points"], arrays.get("times"), arrays.get("rings")
+    return Scan(message.header["stamp"], points, times, rings, imu)
 
 
 def serve(reader: Readable, writer: BinaryIO) -> None:
@@ -161,7 +182,10 @@ def _check(message: Message) -> None:
     if kind not in _HOLDS:
         raise OdometryError(f"there is no message of type {kind!r}; {nearest(str(kind), _HOLDS)}")
     there = message.header.keys() | message.arrays.keys()
-    if lacking := [name for name in _HOLDS[kind] if name not in there]:
+    holds = _HOLDS[kind]
+    if "imu" in there:
+        holds += ("imu_stamps", "imu_pose", "imu_noise")
+    if lacking := [name for name in holds if name not in there]:
         raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
 
 
@@ -181,14 +205,14 @@ def _make(hello: Mapping[str, Any]) -> Odometry:
 def _answer(box: Odometry, message: Message, writer: BinaryIO) -> None:
     header, arrays = message
     if header["type"] == "register":
-        T_odom_sensor, registered = box.register(box.prepare(_scan(message)))
+        T_odom_sensor, registered = box.register(box.prepare(to_scan(message)))
         pose: Poses = np.asarray(T_odom_sensor, np.float64)
         send(writer, {"type": "pose", "registered": bool(registered)}, pose=pose)
         return
     if header["type"] == "start":
         # Arrays from the stream are read-only; poses are an odometry's own to keep.
         motion = arrays["motion"].copy() if "motion" in arrays else None
-        box.start(box.prepare(_scan(message)), arrays["pose"].copy(), motion)
+        box.start(box.prepare(to_scan(message)), arrays["pose"].copy(), motion)
     else:
         box.configure(header["parameters"])
     send(writer, {"type": "done"})

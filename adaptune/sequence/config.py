@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 from adaptune import geometry
 from adaptune.geometry import Poses
 from adaptune.sequence import cache, views
-from adaptune.sequence.bag import BagSource, bag_paths
+from adaptune.sequence.bag import IMU_TYPES, BagSource, bag_paths
 from adaptune.sequence.folder import kitti, scan_folder
+from adaptune.sequence.imu import USUAL, ImuNoise
 from adaptune.sequence.motion import compensate_rotation
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import (
@@ -213,6 +214,18 @@ _VIEWS: dict[str, Callable[[views.Reversible, Any], views.Reversible]] = {
 }
 
 
+_Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class NoiseDensities(_Section):
+    """See `ImuNoise`."""
+
+    gyroscope: _Noise = USUAL.gyroscope
+    accelerometer: _Noise = USUAL.accelerometer
+    gyroscope_walk: _Noise = USUAL.gyroscope_walk
+    accelerometer_walk: _Noise = USUAL.accelerometer_walk
+
+
 class ImuConfig(_Section):
     """An IMU.
 
@@ -224,11 +237,14 @@ class ImuConfig(_Section):
         Its pose in the LiDAR's frame.
     unit : {"m/s2", "g"}
         Of its accelerometer.
+    noise : NoiseDensities
+        For odometries that weigh it against the LiDAR.
     """
 
     topic: str | None = None
     extrinsic: Transform | None = None
     unit: Literal["m/s2", "g"] = "m/s2"
+    noise: NoiseDensities = NoiseDensities()
 
 
 class SequenceConfig(_Part):
@@ -325,6 +341,8 @@ def open_sequence(config: SequenceConfig) -> Sequence:
     if isinstance(source, BagSource):
         topic = reference if isinstance(reference, str) else None
         source.check(topic, None if config.imu is None else config.imu.topic)
+        if config.imu is not None and config.bag is not None:
+            source.topic(config.imu.topic, IMU_TYPES, "an IMU's measurements")
     recorded = RecordedSequence(
         source,
         _section(config),
@@ -378,7 +396,8 @@ def _imu(config: ImuConfig | None) -> ImuSettings | None:
     if config is None:
         return None
     T = None if config.extrinsic is None else to_pose(config.extrinsic)
-    return ImuSettings(config.topic, T, _STANDARD_GRAVITY if config.unit == "g" else 1.0)
+    scale = _STANDARD_GRAVITY if config.unit == "g" else 1.0
+    return ImuSettings(config.topic, T, scale, ImuNoise(**config.noise.model_dump()))
 
 
 def _compensated(sequence: RecordedSequence) -> views.View:

@@ -1,6 +1,7 @@
 """Measurements of an IMU."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,30 @@ from adaptune.geometry import Poses
 from adaptune.trajectory import Trajectory
 
 _CORRELATION = 0.8
+
+
+class ImuNoise(NamedTuple):
+    """White noise of an IMU and the random walk of its biases; the defaults are a fair MEMS IMU's.
+
+    Attributes
+    ----------
+    gyroscope : float
+        rad/s for a root hertz.
+    accelerometer : float
+        m/s^2 for a root hertz.
+    gyroscope_walk : float
+        rad/s^2 for a root hertz.
+    accelerometer_walk : float
+        m/s^3 for a root hertz.
+    """
+
+    gyroscope: float = 2e-4
+    accelerometer: float = 2e-3
+    gyroscope_walk: float = 2e-5
+    accelerometer_walk: float = 2e-4
+
+
+USUAL = ImuNoise()
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +52,31 @@ class Imu:
         Metres per second squared, gravity included.
     T_sensor_imu : ndarray of shape (4, 4)
         The IMU's pose in the LiDAR's frame.
+    noise : ImuNoise
     """
 
     stamps: NDArray[np.int64]
     angular_velocity: NDArray[np.float64]
     acceleration: NDArray[np.float64]
     T_sensor_imu: Poses = field(default_factory=lambda: np.eye(4))
+    noise: ImuNoise = USUAL
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the measurements take, in bytes."""
+        return self.stamps.nbytes + self.angular_velocity.nbytes + self.acceleration.nbytes
+
+    def part(self, first: int, last: int) -> "Imu":
+        """Measurements from number `first` to before number `last`."""
+        return replace(
+            self,
+            stamps=self.stamps[first:last],
+            angular_velocity=self.angular_velocity[first:last],
+            acceleration=self.acceleration[first:last],
+        )
 
 
 def clock_offset(trajectory: Trajectory, imu: Imu, rate: float = 50.0) -> float | None:

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.sequence.imu import Imu
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -21,12 +23,16 @@ class Scan:
         float32 seconds since `stamp` at which each point was measured.
     rings : ndarray of shape (n,), optional
         uint16 number of the laser that measured each point.
+    imu : Imu, optional
+        What the IMU measured since the scan before, to the first measurement at the scan's end or
+        after it.
     """
 
     stamp: int
     points: NDArray[np.float32]
     times: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
+    imu: Imu | None = None
 
     def __post_init__(self) -> None:
         # Decoded scans may be shared by all who use them, as those from the cache are.
@@ -45,4 +51,10 @@ class Scan:
             self.points.take(index, axis=0),
             None if self.times is None else self.times.take(index),
             None if self.rings is None else self.rings.take(index),
+            self.imu,
         )
+
+    @property
+    def span(self) -> int:
+        """Nanoseconds from the stamp to the last point; 0 where points have no times."""
+        return round(float(self.times.max()) * 1e9) if self.times is not None and len(self) else 0

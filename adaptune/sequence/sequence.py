@@ -13,7 +13,7 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.sequence import cache
-from adaptune.sequence.imu import Imu, clock_offset
+from adaptune.sequence.imu import USUAL, Imu, ImuNoise, clock_offset
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
@@ -252,11 +252,13 @@ class ImuSettings:
         The IMU's pose in the LiDAR's frame.
     scale : float
         Metres per second squared in a unit of its accelerometer.
+    noise : ImuNoise
     """
 
     topic: str | None = None
     T_sensor_imu: Poses | None = None
     scale: float = 1.0
+    noise: ImuNoise = USUAL
 
 
 _WHOLE = Section()
@@ -374,7 +376,12 @@ class RecordedSequence:
         if imu is None:
             return None
         T = imu.T_sensor_imu if self._imu.T_sensor_imu is None else self._imu.T_sensor_imu
-        return replace(imu, acceleration=imu.acceleration * self._imu.scale, T_sensor_imu=T)
+        return replace(
+            imu,
+            acceleration=imu.acceleration * self._imu.scale,
+            T_sensor_imu=T,
+            noise=self._imu.noise,
+        )
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR, if they are known.

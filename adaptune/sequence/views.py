@@ -7,6 +7,7 @@ lost and the same noise is added in every process, in either direction, whatever
 from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
+from functools import cache as once
 from functools import cached_property
 from typing import Protocol
 
@@ -19,6 +20,9 @@ from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence, SequenceError
 from adaptune.trajectory import Trajectory
+
+# Nanoseconds after the first scan at which an IMU that is on the same clock has begun.
+_LATE = 10 * 10**9
 
 Part = tuple[float, float | None]
 """Seconds since the first scan: [start, stop), to the end where stop is None."""
@@ -237,10 +241,10 @@ class Reversed:
     def _sum(self) -> int:
         """What a moment and its mirror image add up to."""
         first, last = next(iter(self.inner)), next(self.inner.backward())
-        return first.stamp + last.stamp + _span(last)
+        return first.stamp + last.stamp + last.span
 
     def _mirror(self, scan: Scan) -> Scan:
-        span = _span(scan)
+        span = scan.span
         times = None if scan.times is None else np.float32(span * 1e-9) - scan.times
         return replace(
             scan,
@@ -274,9 +278,46 @@ class Reversed:
         return mirrored
 
 
-def _span(scan: Scan) -> int:
-    """Nanoseconds from a scan's first point to its last."""
-    return round(float(scan.times.max()) * 1e9) if scan.times is not None and len(scan) else 0
+class WithImu:
+    """A sequence whose scans bring along what the IMU measured.
+
+    Parameters
+    ----------
+    inner
+        Any sequence.
+    """
+
+    def __init__(self, inner: Sequence):
+        self.inner = inner
+        self.name, self.n_messages = inner.name, inner.n_messages
+        self.reference, self.played_at = inner.reference, inner.played_at
+        self.imu = once(inner.imu)
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Read the scans.
+
+        Raises
+        ------
+        SequenceError
+            If there is no IMU, or it measured at another time.
+        """
+        imu = self.imu()
+        if imu is None or not len(imu):
+            raise SequenceError(f"{self.name}: holds no measurements of an IMU")
+        first: int | None = None
+        for scan in self.inner:
+            if first is None:
+                if not imu.stamps[0] - _LATE < scan.stamp < imu.stamps[-1]:
+                    raise SequenceError(
+                        f"{self.name}: the IMU tells of {imu.stamps[0] * 1e-9:.3f} s to "
+                        f"{imu.stamps[-1] * 1e-9:.3f} s, the first scan is of "
+                        f"{scan.stamp * 1e-9:.3f} s: they are not on the same clock"
+                    )
+                # Those during the first scan, and the one before.
+                first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
+            last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
+            yield replace(scan, imu=imu.part(first, last))
+            first = last
 
 
 def _rng(seed: int, scan: Scan) -> np.random.Generator:

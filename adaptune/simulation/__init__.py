@@ -2,7 +2,7 @@
 
 from adaptune.simulation.course import Course, SceneLeg, SimulationError
 from adaptune.simulation.motion import MOTIONS
-from adaptune.simulation.recording import record
+from adaptune.simulation.recording import as_sequence, record
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import SENSORS
 from adaptune.simulation.simulate import SimulatedScan, simulate
@@ -15,6 +15,7 @@ __all__ = [
     "SceneLeg",
     "SimulatedScan",
     "SimulationError",
+    "as_sequence",
     "record",
     "simulate",
 ]

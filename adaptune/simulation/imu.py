@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert
+from adaptune.sequence.imu import ImuNoise
 from adaptune.simulation.motion import Ride
 
 GRAVITY = 9.80665
@@ -21,11 +22,8 @@ T_IMU_LIDAR: Poses = np.array(
 )
 """Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
 
-GYRO_NOISE, ACCEL_NOISE = 5.2e-5, 5.9e-4
-"""White noise of an Xsens MTi-680G, in rad/s and m/s^2 for a root hertz."""
-
-GYRO_WALK, ACCEL_WALK = 2.0e-6, 3.0e-5
-"""Random walk of the biases, in rad/s and m/s^2 for a root second."""
+NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
+"""Of an Xsens MTi-680G."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +84,10 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
     rng = np.random.default_rng([seed, 5])
     truth = ideal(ride, times)
     errors = []
-    for start, walk, noise in ((2e-3, GYRO_WALK, GYRO_NOISE), (2e-2, ACCEL_WALK, ACCEL_NOISE)):
+    for start, walk, noise in (
+        (2e-3, NOISE.gyroscope_walk, NOISE.gyroscope),
+        (2e-2, NOISE.accelerometer_walk, NOISE.accelerometer),
+    ):
         bias = rng.normal(0.0, start, 3) + np.cumsum(
             rng.normal(0.0, walk / np.sqrt(rate), (len(times), 3)), axis=0
         )

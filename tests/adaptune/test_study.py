@@ -25,6 +25,13 @@ def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
         assert load_study(study_file, stiff).mechanism == mechanism
 
 
+def test_an_odometry_that_needs_an_imu(study_file):
+    needy = ["odometry.name=inertial:Inertial", "odometry.parameters=", "odometry.settings={}"]
+    text = failure(study_file, *needy, "courses.sim={scenes: [garden]}")
+    assert "sequences.one: inertial:Inertial needs an IMU; name its topic" in text
+    assert "courses.sim: inertial:Inertial needs an IMU; simulate one, imu: 200" in text
+
+
 def test_reads_a_study(study_file, tmp_path):
     study = load_study(study_file, ["offline.trials=7"], runs=tmp_path)
     assert study.folder == tmp_path / "small"

@@ -15,7 +15,8 @@ from adaptune.archive import Archive
 from adaptune.odometry import HealthCheck, Isolated, Limits, OdometryError, wire
 from adaptune.odometry.gicp import KeyframeGicp, Settings
 from adaptune.odometry.isolation import _server
-from adaptune.sequence import Scan
+from adaptune.sequence import Imu, Scan
+from adaptune.sequence.imu import ImuNoise
 from adaptune.study import load_study
 from offline.trial import PreparedSequence, run_trials
 from offline.workers import Task, Workers
@@ -181,7 +182,7 @@ def exchange(*messages):
 
 HELLO = {
     "type": "hello",
-    "version": 1,
+    "version": 2,
     "odometry": "faulty:Faulty",
     "parameters": {},
     "settings": {},
@@ -202,6 +203,24 @@ def test_a_conversation():
     assert answers[3].arrays["pose"][0, 3] == pytest.approx(0.3)
 
 
+def test_what_an_imu_measured_arrives():
+    imu = Imu(
+        np.arange(3),
+        np.arange(9.0).reshape(3, 3),
+        -np.arange(9.0).reshape(3, 3),
+        2 * np.eye(4),
+        ImuNoise(1.0, 2.0, 3.0, 4.0),
+    )
+    for given in (imu, imu.part(0, 0), None):
+        sent = io.BytesIO()
+        whole = Scan(7, np.ones((5, 3), np.float32), imu=given)
+        wire.send(sent, {"type": "register", "stamp": 7}, **wire.scan_arrays(whole))
+        sent.seek(0)
+        got = wire.to_scan(wire.receive(sent)).imu
+        for name in ("stamps", "angular_velocity", "acceleration", "T_sensor_imu", "noise"):
+            np.testing.assert_array_equal(getattr(got, name, None), getattr(given, name, None))
+
+
 def test_a_conversation_with_the_command_line():
     process = subprocess.Popen(
         [sys.executable, "-m", "adaptune.cli", "serve"],
@@ -214,7 +233,7 @@ def test_a_conversation_with_the_command_line():
     points = np.zeros((5, 3), np.float32)
     with process:
         wire.send(process.stdin, HELLO | {"settings": settings})
-        assert wire.receive(process.stdout).header["version"] == 1
+        assert wire.receive(process.stdout).header["version"] == 2
         wire.send(process.stdin, {"type": "start", "stamp": -1}, points=points, pose=np.eye(4))
         assert wire.receive(process.stdout).header["type"] == "done"
         # What the odometry writes does not come between the messages.
@@ -229,12 +248,13 @@ def test_a_conversation_with_the_command_line():
     ("first", "message"),
     [
         ({"type": "configure", "parameters": {}}, "the first message must be a hello"),
-        (HELLO | {"version": 2}, "speaks version 1 of the protocol, not 2"),
+        (HELLO | {"version": 1}, "speaks version 2 of the protocol, not 1"),
         (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
         (HELLO | {"settings": {"fualt": "hang"}}, "fualt"),
-        ({"type": "hello", "version": 1}, "hello lacks odometry, parameters, settings"),
+        ({"type": "hello", "version": 2}, "hello lacks odometry, parameters, settings"),
         ({"type": "begin"}, "no message of type 'begin'"),
         ({"type": "start", "stamp": 0}, "start lacks points, pose"),
+        ({"type": "register", "stamp": 0}, "register lacks points"),
         ({}, "no message of type None"),
     ],
 )

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence.views import WithImu
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +155,41 @@ def test_a_transform_leaves_the_world_where_it_is(bag: Path) -> None:
 def test_views_that_make_no_sense_are_refused(bag: Path, view: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         SequenceConfig(bag=str(bag), views=[view])
+
+
+class Inertial:
+    """Scans of 0.1 s, one of them lost, and an IMU of 100 Hz."""
+
+    name, n_messages = "inertial", 4
+
+    def __init__(self, begin: float, end: float) -> None:
+        stamps = np.arange(round(begin * 1e9), round(end * 1e9), 10**7)
+        zeros = np.zeros((len(stamps), 3))
+        self.imu = lambda: Imu(stamps, zeros, zeros) if len(stamps) else None
+        self.reference = self.played_at = None
+
+    def __iter__(self) -> Any:
+        points, times = np.zeros((2, 3), np.float32), np.array([0.0, 0.095], np.float32)
+        for tenth in (0, 1, 3, 4):
+            yield Scan(tenth * 10**8, points.copy(), times.copy())
+
+
+def hundredths(begin: float, end: float) -> list[list[int]]:
+    measured = [scan.imu for scan in WithImu(Inertial(begin, end))]
+    return [(imu.stamps // 10**7).tolist() for imu in measured]
+
+
+def test_scans_bring_along_what_the_imu_measured_since_the_one_before() -> None:
+    # To the first measurement at the scan's end or after it; the first begins with the one before.
+    expected = [[*range(11)], [*range(11, 21)], [*range(21, 41)], [*range(41, 51)]]
+    assert hundredths(0.0, 9.0) == expected
+    assert hundredths(-1.0, 9.0) == expected
+    assert hundredths(0.15, 0.45) == [[15], [*range(16, 21)], [*range(21, 41)], [*range(41, 45)]]
+
+
+def test_an_imu_that_is_not_there_or_of_another_time() -> None:
+    with pytest.raises(SequenceError, match="inertial: holds no measurements of an IMU"):
+        hundredths(0.0, 0.0)
+    for begin in (-9.0, 20.0):
+        with pytest.raises(SequenceError, match="they are not on the same clock"):
+            hundredths(begin, begin + 5.0)
