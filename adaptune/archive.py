@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +63,10 @@ class Trial:
         What the odometry took for each scan, without preparing it.
     faults : tuple of str
         What ended the odometry's process, or was no pose, each with the odometry's last words.
+    metrics : dict
+        Of the whole trajectory by name, see `offline.objective`.
+    usage : dict
+        Of CPU time and memory, which differ from run to run.
     """
 
     parameters: ParameterSet
@@ -72,6 +76,8 @@ class Trial:
     registered: NDArray[np.bool_]
     seconds: NDArray[np.float64]
     faults: tuple[str, ...] = ()
+    metrics: dict[str, float] = field(default_factory=dict)
+    usage: dict[str, float] = field(default_factory=dict)
 
     @property
     def mean_error(self) -> float:
@@ -94,6 +100,8 @@ class Summary:
         How often its process ended, or it gave no pose.
     ms : float
         Milliseconds that the odometry took for a scan.
+    others : dict
+        Other metrics by name.
     """
 
     parameters: ParameterSet
@@ -101,6 +109,12 @@ class Summary:
     lost: int
     faults: int
     ms: float
+    others: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """All that the trial can be judged by, see `offline.objective`."""
+        return {"rte": self.mean_error, "ms_per_scan": self.ms} | self.others
 
 
 def summarise(trial: Trial) -> Summary:
@@ -113,6 +127,7 @@ def summarise(trial: Trial) -> Summary:
         int(trial.restarted.sum()),
         len(trial.faults),
         float(1e3 * seconds.mean(dtype=np.float64)) if len(seconds) else 0.0,
+        trial.metrics | trial.usage,
     )
 
 
@@ -267,6 +282,8 @@ class Archive:
                 registered=trial.registered,
                 seconds=trial.seconds.astype(np.float32),
                 faults=np.frombuffer(json.dumps(trial.faults).encode(), np.uint8),
+                metrics=np.frombuffer(json.dumps(trial.metrics).encode(), np.uint8),
+                usage=np.frombuffer(json.dumps(trial.usage).encode(), np.uint8),
             )
         if whole:
             return
@@ -295,6 +312,8 @@ class Archive:
                 data["registered"],
                 data["seconds"].astype(np.float64),
                 tuple(json.loads(data["faults"].tobytes())),
+                json.loads(data["metrics"].tobytes()),
+                json.loads(data["usage"].tobytes()),
             )
         except (KeyError, ValueError) as error:
             raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error

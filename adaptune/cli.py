@@ -225,32 +225,16 @@ def offline(
     with _progress() as progress:
         training = train(loaded, progress)
     model = training.model
-    rows: list[dict[str, Any]] = []
-    for name, means in training.means.items():
-        best = min(range(len(means)), key=means.__getitem__)
-        rows.append(
-            {
-                "sequence": name,
-                "baseline": means[0],
-                "fixed": means[model.fixed],
-                "own best": means[best],
-                "lost, baseline": training.lost[name][0],
-                "lost, fixed": training.lost[name][1],
-                "_own best set": _short(model.sets[best]),
-                "baseline, whole run": training.whole[name][0],
-                "fixed, whole run": training.whole[name][1],
-            }
-        )
-    report.write_rows(loaded.folder, "training", rows)
     console.print(
         report.table(
-            f"RTE [%] over {model.length:g} m in training, {len(model.sets)} parameter sets",
-            rows,
+            f"RTE [%] over {model.length:g} m in training, "
+            f"{loaded.config.offline.trials} parameter sets",
+            training.rows,
             "Trials start anew at the reference after a lost track, which counts as 30 %; whole "
             "runs do not.",
         )
     )
-    console.print(f"Baseline: {_short(model.sets[0])}", highlight=False)
+    console.print(f"Baseline: {_short(loaded.space.baseline)}", highlight=False)
     console.print(f"Fixed: {_short(model.sets[model.fixed])}", highlight=False)
     console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert, rotation_angle
+from adaptune.geometry import Poses, invert, rotation_angle, steps
 
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
@@ -156,6 +156,42 @@ def kitti_error(
         float(np.degrees(np.mean(np.concatenate(rotations)))),
         tuple(used),
     )
+
+
+def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
+    """Absolute pose error: root mean square of the distances after alignment, in metres.
+
+    As ``evo_ape -a`` gives it: the translation part, after the rotation and translation that bring
+    the positions together in least squares (Umeyama, PAMI 1991).
+
+    Parameters
+    ----------
+    T_ref_sensor, T_odom_sensor
+        Reference and estimated poses, of shape (n, 4, 4); those without reference (NaN) do not
+        count.
+    """
+    known = ~np.isnan(T_ref_sensor[:, 0, 0])
+    ref, odom = T_ref_sensor[known, :3, 3], T_odom_sensor[known, :3, 3]
+    ref, odom = ref - ref.mean(axis=0), odom - odom.mean(axis=0)
+    U, _, Vt = np.linalg.svd(ref.T @ odom)
+    U[:, 2] *= np.linalg.det(U @ Vt)  # a rotation, not a mirror
+    return float(np.sqrt(np.mean(np.sum((ref - odom @ (U @ Vt).T) ** 2, axis=1))))
+
+
+def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
+    """Relative pose error: root mean square of the steps' translation errors, in metres.
+
+    As ``evo_rpe`` gives it by default: from each frame to the next.
+
+    Parameters
+    ----------
+    T_ref_sensor, T_odom_sensor
+        Reference and estimated poses, of shape (n, 4, 4); steps without reference (NaN) do not
+        count.
+    """
+    E = invert(steps(T_ref_sensor)) @ steps(T_odom_sensor)
+    known = ~np.isnan(E[:, 0, 0])
+    return float(np.sqrt(np.mean(np.sum(E[known, :3, 3] ** 2, axis=1))))
 
 
 FAILURE = 30.0

@@ -164,3 +164,34 @@ def draw_tracks(
         axis.grid(alpha=0.3)
     with replacing(path) as beside:
         figure.savefig(beside, dpi=110)
+
+
+def draw_front(
+    path: Path, names: Sequence[str], values: NDArray[np.float64], front: NDArray[np.float64]
+) -> None:
+    """Draw a Pareto front among all that was tried, as PNG: every two objectives that follow.
+
+    Parameters
+    ----------
+    path
+        The picture.
+    names
+        Of the objectives.
+    values
+        Of all sets, of shape (n, n_objectives).
+    front
+        Of those on the front, of shape (m, n_objectives).
+    """
+    from matplotlib.figure import Figure
+
+    n = len(names) - 1
+    figure = Figure(figsize=(1.0 + 5.0 * n, 4.5), layout="constrained")
+    for i, axis in enumerate(figure.subplots(1, n, squeeze=False)[0]):
+        axis.plot(values[:, i], values[:, i + 1], ".", color=COLOURS["baseline"], label="tried")
+        axis.plot(front[:, i], front[:, i + 1], "o-", color=COLOURS["fixed"], label="Pareto front")
+        axis.set_xlabel(names[i])
+        axis.set_ylabel(names[i + 1])
+        axis.grid(alpha=0.3)
+    axis.legend(frameon=False)
+    with replacing(path) as beside:
+        figure.savefig(beside, dpi=110)

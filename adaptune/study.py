@@ -15,6 +15,7 @@ from typing import IO, Annotated, Any, Literal, TypeVar
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -69,6 +70,27 @@ class OdometryConfig(_Section):
     parameters: Annotated[dict[str, dict[str, Any]], Field(min_length=1)] | None = None
 
 
+Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
+"""What a trial can be judged by; `offline.objective` tells what each is."""
+TIMED = ("ms_per_scan", "cpu", "memory")
+"""Metrics that differ from run to run and from machine to machine."""
+_Weighted = Annotated[
+    dict[Metric, Annotated[float, Field(gt=0, allow_inf_nan=False)]], Field(min_length=1)
+]
+
+
+def _weighted(given: Any) -> Any:
+    """A metric or a weighted sum of metrics, or several of them, all as weighted sums."""
+    objectives = given if isinstance(given, list | tuple) else [given]
+    return tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
+
+
+class Limit(_Section):
+    """What a metric may not exceed, on any training sequence."""
+
+    max: float = Field(gt=0, allow_inf_nan=False)
+
+
 class OfflineConfig(_Section):
     """How to search for parameter sets.
 
@@ -87,6 +109,11 @@ class OfflineConfig(_Section):
     storage : str, optional
         URL of a database to mirror the trials in; a journal file in the study's folder when left
         out.
+    objective : tuple of dict
+        What to minimise: a metric, or weighted metrics to be summed; several of them for a Pareto
+        front, of which the first chooses the fixed set.
+    limits : dict
+        By metric what a set may not exceed.
     """
 
     sampler: Literal["tpe", "sobol", "random"] = "tpe"
@@ -97,10 +124,19 @@ class OfflineConfig(_Section):
     workers: int | None = Field(None, ge=1)
     memory: float = Field(4.0, gt=0, allow_inf_nan=False)
     storage: Annotated[str, Field(pattern="://"), AfterValidator(expand)] | None = None
+    objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
+        {"rte": 1.0},
+    )
+    limits: dict[Metric, Limit] = {}
 
     @field_serializer("storage")
     def _hide_password(self, storage: str | None) -> str | None:
         return storage and re.sub(r"(://[^:/@]*):[^@]*@", r"\1@", storage)
+
+    @property
+    def metrics(self) -> set[str]:
+        """All metrics that a trial is judged by."""
+        return {*self.limits, *(metric for weights in self.objective for metric in weights)}
 
 
 def _known_descriptor(name: str) -> str:
@@ -255,10 +291,13 @@ class Study:
             {name: _complete(self.box.space, name, given) for name, given in tuned.items()}
         )
 
-    def odometry(self, parameters: ParameterSet | None = None) -> Box:
-        """A new instance with these parameters; those not given keep their baseline."""
+    def odometry(self, parameters: ParameterSet | None = None, isolated: bool = False) -> Box:
+        """A new instance with these parameters; those not given keep their baseline.
+
+        It runs in a process of its own if it is not known to be clean, or if `isolated` asks.
+        """
         given = self.space.baseline | (parameters or {})
-        if self.box.clean:
+        if self.box.clean and not isolated:
             return self.box(given, self.settings)
         return Isolated(self.config.odometry.name, given, self.settings, self.config.isolation)
 
@@ -395,7 +434,8 @@ def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
             entry.pop("cache", None)  # changes nothing but the time it takes
             lasting[f"{kind}.{name}"] = entry
     offline = config.get("offline", {})
-    lasting["offline"] = {k: offline.get(k) for k in ("sampler", "initial", "batch", "seed")}
+    searched = ("sampler", "initial", "batch", "seed", "objective", "limits")
+    lasting["offline"] = {k: offline.get(k) for k in searched}
     return lasting
 
 

@@ -1,22 +1,27 @@
 """The offline stage: run trials batch by batch, then fit the error model."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptune import __version__, report, yaml
-from adaptune.archive import Archive
+from adaptune.archive import Archive, Summary
 from adaptune.cores import available
 from adaptune.descriptor import averaged
 from adaptune.files import write_text
-from adaptune.metrics import cap
 from adaptune.model import ErrorModel
-from adaptune.model.base import mean_errors
 from adaptune.space import ParameterSet
-from adaptune.study import Study
+from adaptune.study import TIMED, OfflineConfig, Study
+from offline.objective import (
+    Verdict,
+    choose_fixed,
+    judge,
+    label,
+    pareto_front,
+    told,
+)
 from offline.samplers import propose
 from offline.storage import Told, open_mirror
 from offline.workers import Task, Workers, run
@@ -34,19 +39,18 @@ class Training(NamedTuple):
     ----------
     model : ErrorModel
     means : dict
-        For every training sequence the mean capped error of each set in percent, of shape
-        (n_sets,).
-    whole : dict
-        For every training sequence the mean RTE in percent of the whole run, without new starts at
-        the reference, of the baseline and of the fixed set.
-    lost : dict
-        For every training sequence how often the baseline and the fixed set lost track.
+        For every training sequence the mean capped error of each trial in percent, of shape
+        (n_trials,).
+    fixed : int
+        Number of the trial of the fixed set.
+    rows : list of dict
+        For every training sequence what the baseline, the fixed set and its own best set do there.
     """
 
     model: ErrorModel
     means: dict[str, list[float]]
-    whole: dict[str, tuple[float, float]]
-    lost: dict[str, tuple[int, int]]
+    fixed: int
+    rows: list[dict[str, Any]]
 
 
 def train(study: Study, progress: Progress = lambda *_: None) -> Training:
@@ -56,63 +60,126 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
     ----------
     study
         The study; its folder holds the archive and receives the error model (``model.npz``), the
-        fixed set (``fixed.yaml``) and a table of all trials (``trials.csv``, ``trials.json``).
+        fixed set (``fixed.yaml``), a table of all trials (``trials.csv``, ``trials.json``), one of
+        the training sequences (``training.csv``, ``training.json``), and where there are several
+        objectives their Pareto front (``pareto.csv``, ``pareto.json``, ``pareto.png``).
     progress
         Told about every finished trial.
 
     Raises
     ------
     AdaptuneError
-        If a sequence cannot be used.
+        If a sequence cannot be used, or no set keeps the limits.
     """
     study.open()
+    config = study.config.offline
+    if timed := sorted(config.metrics & set(TIMED)):
+        _log.warning(
+            "%s differ from run to run: the same study run again will not find the same sets",
+            " and ".join(timed),
+        )
     archive = Archive(study.folder / "trials")
     archive.tidy()
-    n_workers = study.config.offline.workers or available()
-    with Workers(study, n_workers) as workers:
-        sets = _run_batches(study, archive, workers, progress)
-        model = fit(study, archive, sets)
-        whole = _run_whole(archive, workers, model, progress)
+    with Workers(study, config.workers or available()) as workers:
+        verdicts = _run_batches(study, archive, workers, progress)
+        fixed = choose_fixed(config, verdicts)
+        whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
+    model = fit(study, archive, verdicts, fixed)
     model.save(study.folder / "model.npz")
-    means = {
-        name: cap(model.errors[model.sequence == s]).mean(axis=0)
-        for s, name in enumerate(model.sequences)
+    finished = {
+        name: [archive.finished(name)[n] for n in range(len(verdicts))]
+        for name in study.config.training
     }
-    write_text(study.folder / "fixed.yaml", yaml.dump(model.sets[model.fixed]))
-    report.write_rows(study.folder, "trials", _rows(model, means))
-    lost = {
-        name: (finished[0].lost, finished[model.fixed].lost)
-        for name in model.sequences
-        if (finished := archive.finished(name))
-    }
-    return Training(model, {name: m.tolist() for name, m in means.items()}, whole, lost)
+    means = {name: [trial.mean_error for trial in trials] for name, trials in finished.items()}
+    write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
+    table = _trial_rows(config, verdicts, finished)
+    report.write_rows(study.folder, "trials", table)
+    if len(config.objective) > 1:
+        _write_pareto(study, verdicts, table)
+    rows = _training_rows(config, verdicts, finished, fixed, whole)
+    report.write_rows(study.folder, "training", rows)
+    return Training(model, means, fixed, rows)
 
 
-def _rows(model: ErrorModel, means: dict[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
-    """A row for every trial: its number, its parameters, and its mean errors in percent."""
-    all_means = np.mean(list(means.values()), axis=0)
-    return [
-        {"trial": n, **parameters, "mean": float(all_means[n])}
-        | {name: float(of_sequence[n]) for name, of_sequence in means.items()}
-        for n, parameters in enumerate(model.sets)
-    ]
+def _trial_rows(
+    config: OfflineConfig, verdicts: Sequence[Verdict], finished: Mapping[str, Sequence[Summary]]
+) -> list[dict[str, Any]]:
+    """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
+    rows = []
+    for n, verdict in enumerate(verdicts):
+        runs = [trials[n] for trials in finished.values()]
+        rows.append({"trial": n, **verdict.parameters})
+        if config.metrics != {"rte"}:
+            judged = zip(config.objective, verdict.values, strict=True)
+            rows[-1] |= {label(weights): value for weights, value in judged}
+            for metric in sorted(config.metrics):
+                rows[-1][metric] = float(np.mean([run.metrics[metric] for run in runs]))
+        if config.limits:
+            rows[-1]["excess"] = verdict.excess
+        rows[-1]["mean"] = float(np.mean([run.mean_error for run in runs]))
+        rows[-1] |= {name: trials[n].mean_error for name, trials in finished.items()}
+    return rows
+
+
+def _training_rows(
+    config: OfflineConfig,
+    verdicts: Sequence[Verdict],
+    finished: Mapping[str, Sequence[Summary]],
+    fixed: int,
+    whole: Mapping[str, tuple[float, float]],
+) -> list[dict[str, Any]]:
+    """A row for every training sequence; its own best set is found as the fixed one is."""
+    rows = []
+    for name, runs in finished.items():
+        best = choose_fixed(config, [judge(config, r.parameters, [r.metrics]) for r in runs])
+        rows.append(
+            {
+                "sequence": name,
+                "baseline": runs[0].mean_error,
+                "fixed": runs[fixed].mean_error,
+                "own best": runs[best].mean_error,
+                "lost, baseline": runs[0].lost,
+                "lost, fixed": runs[fixed].lost,
+                "baseline, whole run": whole[name][0],
+                "fixed, whole run": whole[name][1],
+                "_own best trial": best,
+            }
+            | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
+        )
+    return rows
+
+
+def _write_pareto(
+    study: Study, verdicts: Sequence[Verdict], trials: Sequence[Mapping[str, Any]]
+) -> None:
+    """The sets that none that keeps the limits is better than in every objective."""
+    feasible = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
+    values = np.array([verdicts[n].values for n in feasible])
+    front = [feasible[i] for i in pareto_front(values)]
+    report.write_rows(study.folder, "pareto", [trials[n] for n in front])
+    names = [label(weights) for weights in study.config.offline.objective]
+    report.draw_front(
+        study.folder / "pareto.png", names, values, np.array([verdicts[n].values for n in front])
+    )
 
 
 def _run_batches(
     study: Study, archive: Archive, workers: Workers, progress: Progress
-) -> list[ParameterSet]:
+) -> list[Verdict]:
     config = study.config.offline
     names, described = study.config.training, study.config.descriptor.names
     finished = {name: archive.finished(name) for name in names}
     mirror = open_mirror(study, {n: s.parameters for n, s in finished[names[0]].items()})
-    history: list[tuple[ParameterSet, float]] = []
+    verdicts: list[Verdict] = []
 
-    def told(number: int) -> Told:
+    def of(number: int) -> Told:
         trials = {name: finished[name][number] for name in names}
         attributes = {name: trial.mean_error for name, trial in trials.items()}
         attributes["lost"] = sum(trial.lost for trial in trials.values())
         attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
-        return Told(*history[number], attributes)
+        if config.limits:
+            attributes["excess"] = verdicts[number].excess
+        return Told(verdicts[number].parameters, verdicts[number].values, attributes)
 
     total = config.trials * len(names)
     done = 0
@@ -126,25 +193,27 @@ def _run_batches(
         progress("trials", done, total)
         unframed = [name for name in names if not archive.has_frames(name, described)]
         if n_missing or unframed:
-            sets = propose(study.space, config, batch, history)
+            sets = propose(study.space, config, batch, told(verdicts))
             tasks = _tasks(missing, unframed, sets, first, workers.n)
             for task in _run(archive, workers, tasks):
                 done += len(task.numbers)
                 progress("trials", done, total)
         for n in numbers:
             trials = [finished[name][n] for name in names]
-            error = float(np.mean([trial.mean_error for trial in trials]))
-            history.append((trials[0].parameters, error))
-        mirror.tell(len(history), told)
-        best = min(range(len(history)), key=lambda i: history[i][1])
+            runs = [trial.metrics for trial in trials]
+            verdicts.append(judge(config, trials[0].parameters, runs))
+        mirror.tell(len(verdicts), of)
+        best = min(range(len(verdicts)), key=lambda n: (verdicts[n].excess, verdicts[n].values[0]))
         _log.info(
-            "trials %d to %d done; best so far: trial %d with %.3f %%",
+            "trials %d to %d done; best so far: trial %d with %s %.3f%s",
             numbers[0],
             numbers[-1],
             best,
-            history[best][1],
+            label(config.objective[0]),
+            verdicts[best].values[0],
+            "" if verdicts[best].feasible else " (none keeps the limits)",
         )
-    return [parameters for parameters, _ in history]
+    return verdicts
 
 
 def _tasks(
@@ -174,42 +243,50 @@ def _run(archive: Archive, workers: Workers, tasks: list[Task]) -> Iterator[Task
 
 
 def _run_whole(
-    archive: Archive, workers: Workers, model: ErrorModel, progress: Progress
+    study: Study,
+    archive: Archive,
+    workers: Workers,
+    verdicts: Sequence[Verdict],
+    fixed: int,
+    progress: Progress,
 ) -> dict[str, tuple[float, float]]:
     """Mean RTE of baseline and fixed set on the training sequences, in one go from end to end."""
-    numbers = (0, model.fixed)
+    names = study.config.training
     tasks = [
-        Task(name, (n,), (model.sets[n],), whole=True)
-        for name in model.sequences
-        for n in sorted(set(numbers))
+        Task(name, (n,), (verdicts[n].parameters,), whole=True)
+        for name in names
+        for n in sorted({0, fixed})
         if not archive.trial_path(name, n, whole=True).exists()
     ]
     for done, _ in enumerate(_run(archive, workers, tasks), start=1):
         progress("whole runs", done, len(tasks))
     means = {
         (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))
-        for name in model.sequences
-        for n in numbers
+        for name in names
+        for n in (0, fixed)
     }
-    return {name: (means[name, 0], means[name, model.fixed]) for name in model.sequences}
+    return {name: (means[name, 0], means[name, fixed]) for name in names}
 
 
-def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
-    """Make the error model of all trials.
+def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int) -> ErrorModel:
+    """Make the error model of all trials that keep the limits.
 
     Parameters
     ----------
     study
         The study.
     archive
-        Its trials, numbered as `sets`.
-    sets
-        The parameter sets.
+        Its trials.
+    verdicts
+        How they did, in their order.
+    fixed
+        Number of the fixed set's.
     """
+    numbers = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
     descriptors, sequence, errors = [], [], []
     window = study.window
     for s, name in enumerate(study.config.training):
-        of_sequence = archive.read_errors(name, range(len(sets)))
+        of_sequence = archive.read_errors(name, numbers)
         # Whether there is a sub-trajectory depends on the reference alone.
         labelled = ~np.isnan(of_sequence).all(axis=1)
         frames = archive.read_frames(name)
@@ -218,22 +295,23 @@ def fit(study: Study, archive: Archive, sets: list[ParameterSet]) -> ErrorModel:
         descriptors.append(described[labelled])
         sequence.append(np.full(labelled.sum(), s))
         errors.append(of_sequence[labelled])
-    all_errors, all_sequences = np.concatenate(errors), np.concatenate(sequence)
     return ErrorModel(
         odometry={
             "name": study.config.odometry.name,
             "settings": study.settings.model_dump(mode="json"),
         },
         space=study.space,
-        sets=sets,
-        fixed=int(np.argmin(mean_errors(all_errors, all_sequences))),
+        sets=[verdicts[n].parameters for n in numbers],
+        fixed=numbers.index(fixed),
         length=study.config.sub_trajectory,
         sequences=list(study.config.training),
         blocks=frames.blocks,
         window=window,
         descriptors=np.concatenate(descriptors),
-        sequence=all_sequences,
-        errors=all_errors,
-        provenance={"adaptune": __version__}
-        | study.config.offline.model_dump(mode="json", exclude={"workers", "memory", "storage"}),
+        sequence=np.concatenate(sequence),
+        errors=np.concatenate(errors),
+        provenance={"adaptune": __version__, "trials": numbers}
+        | study.config.offline.model_dump(
+            mode="json", exclude={"trials", "workers", "memory", "storage"}
+        ),
     )

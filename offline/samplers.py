@@ -9,6 +9,7 @@ from scipy.stats import qmc
 
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 from adaptune.study import OfflineConfig
+from offline.objective import Value
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -17,7 +18,7 @@ def propose(
     space: ParameterSpace,
     config: OfflineConfig,
     batch: int,
-    history: Sequence[tuple[ParameterSet, float]],
+    history: Sequence[tuple[ParameterSet, Value]],
 ) -> list[ParameterSet]:
     """Propose the parameter sets of one batch of trials.
 
@@ -33,7 +34,8 @@ def propose(
     batch
         Number of the batch, from 0; trial 0 is the baseline.
     history
-        Parameters and mean error in percent of all trials of the batches before, in their order.
+        Parameters and value, or values where there are several objectives, of all trials of the
+        batches before, in their order.
 
     Returns
     -------
@@ -70,7 +72,7 @@ def _tpe(
     space: ParameterSpace,
     config: OfflineConfig,
     batch: int,
-    history: Sequence[tuple[ParameterSet, float]],
+    history: Sequence[tuple[ParameterSet, Value]],
     pending: Sequence[ParameterSet],
 ) -> list[ParameterSet]:
     """The rest of a batch that begins with `pending`, by a tree-structured Parzen estimator.
@@ -81,10 +83,15 @@ def _tpe(
     distributions = {name: _distribution(p) for name, p in space.parameters.items()}
     seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
     # The initial points are the start-up: Optuna needs no random ones of its own.
-    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=1))
+    study = optuna.create_study(
+        sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=1),
+        directions=["minimize"] * len(config.objective),
+    )
     study.add_trials(
-        optuna.trial.create_trial(params=params, distributions=distributions, value=value)
-        for params, value in history
+        optuna.trial.create_trial(
+            params=params, distributions=distributions, values=np.atleast_1d(values).tolist()
+        )
+        for params, values in history
     )
     for params in pending:
         study.enqueue_trial(params)

@@ -41,14 +41,14 @@ class Told(NamedTuple):
     Attributes
     ----------
     parameters : dict
-    value : float
-        What is minimised.
+    values : tuple of float
+        What is minimised, one for each objective.
     attributes : dict
         What else there is to know, as plain data.
     """
 
     parameters: ParameterSet
-    value: float
+    values: tuple[float, ...]
     attributes: Mapping[str, Any] = {}
 
 
@@ -76,6 +76,7 @@ class Mirror(ABC):
 
     def __init__(self, study: Study):
         self._name = study.name
+        self._directions = ["minimize"] * len(study.config.offline.objective)
         self._distributions = {n: _distribution(p) for n, p in study.space.parameters.items()}
 
     @abstractmethod
@@ -83,18 +84,23 @@ class Mirror(ABC):
         """Tell of the first `n` trials; those that it knows are not asked for again."""
 
     def _create(self, storage: Any) -> optuna.Study:
-        return optuna.create_study(storage=storage, study_name=self._name, load_if_exists=True)
+        return optuna.create_study(
+            storage=storage,
+            study_name=self._name,
+            load_if_exists=True,
+            directions=self._directions,
+        )
 
     def _add(self, mirror: optuna.Study, n: int, trial: Callable[[int], Told]) -> None:
         for number in range(len(mirror.get_trials(deepcopy=False)), n):
-            parameters, value, attributes = trial(number)
-            finite = np.isfinite(value)
+            parameters, values, attributes = trial(number)
+            finite = np.isfinite(values).all()
             mirror.add_trial(
                 optuna.trial.create_trial(
                     state=optuna.trial.TrialState.COMPLETE if finite else _FAIL,
                     params=parameters,
                     distributions=self._distributions,
-                    value=value if finite else None,
+                    values=values if finite else None,
                     user_attrs={_NUMBER: number} | dict(attributes),
                 )
             )

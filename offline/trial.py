@@ -10,11 +10,12 @@ from adaptune.archive import Frames, Trial
 from adaptune.descriptor import Describer
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
-from adaptune.metrics import sub_trajectory_rte, window_ends
+from adaptune.metrics import KITTI_LENGTHS, sub_trajectory_rte, window_ends
 from adaptune.odometry import Box, Isolated
 from adaptune.odometry.base import prepared_bytes
 from adaptune.space import ParameterSet
 from adaptune.study import Study
+from offline.objective import trajectory_metrics
 
 MIN_POINTS = 20
 """No odometry makes anything of a scan with fewer."""
@@ -46,7 +47,7 @@ class PreparedSequence:
 
     def __init__(self, study: Study, name: str, memory: float):
         self._sequence = study.sequence(name)
-        self._box = study.odometry()
+        self._box = _odometry(study)
         self._kept: list[Any] = []
         self.nbytes = 0
         describe = Describer(study.config.descriptor.names)
@@ -113,6 +114,20 @@ def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
             f"sequences.{name}: its path of {path:.1f} m holds no sub-trajectory of "
             f"{study.config.sub_trajectory:g} m; make sub_trajectory shorter or the sequence longer"
         )
+    shortest = min(KITTI_LENGTHS)
+    judged = "kitti" in study.config.offline.metrics
+    if judged and not (window_ends(T_ref_sensor, shortest) >= 0).any():
+        raise AdaptuneError(
+            f"sequences.{name}: its path holds no sub-trajectory of {shortest:g} m, the least of "
+            f"KITTI's error; judge by another metric (offline.objective, offline.limits)"
+        )
+
+
+def _odometry(study: Study, parameters: ParameterSet | None = None) -> Box:
+    """An odometry, in a process of its own where its memory is to be told apart."""
+    if "memory" in study.config.offline.metrics:
+        return study.odometry(parameters, isolated=True)
+    return study.odometry(parameters)
 
 
 class _Run:
@@ -125,9 +140,16 @@ class _Run:
         self.restarted = np.zeros(n, bool)
         self.registered = np.ones(n, bool)
         self.seconds = np.zeros(n)
+        self.lost_steps: dict[int, Poses] = {}
+        self._cpu = 0.0
         self._T_ref_sensor = frames.T_ref_sensor
         self._T_ref_steps = steps(frames.T_ref_sensor)
         self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
+
+    @property
+    def cpu(self) -> float:
+        """Seconds that the odometry has computed."""
+        return self.odometry.cpu if isinstance(self.odometry, Isolated) else self._cpu
 
     def step(self, i: int, prepared: Any) -> None:
         if i == 0:
@@ -136,27 +158,31 @@ class _Run:
             self.odometry.start(prepared, T)
             self.T_odom_sensor[0] = T
             return
-        begin = time.perf_counter()
+        begin, begin_cpu = time.perf_counter(), time.process_time()
         T, self.registered[i] = self.odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
-        if self._lost(i, T):
+        self._cpu += time.process_time() - begin_cpu
+        finite = np.isfinite(T).all()
+        # An odometry without a pose has, as far as one can tell, not moved.
+        T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
+        if self._lost(i, T_step if finite else None):
+            self.lost_steps[i] = T_step
             T = self._T_ref_sensor[i]
             self.odometry.start(prepared, T, self._T_ref_steps[i - 1])
             self.restarted[i] = True
-        elif not np.isfinite(T).all():
+        elif not finite:
             # There is no reference to go on at.
             T = self.T_odom_sensor[i - 1]
             self.odometry.start(prepared, T)
         self.T_odom_sensor[i] = T
 
-    def _lost(self, i: int, T_odom_sensor: Poses) -> bool:
+    def _lost(self, i: int, T_step: Poses | None) -> bool:
         T_ref_step = self._T_ref_steps[i - 1]
         if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
             return False
-        if not np.isfinite(T_odom_sensor).all():
+        if T_step is None:
             return True
-        T_previous_current = invert(self.T_odom_sensor[i - 1]) @ T_odom_sensor
-        departure = T_previous_current[:3, 3] - T_ref_step[:3, 3]
+        departure = T_step[:3, 3] - T_ref_step[:3, 3]
         return bool(np.linalg.norm(departure) > self._bounds[i - 1])
 
 
@@ -182,21 +208,30 @@ def run_trials(
     """
     frames = sequence.frames
     lost_track = None if whole else study.config.lost_track
-    runs = [_Run(study.odometry(s), frames, lost_track) for s in sets]
+    runs = [_Run(_odometry(study, s), frames, lost_track) for s in sets]
     for i, prepared in enumerate(sequence):
         for run in runs:
             run.step(i, prepared)
-    return [
-        Trial(
-            parameters,
-            run.T_odom_sensor,
-            sub_trajectory_rte(
-                frames.T_ref_sensor, run.T_odom_sensor, study.config.sub_trajectory, run.restarted
-            ),
-            run.restarted,
-            run.registered,
-            run.seconds,
-            tuple(run.odometry.faults) if isinstance(run.odometry, Isolated) else (),
-        )
-        for parameters, run in zip(sets, runs, strict=True)
-    ]
+    return [_trial(study, s, frames, run) for s, run in zip(sets, runs, strict=True)]
+
+
+def _trial(study: Study, parameters: ParameterSet, frames: Frames, run: _Run) -> Trial:
+    errors = sub_trajectory_rte(
+        frames.T_ref_sensor, run.T_odom_sensor, study.config.sub_trajectory, run.restarted
+    )
+    duration = (frames.stamps[-1] - frames.stamps[0]) * 1e-9
+    isolated = run.odometry if isinstance(run.odometry, Isolated) else None
+    usage = {"cpu": 100.0 * run.cpu / duration}
+    if isolated is not None:
+        usage["memory"] = isolated.memory
+    return Trial(
+        parameters,
+        run.T_odom_sensor,
+        errors,
+        run.restarted,
+        run.registered,
+        run.seconds,
+        () if isolated is None else tuple(isolated.faults),
+        trajectory_metrics(frames, run.T_odom_sensor, run.lost_steps),
+        usage,
+    )

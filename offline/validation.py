@@ -46,6 +46,10 @@ class LabelledSequence:
         Percent, infinite where the track was lost.
     blocks : tuple of int, optional
         Lengths of the descriptors; one when left out.
+    baseline : ndarray of shape (n,), optional
+        Errors of the baseline, which may break limits; those of the first set when left out.
+    values : ndarray of shape (n_sets,), optional
+        By what the fixed set is chosen; the mean capped error when left out.
     """
 
     name: str
@@ -53,6 +57,8 @@ class LabelledSequence:
     descriptors: NDArray[np.float32]
     errors: NDArray[np.float32]
     blocks: tuple[int, ...] | None = None
+    baseline: NDArray[np.float64] | None = None
+    values: NDArray[np.float64] | None = None
 
 
 class LeftOut(NamedTuple):
@@ -159,10 +165,12 @@ def validate(
     """
     model = ErrorModel.load(study.folder / "model.npz")
     archive = Archive(study.folder / "trials")
+    numbers = model.provenance["trials"]
+    weights = study.config.offline.objective[0]
     sequences = []
     for name in model.sequences:
         frames = archive.read_frames(name)
-        errors = archive.read_errors(name, range(len(model.sets)))
+        errors = archive.read_errors(name, numbers)
         labelled = ~np.isnan(errors).all(axis=1)
         described = averaged(
             frames.descriptors, frames.stamps, model.window, study.config.online.period
@@ -170,8 +178,17 @@ def validate(
         blocks = tuple(frames.blocks.values())
         since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
         period = (since // study.config.online.period).astype(np.int64)
+        metrics = [archive.finished(name)[n].metrics for n in numbers]
         sequences.append(
-            LabelledSequence(name, period, described[labelled], errors[labelled], blocks)
+            LabelledSequence(
+                name,
+                period,
+                described[labelled],
+                errors[labelled],
+                blocks,
+                archive.read(name, 0).errors[labelled],
+                np.array([sum(w * of_set[m] for m, w in weights.items()) for of_set in metrics]),
+            )
         )
     validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
     rows: list[dict[str, Any]] = []
@@ -232,7 +249,11 @@ def training_data(
     errors = np.concatenate([s.errors for s in sequences])
     number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
     pca = ScaledPCA(blocks=sequences[0].blocks).fit(descriptors)
-    fixed = int(np.argmin(mean_errors(errors, number)))
+    values = [
+        mean_errors(s.errors, np.zeros(len(s.errors), np.intp)) if s.values is None else s.values
+        for s in sequences
+    ]
+    fixed = int(np.argmin(np.mean(values, axis=0)))
     return TrainingData(pca.transform(descriptors), number, errors, sets, fixed), pca
 
 
@@ -247,7 +268,8 @@ def _leave_out(
     capped = cap(sequence.errors)
     _, first, period = np.unique(sequence.period, return_index=True, return_inverse=True)
     frames = np.arange(len(capped))
-    errors = {"baseline": capped[:, 0], "fixed": capped[:, data.fixed]}
+    baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
+    errors = {"baseline": baseline, "fixed": capped[:, data.fixed]}
     adapted = {}
     for name, make in rules.items():
         rule = make().fit(data)

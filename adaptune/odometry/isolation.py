@@ -68,12 +68,18 @@ class Isolated:
     ----------
     faults : list of str
         What went wrong, each with the last lines that the odometry wrote.
+    cpu : float
+        Seconds that its processes have computed.
+    memory : float
+        Megabytes that they took at most, what they began with included.
     """
 
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
         self.name = name
         self.parameters = box_class(name).space.baseline | parameters
         self.faults: list[str] = []
+        self.cpu = self.memory = 0.0
+        self._cpu_before = 0.0
         self._settings = settings
         self._limits = limits
         self._stream: BinaryIO | None = None
@@ -130,6 +136,8 @@ class Isolated:
         if nonsense := _nonsense(T_odom_sensor):
             self._fault(nonsense)
             return Registration(np.full((4, 4), np.nan), registered=False)
+        self.cpu = self._cpu_before + answer.header.get("cpu", 0.0)
+        self.memory = max(self.memory, answer.header.get("memory", 0.0))
         return Registration(T_odom_sensor.copy(), answer.header["registered"])
 
     def configure(self, parameters: ParameterSet) -> None:
@@ -143,6 +151,7 @@ class Isolated:
             with contextlib.suppress(OSError):
                 self._stream.close()
             self._stream = None
+            self._cpu_before = self.cpu
 
     def __del__(self) -> None:
         self.close()

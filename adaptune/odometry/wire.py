@@ -13,19 +13,22 @@ type           holds                                                    answer
 =============  =======================================================  =========================
 ``hello``      version, odometry, parameters, settings                  ``done``: version, live
 ``start``      stamp, points, times?, rings?, imu..?, pose, motion?     ``done``
-``register``   stamp, points, times?, rings?, imu..?                    ``pose``: registered, pose
+``register``   stamp, points, times?, rings?, imu..?                    ``pose``: registered, pose,
+                                                                        cpu?, memory?
 ``configure``  parameters                                               ``done``
 =============  =======================================================  =========================
 
 or with ``refused`` and a ``message``, where it cannot do what is asked. Points are float32 of
 shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16, poses and motions
-float64 of shape (4, 4), stamps integer nanoseconds. What an IMU measured since the scan before are
-four arrays: imu_stamps, int64; imu, float64 of shape (n, 6), rad/s and m/s^2; imu_pose, its pose in
-the LiDAR's frame; imu_noise, float64 of shape (4,), see `adaptune.sequence.imu.ImuNoise`. The other
-side ends by closing the stream.
+float64 of shape (4, 4), stamps integer nanoseconds, cpu the seconds that the odometry's process has
+computed, memory its peak in megabytes. What an IMU measured since the scan before are four arrays:
+imu_stamps, int64; imu, float64 of shape (n, 6), rad/s and m/s^2; imu_pose, its pose in the LiDAR's
+frame; imu_noise, float64 of shape (4,), see `adaptune.sequence.imu.ImuNoise`. The other side ends
+by closing the stream.
 """
 
 import json
+import resource
 import struct
 from collections.abc import Mapping
 from typing import Any, BinaryIO, NamedTuple, Protocol
@@ -202,12 +205,18 @@ def _make(hello: Mapping[str, Any]) -> Odometry:
     return cls(hello["parameters"], settings)
 
 
+def _usage() -> dict[str, float]:
+    """CPU seconds and peak resident megabytes of this process."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
+
+
 def _answer(box: Odometry, message: Message, writer: BinaryIO) -> None:
     header, arrays = message
     if header["type"] == "register":
         T_odom_sensor, registered = box.register(box.prepare(to_scan(message)))
         pose: Poses = np.asarray(T_odom_sensor, np.float64)
-        send(writer, {"type": "pose", "registered": bool(registered)}, pose=pose)
+        send(writer, {"type": "pose", "registered": bool(registered), **_usage()}, pose=pose)
         return
     if header["type"] == "start":
         # Arrays from the stream are read-only; poses are an odometry's own to keep.

@@ -23,6 +23,8 @@ def random_trial(seed=0, parameters=PARAMETERS):
         rng.random(N) < 0.1,
         rng.random(N) < 0.9,
         rng.random(N).astype(np.float32).astype(float),
+        metrics={"rte": rng.random()},
+        usage={"cpu": rng.random()},
     )
 
 

@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 from adaptune.metrics import (
     FAILURE,
     KITTI_LENGTHS,
+    absolute_error,
     cap,
     kitti_error,
+    relative_error,
     sub_trajectory_rte,
     travelled,
     window_ends,
@@ -251,6 +253,37 @@ def test_rte_of_a_recorded_pair(recorded):
         kitti_error(T_ref, T_est, (100.0,)).translation
     )
     assert np.isnan(errors).sum() == (window_ends(T_ref, 100.0) < 0).sum() > 0
+
+
+def test_errors_of_a_recorded_pair_are_those_of_evo(recorded):
+    folder = recorded / "kitti_00"
+    T_ref = read_kitti(folder / "ground_truth_kitti.txt")
+    T_est = read_kitti(folder / "kiss_icp_kitti.txt")
+    assert absolute_error(T_ref, T_est) == pytest.approx(3.500719, abs=1e-6)
+    assert relative_error(T_ref, T_est) == pytest.approx(0.034188, abs=1e-6)
+
+
+@modest
+@given(seeds)
+def test_alignment_takes_out_where_the_estimate_began(seed):
+    rng = np.random.default_rng(seed)
+    T_ref = walk(rng, 30)
+    T_est = drift(rng, T_ref)
+    moved = walk(rng, 2)[1] @ T_est
+    assert absolute_error(T_ref, T_ref[3] @ T_ref) == pytest.approx(0.0, abs=1e-9)
+    assert absolute_error(T_ref, moved) == pytest.approx(absolute_error(T_ref, T_est))
+    plain = np.linalg.norm(T_ref[:, :3, 3] - T_est[:, :3, 3], axis=1)
+    assert absolute_error(T_ref, T_est) <= np.sqrt((plain**2).mean()) + 1e-12
+
+
+def test_errors_worked_by_hand():
+    T_ref, T_est = line(0.0, 1.0, 2.0, 3.0), line(0.0, 1.1, 2.1, 3.3)
+    assert relative_error(T_ref, T_est) == pytest.approx(np.sqrt((0.01 + 0.0 + 0.04) / 3))
+    # Aligned on a line, what is left are the departures 0, 0.1, 0.1, 0.3 from their mean.
+    assert absolute_error(T_ref, T_est) == pytest.approx(np.std([0.0, 0.1, 0.1, 0.3]))
+    T_ref[2] = np.nan
+    assert relative_error(T_ref, T_est) == pytest.approx(0.1)
+    assert absolute_error(T_ref, T_est) == pytest.approx(np.std([0.0, 0.1, 0.3]))
 
 
 def test_cap():

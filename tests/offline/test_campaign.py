@@ -24,7 +24,7 @@ def files(folder):
     for path in sorted((folder / "trials").rglob("*.npz")):
         with np.load(path) as data:
             contents[path.relative_to(folder)] = {
-                key: data[key].tobytes() for key in data if key != "seconds"
+                key: data[key].tobytes() for key in data if key not in ("seconds", "usage")
             }
     contents[Path("model.npz")] = (folder / "model.npz").read_bytes()
     return contents

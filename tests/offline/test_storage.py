@@ -46,7 +46,7 @@ def told(number):
         "max_correspondence_distance": rng.uniform(0.1, 5.0),
         "keyframe_interval": rng.uniform(0.5, 15.0),
     }
-    return Told(parameters, rng.gamma(1.0), {"one": rng.random(), "lost": number})
+    return Told(parameters, (rng.gamma(1.0),), {"one": rng.random(), "lost": number})
 
 
 def in_journal(study):

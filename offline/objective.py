@@ -1,0 +1,201 @@
+"""What a trial is judged by: metrics, weighted sums of them, and limits.
+
+Metrics of one parameter set on one sequence:
+
+===============  ==================================================================================
+``rte``          mean capped error of the sub-trajectories, percent
+``kitti``        translation error of KITTI's benchmark, percent
+``rpe``          relative pose error from scan to scan as evo gives it, metres
+``ape``          absolute pose error after alignment as evo gives it, metres
+``ms_per_scan``  milliseconds that the odometry takes for a scan, without preparing it
+``cpu``          CPU time over the recording's duration, percent of a core
+``memory``       megabytes that the odometry's process takes at most
+===============  ==================================================================================
+
+The first four repeat on the same machine, the last three do not.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.archive import Frames
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses, invert
+from adaptune.metrics import absolute_error, kitti_error, relative_error
+from adaptune.space import ParameterSet
+from adaptune.study import Metric, OfflineConfig
+
+BOUND = 1e6
+"""No metric counts for more, nor one that cannot be told, so that sums stay finite."""
+SEVERITY = 10.0
+"""How many times the baseline's value is added to that of a set that breaks a limit."""
+
+Metrics = Mapping[str, float]
+Value = float | tuple[float, ...]
+"""What samplers minimise: a tuple where there are several objectives."""
+
+
+class Verdict(NamedTuple):
+    """How a parameter set did on the sequences on which it was run.
+
+    Attributes
+    ----------
+    parameters : dict
+    values : tuple of float
+        Of every objective, the mean over the sequences.
+    excess : float
+        By how much limits are exceeded, each in parts of the limit; 0 if it keeps them all.
+    """
+
+    parameters: ParameterSet
+    values: tuple[float, ...]
+    excess: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it keeps all limits."""
+        return self.excess == 0.0
+
+
+def trajectory_metrics(
+    frames: Frames, T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]
+) -> dict[str, float]:
+    """Those metrics that are of the trajectory as a whole.
+
+    Parameters
+    ----------
+    frames
+        Of the sequence.
+    T_odom_sensor
+        The odometry's poses, of shape (n, 4, 4).
+    lost_steps
+        See `joined`.
+    """
+    T_ref_sensor, T = frames.T_ref_sensor, joined(T_odom_sensor, lost_steps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = {
+            "kitti": kitti_error(T_ref_sensor, T).translation,
+            "rpe": relative_error(T_ref_sensor, T),
+            "ape": absolute_error(T_ref_sensor, T) if np.abs(T).max() < 1e100 else np.inf,
+        }
+    return {name: float(np.fmin(value, BOUND)) for name, value in found.items()}
+
+
+def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
+    """Undo new starts at the reference, each of which would hide the error that led to it.
+
+    Parameters
+    ----------
+    T_odom_sensor
+        Poses of shape (n, 4, 4).
+    lost_steps
+        For every frame with a new start, the motion since the frame before as the odometry gave
+        it, of shape (4, 4).
+
+    Returns
+    -------
+    ndarray of shape (n, 4, 4)
+        The trajectory as it would have gone on from the wrong pose.
+    """
+    T = T_odom_sensor.copy()
+    for start, end in pairwise([*sorted(lost_steps), len(T)]):
+        T_joined_odom = T[start - 1] @ lost_steps[start] @ invert(T_odom_sensor[start])
+        T[start:end] = T_joined_odom @ T_odom_sensor[start:end]
+    return T
+
+
+def judge(config: OfflineConfig, parameters: ParameterSet, runs: Sequence[Metrics]) -> Verdict:
+    """Judge a parameter set by its metrics on some sequences.
+
+    Parameters
+    ----------
+    config
+        Its objective and limits. A limit holds on every sequence.
+    parameters
+        The set.
+    runs
+        Its metrics, a mapping for each sequence.
+    """
+    values = tuple(
+        float(np.mean([sum(w * run[m] for m, w in weights.items()) for run in runs]))
+        for weights in config.objective
+    )
+    worst = {name: max(run[name] for run in runs) for name in config.limits}
+    excess = sum(max(0.0, worst[m] / limit.max - 1.0) for m, limit in config.limits.items())
+    return Verdict(parameters, values, excess)
+
+
+def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, Value]]:
+    """What samplers are told: values, a tuple of them where there are several objectives.
+
+    Sets that break limits are told to be worse by ten times the baseline's value, and the more so
+    the more they exceed: what is proposed next keeps away from them.
+
+    Parameters
+    ----------
+    verdicts
+        Of all trials, the baseline's first.
+    """
+    history: list[tuple[ParameterSet, Value]] = []
+    for verdict in verdicts:
+        values = verdict.values
+        if not verdict.feasible:
+            values = tuple(
+                value + SEVERITY * (baseline or 1.0) * (1.0 + verdict.excess)
+                for value, baseline in zip(values, verdicts[0].values, strict=True)
+            )
+        history.append((verdict.parameters, values if len(values) > 1 else values[0]))
+    return history
+
+
+def choose_fixed(config: OfflineConfig, verdicts: Sequence[Verdict]) -> int:
+    """Number of the set that does best by the first objective among those that keep all limits.
+
+    Of equal ones, the first.
+
+    Raises
+    ------
+    AdaptuneError
+        If there is none.
+    """
+    feasible = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
+    if not feasible:
+        nearest = min(range(len(verdicts)), key=lambda n: verdicts[n].excess)
+        limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
+        raise AdaptuneError(
+            f"offline.limits: none of {len(verdicts)} parameter sets keeps {limits} on every "
+            f"sequence; nearest comes trial {nearest}, {verdicts[nearest].excess:.0%} beyond: "
+            f"loosen the limits, widen the ranges of the parameters, or run more trials"
+        )
+    return min(feasible, key=lambda n: verdicts[n].values[0])
+
+
+def label(weights: Mapping[Metric, float]) -> str:
+    """A weighted sum in words."""
+    return " + ".join(name if w == 1.0 else f"{w:g} {name}" for name, w in weights.items())
+
+
+def pareto_front(values: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Rows that no other row is as good as in every column and better than in one.
+
+    Parameters
+    ----------
+    values
+        To be minimised, of shape (n, n_objectives).
+
+    Returns
+    -------
+    ndarray of shape (m,)
+        Their numbers, by rising value of the first column; of equal rows the first.
+    """
+    unique, first = np.unique(values, axis=0, return_index=True)
+    front = [
+        number
+        for row, number in zip(unique, first, strict=True)
+        if not ((unique <= row).all(axis=1) & (unique < row).any(axis=1)).any()
+    ]
+    return np.array(front, np.intp)

@@ -1,0 +1,210 @@
+"""What trials are judged by."""
+
+import csv
+
+import drives
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from adaptune.archive import Archive
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import steps
+from adaptune.odometry import Registration
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.study import ConfigurationError, OfflineConfig, Study, load_study
+from offline.campaign import train
+from offline.objective import (
+    SEVERITY,
+    Verdict,
+    choose_fixed,
+    joined,
+    judge,
+    label,
+    pareto_front,
+    told,
+)
+from offline.trial import PreparedSequence, run_trials
+
+
+def config(**given):
+    return OfflineConfig.model_validate(given)
+
+
+def test_every_way_to_write_an_objective():
+    assert config().objective == ({"rte": 1.0},)
+    assert config(objective="ape").objective == ({"ape": 1.0},)
+    assert config(objective={"rpe": 2.0, "ape": 0.5}).objective == ({"rpe": 2.0, "ape": 0.5},)
+    both = config(objective=["rte", {"ms_per_scan": 0.1}])
+    assert both.objective == ({"rte": 1.0}, {"ms_per_scan": 0.1})
+    assert both.metrics == {"rte", "ms_per_scan"}
+    assert config(limits={"cpu": {"max": 50}}).metrics == {"rte", "cpu"}
+    assert label({"rte": 1.0, "ms_per_scan": 0.1}) == "rte + 0.1 ms_per_scan"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("offline.objective=rtee", "offline.objective"),
+        ("offline.objective={rte: -1}", "offline.objective"),
+        ("offline.objective=[]", "offline.objective"),
+        ("offline.objective={}", "offline.objective"),
+        ("offline.limits={rte: {min: 1}}", "offline.limits.rte.min: unknown key"),
+        ("offline.limits={speed: {max: 1}}", "offline.limits.speed"),
+    ],
+)
+def test_wrong_objectives_are_refused(study_file, override, message):
+    with pytest.raises(ConfigurationError, match=message):
+        load_study(study_file, [override])
+
+
+def test_a_sum_is_a_mean_over_sequences_and_a_limit_holds_on_each():
+    of = config(objective={"rte": 1, "ms_per_scan": 0.1}, limits={"ms_per_scan": {"max": 20}})
+    runs = [{"rte": 1.0, "ms_per_scan": 10.0}, {"rte": 3.0, "ms_per_scan": 30.0}]
+    verdict = judge(of, {"a": 1}, runs)
+    assert verdict.values == pytest.approx((0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0),))
+    assert verdict.excess == pytest.approx(0.5)
+    assert judge(of, {"a": 1}, runs[:1]).feasible
+
+
+def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
+    verdicts = [Verdict({}, (2.0,), 0.0), Verdict({}, (1.0,), 0.1), Verdict({}, (2.0,), 0.0)]
+    assert choose_fixed(config(), verdicts) == 0
+    of = config(limits={"ms_per_scan": {"max": 20}})
+    with pytest.raises(AdaptuneError, match=r"none of 1 .* keeps ms_per_scan <= 20 .* 10% beyond"):
+        choose_fixed(of, verdicts[1:2])
+
+
+def test_samplers_are_told_a_penalty():
+    history = told([Verdict({"a": 0}, (2.0,), 0.0), Verdict({"a": 1}, (1.0,), 0.5)])
+    assert history == [({"a": 0}, 2.0), ({"a": 1}, 1.0 + SEVERITY * 2.0 * 1.5)]
+    several = told([Verdict({}, (0.0, 4.0), 0.0), Verdict({}, (1.0, 1.0), 1.0)])
+    assert [value for _, value in several] == [(0.0, 4.0), (21.0, 81.0)]
+
+
+@given(arrays(float, st.tuples(st.integers(1, 20), st.integers(1, 3)), elements=st.integers(0, 5)))
+def test_the_front_is_what_nothing_dominates(values):
+    front = pareto_front(values)
+
+    def dominates(a, b):
+        return (a <= b).all() and (a < b).any()
+
+    for i, row in enumerate(values):
+        dominated = any(dominates(other, row) for other in values)
+        twin = any((values[j] == row).all() for j in front)
+        assert dominated != twin
+        assert not (dominated and i in front)
+    assert (np.diff(values[front, 0]) >= 0).all()
+
+
+def test_new_starts_are_undone():
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, 0, 3] = [0, 1, 2, 10, 11, 12]
+    sideways = np.eye(4)
+    sideways[:3, 3] = [1, 5, 0]
+    whole = joined(T, {3: sideways})
+    np.testing.assert_allclose(whole[:, 0, 3], [0, 1, 2, 3, 4, 5])
+    np.testing.assert_allclose(whole[:, 1, 3], [0, 0, 0, 5, 5, 5])
+    twice = joined(T, {3: sideways, 5: sideways})
+    np.testing.assert_allclose(twice[:, 1, 3], [0, 0, 0, 5, 5, 10])
+    np.testing.assert_array_equal(joined(T, {}), T)
+
+
+@given(st.integers(0, 1000))
+def test_joining_keeps_every_step(seed):
+    rng = np.random.default_rng(seed)
+    T, lost = np.tile(np.eye(4), (20, 1, 1)), {}
+    T[:, :3, 3] = rng.normal(size=(20, 3)).cumsum(axis=0)
+    for i in rng.choice(np.arange(1, 20), 4, replace=False):
+        lost[int(i)] = np.eye(4)
+        lost[int(i)][:3, 3] = rng.normal(size=3)
+    expected = steps(T)
+    for i, step in lost.items():
+        expected[i - 1] = step
+    np.testing.assert_allclose(steps(joined(T, lost)), expected, atol=1e-9)
+
+
+class Sideways(KeyframeGicp):
+    """Loses 5 m to the side at scan 10."""
+
+    scan = 0
+
+    def register(self, prepared):
+        self.scan += 1
+        T, ok = super().register(prepared)
+        if self.scan == 10:
+            T = T.copy()
+            T[1, 3] += 5.0
+        return Registration(T, ok)
+
+
+def test_a_lost_track_is_in_the_metrics_of_the_trajectory(study_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(Study, "odometry", lambda self, p=None: Sideways(p, self.settings))
+    study = load_study(study_file, [], tmp_path / "study")
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(study, sequence, [study.space.baseline])
+    assert np.flatnonzero(trial.restarted).tolist() == [10]
+    assert trial.metrics["rpe"] == pytest.approx(5.0 / np.sqrt(39), rel=0.02)
+    assert trial.metrics["ape"] > 1.0
+
+
+def test_judged_by_time_within_limits(study_file, tmp_path):
+    overrides = [
+        "offline.objective=[rpe, {rte: 1.0, ape: 0.5}, ms_per_scan]",
+        "offline.limits={rte: {max: 0.775}}",
+    ]
+    study = load_study(study_file, overrides, tmp_path / "study")
+    training = train(study)
+    rows = list(csv.DictReader((study.folder / "trials.csv").open()))
+    front = list(csv.DictReader((study.folder / "pareto.csv").open()))
+    assert (study.folder / "pareto.png").stat().st_size > 1000
+    keep = [r for r in rows if max(float(r["one"]), float(r["two"])) <= 0.775]
+    assert 0 < len(keep) < len(rows)
+    assert all((float(r["excess"]) == 0.0) == (r in keep) for r in rows)
+    assert front
+    assert all(row in keep for row in front)
+    best = min(keep, key=lambda r: float(r["rpe"]))
+    assert int(best["trial"]) == training.fixed
+    assert training.model.provenance["trials"] == [int(r["trial"]) for r in keep]
+    assert (
+        training.model.sets[training.model.fixed]
+        == training.model.sets[training.model.provenance["trials"].index(training.fixed)]
+    )
+    summary = Archive(study.folder / "trials").finished("one")[training.fixed]
+    assert summary.metrics["ms_per_scan"] > 0
+    with pytest.raises(ConfigurationError, match=r"other values of offline\.objective"):
+        load_study(study_file, overrides[1:], tmp_path / "study").check()
+
+
+def test_limits_that_no_set_keeps(study_file, tmp_path):
+    study = load_study(
+        study_file, ["offline.limits={ms_per_scan: {max: 1e-6}}"], tmp_path / "study"
+    )
+    with pytest.raises(AdaptuneError, match="none of 10 parameter sets keeps ms_per_scan <= 1e-06"):
+        train(study)
+
+
+def test_kittis_error_needs_its_length(study_file, tmp_path):
+    study = load_study(study_file, ["offline.objective=kitti"], tmp_path / "study")
+    with pytest.raises(AdaptuneError, match=r"one: its path holds no sub-trajectory of 100 m"):
+        train(study)
+
+
+def test_memory_is_that_of_a_process_of_its_own(study_file, tmp_path):
+    drives.write_bag(tmp_path / "one.bag", drives.scans(0, 15))
+    study = load_study(
+        study_file,
+        [
+            "offline.objective={rte: 1.0, memory: 0.001}",
+            "offline.trials=2",
+            "training=[one]",
+            f"sequences.one.bag={tmp_path / 'one.bag'}",
+        ],
+        tmp_path / "study",
+    )
+    train(study)
+    metrics = Archive(study.folder / "trials").finished("one")[1].metrics
+    assert 10.0 < metrics["memory"] < 4000.0
+    assert metrics["cpu"] > 0.0
