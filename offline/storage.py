@@ -76,7 +76,9 @@ class Mirror(ABC):
 
     def __init__(self, study: Study):
         self._name = study.name
-        self._directions = ["minimize"] * len(study.config.offline.objective)
+        self._directions = [optuna.study.StudyDirection.MINIMIZE] * len(
+            study.config.offline.objective
+        )
         self._distributions = {n: _distribution(p) for n, p in study.space.parameters.items()}
 
     @abstractmethod

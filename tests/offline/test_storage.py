@@ -58,8 +58,8 @@ def assert_mirrors(mirror, n):
     trials = mirror.get_trials()
     assert [trial.number for trial in trials] == list(range(n))
     for trial in trials:
-        parameters, value, attributes = told(trial.number)
-        assert (trial.params, trial.value) == (parameters, value)
+        parameters, values, attributes = told(trial.number)
+        assert (trial.params, trial.values) == (parameters, list(values))
         assert attributes.items() <= trial.user_attrs.items()
 
 
