@@ -188,7 +188,7 @@ def test_limits_that_no_set_keeps(study_file, tmp_path):
 
 def test_kittis_error_needs_its_length(study_file, tmp_path):
     study = load_study(study_file, ["offline.objective=kitti"], tmp_path / "study")
-    with pytest.raises(AdaptuneError, match=r"one: its path holds no sub-trajectory of 100 m"):
+    with pytest.raises(AdaptuneError, match=r"(one|two): its path holds no .* of 100 m"):
         train(study)
 
 
