@@ -26,6 +26,10 @@ DISTANCE_BIN = 3.0
 N_DISTANCES = 10
 N_CLASSES = 9
 N_FEATURES = N_DISTANCES * N_CLASSES
+SPAN = 128
+"""Cells across, more than there can be within the last bin."""
+Z_LIMIT = 1_000_000
+"""Metres and cells; beyond, the number of a cell would lose its meaning."""
 
 
 @numba.njit(cache=True)
@@ -77,7 +81,8 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
     -------
     sums : ndarray of shape (n_cells, 10)
         Count, x, y, z, xx, yy, zz, xy, xz, yz, about the cell's centre.
-    centres : ndarray of shape (n_cells, 3)
+    centres : ndarray of shape (n_cells, 2)
+        x and y.
     """
     n = len(points)
     size = 1024
@@ -85,33 +90,38 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
         size *= 2
     mask = size - 1
     slots = np.full(size, -1, np.int32)
-    keys = np.empty((n, 3), np.int64)
+    keys = np.empty(n, np.int64)
     sums = np.empty((n, 10), np.float64)
     cells = 0
+    cell, last = -1, -1
     # A cell with its mean within the last bin has no point further out than this.
     reach = DISTANCE_BIN * N_DISTANCES + 1.5 * CELL_SIZE
     limit = reach * reach
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        # Also false for what is not a number; beyond 1e6 m the keys would lose their meaning.
-        if not (x * x + y * y <= limit and abs(z) <= 1e6):
+        # Also false for what is not a number.
+        if not (x * x + y * y <= limit and abs(z) <= Z_LIMIT):
             continue
         kx = int(np.floor(x / CELL_SIZE))
         ky = int(np.floor(y / CELL_SIZE))
         kz = int(np.floor(z / CELL_SIZE))
-        slot = (kx * 73856093 ^ ky * 19349669 ^ kz * 83492791) & mask
-        while True:
-            cell = slots[slot]
-            if cell < 0:
-                cell = cells
-                slots[slot] = cell
-                keys[cell, 0], keys[cell, 1], keys[cell, 2] = kx, ky, kz
-                sums[cell] = 0.0
-                cells += 1
-                break
-            if keys[cell, 0] == kx and keys[cell, 1] == ky and keys[cell, 2] == kz:
-                break
-            slot = (slot + 1) & mask
+        key = (kz + 2 * Z_LIMIT) * SPAN * SPAN + (ky + SPAN // 2) * SPAN + (kx + SPAN // 2)
+        # Neighbours in a scan often share their cell.
+        if key != last:
+            last = key
+            slot = ((key * 0x9E3779B97F4A7C1) >> 24) & mask
+            while True:
+                cell = slots[slot]
+                if cell < 0:
+                    cell = cells
+                    slots[slot] = cell
+                    keys[cell] = key
+                    sums[cell] = 0.0
+                    cells += 1
+                    break
+                if keys[cell] == key:
+                    break
+                slot = (slot + 1) & mask
         x -= (kx + 0.5) * CELL_SIZE
         y -= (ky + 0.5) * CELL_SIZE
         z -= (kz + 0.5) * CELL_SIZE
@@ -126,7 +136,10 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
         s[7] += x * y
         s[8] += x * z
         s[9] += y * z
-    centres = (keys[:cells].astype(np.float64) + 0.5) * CELL_SIZE
+    centres = np.empty((cells, 2), np.float64)
+    for cell in range(cells):
+        centres[cell, 0] = (keys[cell] % SPAN - SPAN // 2 + 0.5) * CELL_SIZE
+        centres[cell, 1] = (keys[cell] // SPAN % SPAN - SPAN // 2 + 0.5) * CELL_SIZE
     return sums[:cells], centres
 
 

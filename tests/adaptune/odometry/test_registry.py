@@ -66,9 +66,7 @@ def test_an_odometry_that_a_package_announces(monkeypatch):
     point = metadata.EntryPoint(
         "theirs", "adaptune.odometry.gicp:KeyframeGicp", "adaptune.odometries"
     )
-    monkeypatch.setattr(
-        "adaptune.plugins.entry_points", lambda group: [point][: "odom" in group]
-    )
+    monkeypatch.setattr("adaptune.plugins.entry_points", lambda group: [point][: "odom" in group])
     assert box_class("theirs") is KeyframeGicp
     with pytest.raises(OdometryError, match="did you mean 'theirs'"):
         box_class("thiers")
