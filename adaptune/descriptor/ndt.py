@@ -92,8 +92,7 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
     slots = np.full(size, -1, np.int32)
     keys = np.empty(n, np.int64)
     sums = np.empty((n, 10), np.float64)
-    cells = 0
-    cell, last = -1, -1
+    cells, cell, last = 0, -1, -1
     # A cell with its mean within the last bin has no point further out than this.
     reach = DISTANCE_BIN * N_DISTANCES + 1.5 * CELL_SIZE
     limit = reach * reach
@@ -102,8 +101,7 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
         # Also false for what is not a number.
         if not (x * x + y * y <= limit and abs(z) <= Z_LIMIT):
             continue
-        kx = int(np.floor(x / CELL_SIZE))
-        ky = int(np.floor(y / CELL_SIZE))
+        kx, ky = int(np.floor(x / CELL_SIZE)), int(np.floor(y / CELL_SIZE))
         kz = int(np.floor(z / CELL_SIZE))
         key = (kz + 2 * Z_LIMIT) * SPAN * SPAN + (ky + SPAN // 2) * SPAN + (kx + SPAN // 2)
         # Neighbours in a scan often share their cell.
