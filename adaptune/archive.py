@@ -67,6 +67,9 @@ class Trial:
         Of the whole trajectory by name, see `offline.objective`.
     usage : dict
         Of CPU time and memory, which differ from run to run.
+    repeats : tuple of dict
+        Where the trial was run several times, RTE and metrics of every run. Poses are then the
+        first run's, and errors the mean of the capped ones of all.
     """
 
     parameters: ParameterSet
@@ -78,6 +81,7 @@ class Trial:
     faults: tuple[str, ...] = ()
     metrics: dict[str, float] = field(default_factory=dict)
     usage: dict[str, float] = field(default_factory=dict)
+    repeats: tuple[dict[str, float], ...] = ()
 
     @property
     def mean_error(self) -> float:
@@ -102,6 +106,8 @@ class Summary:
         Milliseconds that the odometry took for a scan.
     others : dict
         Other metrics by name.
+    repeats : sequence of dict
+        See `Trial`.
     """
 
     parameters: ParameterSet
@@ -110,6 +116,7 @@ class Summary:
     faults: int
     ms: float
     others: dict[str, float] = field(default_factory=dict)
+    repeats: Sequence[dict[str, float]] = ()
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -128,6 +135,7 @@ def summarise(trial: Trial) -> Summary:
         len(trial.faults),
         float(1e3 * seconds.mean(dtype=np.float64)) if len(seconds) else 0.0,
         trial.metrics | trial.usage,
+        list(trial.repeats),
     )
 
 
@@ -284,6 +292,7 @@ class Archive:
                 faults=np.frombuffer(json.dumps(trial.faults).encode(), np.uint8),
                 metrics=np.frombuffer(json.dumps(trial.metrics).encode(), np.uint8),
                 usage=np.frombuffer(json.dumps(trial.usage).encode(), np.uint8),
+                repeats=np.frombuffer(json.dumps(trial.repeats).encode(), np.uint8),
             )
         if whole:
             return
@@ -314,6 +323,7 @@ class Archive:
                 tuple(json.loads(data["faults"].tobytes())),
                 json.loads(data["metrics"].tobytes()),
                 json.loads(data["usage"].tobytes()),
+                tuple(json.loads(data["repeats"].tobytes())),
             )
         except (KeyError, ValueError) as error:
             raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error

@@ -41,13 +41,22 @@ from adaptune.odometry import (
 )
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
-from adaptune.sequence.config import expand
+from adaptune.sequence.config import ViewConfig, expand
 from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course, as_sequence
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 """Becomes a file's name."""
+
+
+OF_VIEW = "+"
+"""Between the name of a sequence and that of a view of it; in no name that a user gives."""
+
+
+def origin(name: str) -> str:
+    """Name of the sequence that a training sequence is, or is a view of."""
+    return name.partition(OF_VIEW)[0]
 
 
 class ConfigurationError(AdaptuneError):
@@ -91,6 +100,10 @@ class Limit(_Section):
     max: float = Field(gt=0, allow_inf_nan=False)
 
 
+PRESETS: dict[str, dict[str, Any]] = {"paper": {"sampler": "tpe", "trials": 256, "runs": "whole"}}
+"""What presets of the offline stage set, where nothing else is said."""
+
+
 class OfflineConfig(_Section):
     """How to search for parameter sets.
 
@@ -114,6 +127,16 @@ class OfflineConfig(_Section):
         front, of which the first chooses the fixed set.
     limits : dict
         By metric what a set may not exceed.
+    runs : str
+        `restart`: an odometry that loses track starts anew at the reference. `whole`: every run
+        goes from end to end, whatever happens. `episodes`: in overlapping pieces that each start
+        anew, for what cannot be restarted where it gets lost.
+    repeats : int
+        Runs of every trial, for odometries that differ from run to run.
+    augment : list of ViewConfig
+        Each adds a view of every training sequence to the training.
+    preset : str, optional
+        `paper`: as Koide et al. (IROS 2021) did, see `PRESETS`.
     """
 
     sampler: Literal["tpe", "sobol", "random"] = "tpe"
@@ -128,6 +151,16 @@ class OfflineConfig(_Section):
         {"rte": 1.0},
     )
     limits: dict[Metric, Limit] = {}
+    runs: Literal["restart", "whole", "episodes"] = "restart"
+    repeats: int = Field(1, ge=1)
+    augment: tuple[ViewConfig, ...] = ()
+    preset: Literal["paper"] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        preset = PRESETS.get(str(given.get("preset")), {}) if isinstance(given, dict) else {}
+        return preset | given if preset else given
 
     @field_serializer("storage")
     def _hide_password(self, storage: str | None) -> str | None:
@@ -320,8 +353,30 @@ class Study:
         """Where a simulated course's bag is kept."""
         return self.folder / "recordings" / f"{course}.bag"
 
+    @cached_property
+    def _views(self) -> dict[str, ViewConfig]:
+        """Views that the training is augmented with, by names that differ."""
+        views: dict[str, ViewConfig] = {}
+        for view in self.config.offline.augment:
+            same = sum(other.name == view.name for other in views.values())
+            views[f"{view.name}{same + 1}" if same else view.name] = view
+        return views
+
+    @property
+    def training(self) -> list[str]:
+        """Names of the training sequences, each with the views of it."""
+        return [
+            name + suffix
+            for name in self.config.training
+            for suffix in ("", *(f"{OF_VIEW}{view}" for view in self._views))
+        ]
+
     def sequence_config(self, name: str) -> SequenceConfig:
-        """What is known of a sequence or a course."""
+        """What is known of a sequence, a course, or a view of one that is trained on."""
+        if OF_VIEW in name:
+            name, view = name.split(OF_VIEW)
+            seen = self.sequence_config(name)
+            return seen.model_copy(update={"views": (*seen.views, self._views[view])})
         if name in self.config.sequences:
             return self.config.sequences[name]
         return as_sequence(self.config.courses[name], self.recording(name))
@@ -336,9 +391,10 @@ class Study:
         ConfigurationError
             If the course has not been recorded.
         """
-        if name in self.config.courses and not self.recording(name).exists():
+        course = origin(name)
+        if course in self.config.courses and not self.recording(course).exists():
             raise ConfigurationError(
-                f"{self.recording(name)}: the course {name} is not recorded yet; run "
+                f"{self.recording(course)}: the course {course} is not recorded yet; run "
                 f"`adaptune simulate` with this study first"
             )
         sequence = open_sequence(self.sequence_config(name))
@@ -434,8 +490,8 @@ def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
             entry.pop("cache", None)  # changes nothing but the time it takes
             lasting[f"{kind}.{name}"] = entry
     offline = config.get("offline", {})
-    searched = ("sampler", "initial", "batch", "seed", "objective", "limits")
-    lasting["offline"] = {k: offline.get(k) for k in searched}
+    searched = ("sampler", "initial", "batch", "seed", "objective", "limits", "runs", "repeats")
+    lasting["offline"] = {k: offline.get(k) for k in (*searched, "augment")}
     return lasting
 
 

@@ -87,8 +87,7 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
     model = fit(study, archive, verdicts, fixed)
     model.save(study.folder / "model.npz")
     finished = {
-        name: [archive.finished(name)[n] for n in range(len(verdicts))]
-        for name in study.config.training
+        name: [archive.finished(name)[n] for n in range(len(verdicts))] for name in study.training
     }
     means = {name: [trial.mean_error for trial in trials] for name, trials in finished.items()}
     write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
@@ -116,6 +115,8 @@ def _trial_rows(
                 rows[-1][metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.limits:
             rows[-1]["excess"] = verdict.excess
+        if config.repeats > 1:
+            rows[-1]["margin"] = verdict.margin
         rows[-1]["mean"] = float(np.mean([run.mean_error for run in runs]))
         rows[-1] |= {name: trials[n].mean_error for name, trials in finished.items()}
     return rows
@@ -131,7 +132,7 @@ def _training_rows(
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
     for name, runs in finished.items():
-        best = choose_fixed(config, [judge(config, r.parameters, [r.metrics]) for r in runs])
+        best = choose_fixed(config, [judge(config, [run]) for run in runs])
         rows.append(
             {
                 "sequence": name,
@@ -167,7 +168,7 @@ def _run_batches(
     study: Study, archive: Archive, workers: Workers, progress: Progress
 ) -> list[Verdict]:
     config = study.config.offline
-    names, described = study.config.training, study.config.descriptor.names
+    names, described = study.training, study.config.descriptor.names
     finished = {name: archive.finished(name) for name in names}
     mirror = open_mirror(study, {n: s.parameters for n, s in finished[names[0]].items()})
     verdicts: list[Verdict] = []
@@ -198,10 +199,7 @@ def _run_batches(
             for task in _run(archive, workers, tasks):
                 done += len(task.numbers)
                 progress("trials", done, total)
-        for n in numbers:
-            trials = [finished[name][n] for name in names]
-            runs = [trial.metrics for trial in trials]
-            verdicts.append(judge(config, trials[0].parameters, runs))
+        verdicts += [judge(config, [finished[name][n] for name in names]) for n in numbers]
         mirror.tell(len(verdicts), of)
         best = min(range(len(verdicts)), key=lambda n: (verdicts[n].excess, verdicts[n].values[0]))
         _log.info(
@@ -251,7 +249,7 @@ def _run_whole(
     progress: Progress,
 ) -> dict[str, tuple[float, float]]:
     """Mean RTE of baseline and fixed set on the training sequences, in one go from end to end."""
-    names = study.config.training
+    names = study.training
     tasks = [
         Task(name, (n,), (verdicts[n].parameters,), whole=True)
         for name in names
@@ -285,7 +283,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
     numbers = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
     descriptors, sequence, errors = [], [], []
     window = study.window
-    for s, name in enumerate(study.config.training):
+    for s, name in enumerate(study.training):
         of_sequence = archive.read_errors(name, numbers)
         # Whether there is a sub-trajectory depends on the reference alone.
         labelled = ~np.isnan(of_sequence).all(axis=1)
@@ -304,7 +302,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         sets=[verdicts[n].parameters for n in numbers],
         fixed=numbers.index(fixed),
         length=study.config.sub_trajectory,
-        sequences=list(study.config.training),
+        sequences=list(study.training),
         blocks=frames.blocks,
         window=window,
         descriptors=np.concatenate(descriptors),

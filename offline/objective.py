@@ -21,20 +21,20 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
-from adaptune.archive import Frames
+from adaptune.archive import Frames, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
 from adaptune.metrics import absolute_error, kitti_error, relative_error
 from adaptune.space import ParameterSet
-from adaptune.study import Metric, OfflineConfig
+from adaptune.study import TIMED, Metric, OfflineConfig
 
 BOUND = 1e6
 """No metric counts for more, nor one that cannot be told, so that sums stay finite."""
 SEVERITY = 10.0
 """How many times the baseline's value is added to that of a set that breaks a limit."""
 
-Metrics = Mapping[str, float]
 Value = float | tuple[float, ...]
 """What samplers minimise: a tuple where there are several objectives."""
 
@@ -49,11 +49,15 @@ class Verdict(NamedTuple):
         Of every objective, the mean over the sequences.
     excess : float
         By how much limits are exceeded, each in parts of the limit; 0 if it keeps them all.
+    margin : float
+        From the first value to the upper end of its one-sided 95 % confidence interval, where
+        trials are repeated; 0 where they are not.
     """
 
     parameters: ParameterSet
     values: tuple[float, ...]
     excess: float
+    margin: float = 0.0
 
     @property
     def feasible(self) -> bool:
@@ -108,25 +112,40 @@ def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
     return T
 
 
-def judge(config: OfflineConfig, parameters: ParameterSet, runs: Sequence[Metrics]) -> Verdict:
-    """Judge a parameter set by its metrics on some sequences.
+def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
+    """Judge a parameter set by its trials on some sequences.
 
     Parameters
     ----------
     config
         Its objective and limits. A limit holds on every sequence.
-    parameters
-        The set.
     runs
-        Its metrics, a mapping for each sequence.
+        Its trials, one for each sequence.
     """
+    metrics = [run.metrics for run in runs]
     values = tuple(
-        float(np.mean([sum(w * run[m] for m, w in weights.items()) for run in runs]))
+        float(np.mean([weighted(weights, of_run) for of_run in metrics]))
         for weights in config.objective
     )
-    worst = {name: max(run[name] for run in runs) for name in config.limits}
+    worst = {name: max(of_run[name] for of_run in metrics) for name in config.limits}
     excess = sum(max(0.0, worst[m] / limit.max - 1.0) for m, limit in config.limits.items())
-    return Verdict(parameters, values, excess)
+    return Verdict(runs[0].parameters, values, excess, _margin(config.objective[0], runs))
+
+
+def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
+    """A weighted sum of metrics."""
+    return sum(weight * metrics[name] for name, weight in weights.items())
+
+
+def _margin(weights: Mapping[Metric, float], runs: Sequence[Summary]) -> float:
+    """Student's, of the mean over sequences: runs of a set vary, the sequences do not."""
+    if not all(run.repeats for run in runs):
+        return 0.0
+    repeatable = {name: w for name, w in weights.items() if name not in TIMED}
+    values = np.array([[weighted(repeatable, r) for r in run.repeats] for run in runs])
+    n_runs, n_repeats = values.shape
+    error = np.sqrt(values.var(axis=1, ddof=1).sum() / n_repeats) / n_runs
+    return float(stats.t.ppf(0.95, n_runs * (n_repeats - 1)) * error)
 
 
 def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, Value]]:
@@ -155,7 +174,8 @@ def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, Value]]:
 def choose_fixed(config: OfflineConfig, verdicts: Sequence[Verdict]) -> int:
     """Number of the set that does best by the first objective among those that keep all limits.
 
-    Of equal ones, the first.
+    Where trials are repeated, the one whose value is surely least: the upper end of its confidence
+    interval counts. Of equal ones, the first.
 
     Raises
     ------
@@ -171,7 +191,7 @@ def choose_fixed(config: OfflineConfig, verdicts: Sequence[Verdict]) -> int:
             f"sequence; nearest comes trial {nearest}, {verdicts[nearest].excess:.0%} beyond: "
             f"loosen the limits, widen the ranges of the parameters, or run more trials"
         )
-    return min(feasible, key=lambda n: verdicts[n].values[0])
+    return min(feasible, key=lambda n: verdicts[n].values[0] + verdicts[n].margin)
 
 
 def label(weights: Mapping[Metric, float]) -> str:

@@ -10,7 +10,7 @@ from adaptune.archive import Frames, Trial
 from adaptune.descriptor import Describer
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
-from adaptune.metrics import KITTI_LENGTHS, sub_trajectory_rte, window_ends
+from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.odometry import Box, Isolated
 from adaptune.odometry.base import prepared_bytes
 from adaptune.space import ParameterSet
@@ -19,6 +19,8 @@ from offline.objective import trajectory_metrics
 
 MIN_POINTS = 20
 """No odometry makes anything of a scan with fewer."""
+EPISODE = 4.0
+"""Sub-trajectories from the beginning of an episode to that of the next."""
 
 
 class PreparedSequence:
@@ -131,11 +133,14 @@ def _odometry(study: Study, parameters: ParameterSet | None = None) -> Box:
 
 
 class _Run:
-    """An odometry on its way along a sequence."""
+    """An odometry on its way along a piece of a sequence, from frame `begin` to before `end`."""
 
-    def __init__(self, odometry: Box, frames: Frames, lost_track: float | None):
+    def __init__(
+        self, odometry: Box, frames: Frames, lost_track: float | None, begin: int, end: int
+    ):
         n = len(frames.stamps)
         self.odometry = odometry
+        self.begin, self.end = begin, end
         self.T_odom_sensor = np.empty((n, 4, 4))
         self.restarted = np.zeros(n, bool)
         self.registered = np.ones(n, bool)
@@ -152,11 +157,11 @@ class _Run:
         return self.odometry.cpu if isinstance(self.odometry, Isolated) else self._cpu
 
     def step(self, i: int, prepared: Any) -> None:
-        if i == 0:
-            T = self._T_ref_sensor[0]
+        if i == self.begin:
+            T = self._T_ref_sensor[i]
             T = np.eye(4) if np.isnan(T[0, 0]) else T
             self.odometry.start(prepared, T)
-            self.T_odom_sensor[0] = T
+            self.T_odom_sensor[i] = T
             return
         begin, begin_cpu = time.perf_counter(), time.process_time()
         T, self.registered[i] = self.odometry.register(prepared)
@@ -186,14 +191,40 @@ class _Run:
         return bool(np.linalg.norm(departure) > self._bounds[i - 1])
 
 
+def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
+    """Pieces of a sequence that overlap, so that every sub-trajectory lies within one of them.
+
+    Parameters
+    ----------
+    T_ref_sensor
+        Reference poses of shape (n, 4, 4).
+    length
+        Metres of a sub-trajectory. A piece begins every `EPISODE` times that.
+
+    Returns
+    -------
+    list of (begin, end)
+        Frames from `begin` to before `end`.
+    """
+    distance = travelled(T_ref_sensor)
+    n = len(distance)
+    starts = np.arange(0.0, max(distance[-1], 1e-9), EPISODE * length)
+    begins = np.unique(np.searchsorted(distance, starts)).tolist()
+    ends = [
+        min(n, int(np.searchsorted(distance, distance[last - 1] + length, side="right")) + 1)
+        for last in [*begins[1:], n]
+    ]
+    return list(zip(begins, ends, strict=True))
+
+
 def run_trials(
     study: Study, sequence: PreparedSequence, sets: Sequence[ParameterSet], whole: bool = False
 ) -> list[Trial]:
     """Run an odometry with several parameter sets on one pass over a sequence.
 
-    Where the odometry loses track, it is started anew at the reference with that scan, and the
-    sub-trajectories across that frame are labelled as failures: what comes after is judged for
-    itself.
+    With ``offline.runs: restart``, where the odometry loses track, it is started anew at the
+    reference with that scan, and the sub-trajectories across that frame are labelled as failures:
+    what comes after is judged for itself. See `OfflineConfig` for the other ways.
 
     Parameters
     ----------
@@ -204,34 +235,89 @@ def run_trials(
     sets
         The parameter sets.
     whole
-        Do not start anew at the reference.
+        From end to end, whatever the study says.
     """
-    frames = sequence.frames
-    lost_track = None if whole else study.config.lost_track
-    runs = [_Run(_odometry(study, s), frames, lost_track) for s in sets]
+    frames, config = sequence.frames, study.config
+    kind, repeats = ("whole", 1) if whole else (config.offline.runs, config.offline.repeats)
+    pieces = [(0, len(frames.stamps))]
+    if kind == "episodes":
+        pieces = episodes(frames.T_ref_sensor, config.sub_trajectory)
+    lost_track = config.lost_track if kind == "restart" else None
+    # Of every set every repeat, and of that every piece.
+    runs = [
+        [
+            [_Run(_odometry(study, s), frames, lost_track, *piece) for piece in pieces]
+            for _ in range(repeats)
+        ]
+        for s in sets
+    ]
+    each = [run for of_set in runs for repeat in of_set for run in repeat]
     for i, prepared in enumerate(sequence):
-        for run in runs:
-            run.step(i, prepared)
-    return [_trial(study, s, frames, run) for s, run in zip(sets, runs, strict=True)]
+        for run in each:
+            if run.begin <= i < run.end:
+                run.step(i, prepared)
+    return [
+        _mean(s, [_trial(study, s, frames, repeat) for repeat in of_set])
+        for s, of_set in zip(sets, runs, strict=True)
+    ]
 
 
-def _trial(study: Study, parameters: ParameterSet, frames: Frames, run: _Run) -> Trial:
-    errors = sub_trajectory_rte(
-        frames.T_ref_sensor, run.T_odom_sensor, study.config.sub_trajectory, run.restarted
-    )
+def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Sequence[_Run]) -> Trial:
+    """Make one trial of pieces: what is told of a frame is of the last that began before it."""
+    n = len(frames.stamps)
+    T_odom_sensor = np.empty((n, 4, 4))
+    errors, seconds = np.empty(n), np.empty(n)
+    restarted, registered = np.zeros(n, bool), np.ones(n, bool)
+    lost_steps: dict[int, Poses] = {}
+    cpu = 0.0
+    for run, after in zip(pieces, [*pieces[1:], None], strict=True):
+        own = slice(run.begin, n if after is None else after.begin)
+        T_odom_sensor[own] = run.T_odom_sensor[own]
+        piece = slice(run.begin, run.end)
+        errors[own] = sub_trajectory_rte(
+            frames.T_ref_sensor[piece],
+            run.T_odom_sensor[piece],
+            study.config.sub_trajectory,
+            run.restarted[piece],
+        )[: own.stop - own.start]
+        restarted[own], registered[own] = run.restarted[own], run.registered[own]
+        seconds[own] = run.seconds[own]
+        lost_steps |= run.lost_steps
+        cpu += run.cpu * (own.stop - own.start) / (run.end - run.begin)
+        if after is not None:
+            T = run.T_odom_sensor
+            lost_steps[after.begin] = invert(T[after.begin - 1]) @ T[after.begin]
     duration = (frames.stamps[-1] - frames.stamps[0]) * 1e-9
-    isolated = run.odometry if isinstance(run.odometry, Isolated) else None
-    usage = {"cpu": 100.0 * run.cpu / duration}
-    if isolated is not None:
-        usage["memory"] = isolated.memory
+    isolated = [r.odometry for r in pieces if isinstance(r.odometry, Isolated)]
+    usage = {"cpu": 100.0 * cpu / duration}
+    if isolated:
+        usage["memory"] = max(box.memory for box in isolated)
     return Trial(
         parameters,
-        run.T_odom_sensor,
+        T_odom_sensor,
         errors,
-        run.restarted,
-        run.registered,
-        run.seconds,
-        () if isolated is None else tuple(isolated.faults),
-        trajectory_metrics(frames, run.T_odom_sensor, run.lost_steps),
+        restarted,
+        registered,
+        seconds,
+        tuple(fault for box in isolated for fault in box.faults),
+        trajectory_metrics(frames, T_odom_sensor, lost_steps),
         usage,
+    )
+
+
+def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
+    """One trial of several runs with the same parameters."""
+    if len(repeats) == 1:
+        return repeats[0]
+    return Trial(
+        parameters,
+        repeats[0].T_odom_sensor,
+        np.mean([cap(trial.errors) for trial in repeats], axis=0),
+        np.any([trial.restarted for trial in repeats], axis=0),
+        np.all([trial.registered for trial in repeats], axis=0),
+        np.mean([trial.seconds for trial in repeats], axis=0),
+        tuple(fault for trial in repeats for fault in trial.faults),
+        {m: float(np.mean([t.metrics[m] for t in repeats])) for m in repeats[0].metrics},
+        {m: float(np.mean([t.usage[m] for t in repeats])) for m in repeats[0].usage},
+        tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
     )

@@ -20,7 +20,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import RULES, ErrorModel, Rule, TrainingData
 from adaptune.model.base import mean_errors
-from adaptune.study import Study
+from adaptune.study import Study, origin
+from offline.objective import weighted
 
 MIN_SEQUENCES = 6
 """Fewer say too little about places they are not to advise for adapting."""
@@ -166,7 +167,7 @@ def validate(
     model = ErrorModel.load(study.folder / "model.npz")
     archive = Archive(study.folder / "trials")
     numbers = model.provenance["trials"]
-    weights = study.config.offline.objective[0]
+    objective = study.config.offline.objective[0]
     sequences = []
     for name in model.sequences:
         frames = archive.read_frames(name)
@@ -178,7 +179,7 @@ def validate(
         blocks = tuple(frames.blocks.values())
         since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
         period = (since // study.config.online.period).astype(np.int64)
-        metrics = [archive.finished(name)[n].metrics for n in numbers]
+        values = [weighted(objective, archive.finished(name)[n].metrics) for n in numbers]
         sequences.append(
             LabelledSequence(
                 name,
@@ -187,7 +188,7 @@ def validate(
                 errors[labelled],
                 blocks,
                 archive.read(name, 0).errors[labelled],
-                np.array([sum(w * of_set[m] for m, w in weights.items()) for of_set in metrics]),
+                np.array(values),
             )
         )
     validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
@@ -209,7 +210,7 @@ def leave_one_out(
     rules: dict[str, Callable[[], Rule]] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Validation:
-    """Leave each sequence out in turn.
+    """Leave each sequence out in turn, with all views of it.
 
     Parameters
     ----------
@@ -227,17 +228,20 @@ def leave_one_out(
     ValidationError
         If there are fewer than two sequences.
     """
-    if len(sequences) < 2:
+    groups = dict.fromkeys(origin(s.name) for s in sequences)
+    if len(groups) < 2:
         raise ValidationError(
             "training: one sequence cannot be validated, for nothing remains to train on when it "
             "is left out; add sequences"
         )
     left_out = []
-    for i, sequence in enumerate(sequences):
-        progress(i, len(sequences))
-        others = [s for s in sequences if s is not sequence]
+    # Views say nothing new of the place that they are of.
+    seen = [s for s in sequences if s.name in groups]
+    for i, sequence in enumerate(seen):
+        progress(i, len(seen))
+        others = [s for s in sequences if origin(s.name) != sequence.name]
         left_out.append(_leave_out(sequence, others, sets, rules or RULES))
-    progress(len(sequences), len(sequences))
+    progress(len(seen), len(seen))
     return Validation(left_out)
 
 

@@ -194,10 +194,14 @@ class ViewConfig(_Section):
             raise ValueError(f"a part goes from a start to a later stop, not {list(bad[0])}")
         return self
 
+    @property
+    def name(self) -> str:
+        """Which view it is."""
+        return self._given()[0]
+
     def of(self, sequence: views.Reversible) -> views.Reversible:
         """The sequence as this view shows it."""
-        (name,) = self._given()
-        return _VIEWS[name](sequence, getattr(self, name))
+        return _VIEWS[self.name](sequence, getattr(self, self.name))
 
     def _given(self) -> list[str]:
         return [name for name in type(self).model_fields if getattr(self, name) is not None]

@@ -25,6 +25,7 @@ def random_trial(seed=0, parameters=PARAMETERS):
         rng.random(N).astype(np.float32).astype(float),
         metrics={"rte": rng.random()},
         usage={"cpu": rng.random()},
+        repeats=({"rte": rng.random()}, {"rte": rng.random()}),
     )
 
 

@@ -13,7 +13,7 @@ from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.study import load_study
+from adaptune.study import ConfigurationError, load_study
 from offline.campaign import train
 from offline.workers import WorkerError, Workers
 
@@ -149,3 +149,36 @@ def test_what_a_worker_finds_wrong_reaches_the_user(study_file, tmp_path):
     )
     with pytest.raises(AdaptuneError, match=r"two: its path of 2\.4 m holds no sub-trajectory"):
         train(study)
+
+
+def test_views_are_trained_on_beside_their_origin(study_file, tmp_path):
+    overrides = [
+        "offline.augment=[{noise: {sigma: 0.02}}, {reverse: true}, {noise: {sigma: 0.1}}]",
+        "offline.trials=2",
+        "training=[one]",
+    ]
+    study = load_study(study_file, overrides, tmp_path / "study")
+    names = ["one", "one+noise", "one+reverse", "one+noise2"]
+    training = train(study)
+    assert training.model.sequences == names
+    assert [row["sequence"] for row in training.rows] == names
+    archive = Archive(study.folder / "trials")
+    frames = [archive.read_frames(name).T_ref_sensor for name in names]
+    np.testing.assert_array_equal(frames[0], frames[1])
+    np.testing.assert_allclose(frames[0], frames[2][::-1], atol=1e-9)
+    errors = [training.means[name][0] for name in names]
+    assert len(set(errors)) == 4
+    with pytest.raises(ConfigurationError, match=r"other values of offline\.augment"):
+        load_study(study_file, overrides[1:], study.folder).check()
+
+
+def test_a_view_that_cannot_be_is_told(study_file, tmp_path):
+    study = load_study(study_file, ["offline.augment=[{rings: 2}]"], tmp_path / "study")
+    with pytest.raises(AdaptuneError, match=r"its points have no ring"):
+        train(study)
+
+
+def test_the_preset_of_the_paper(study_file):
+    offline = load_study(study_file, ["offline={preset: paper, trials: 9}"]).config.offline
+    assert (offline.runs, offline.sampler, offline.trials) == ("whole", "tpe", 9)
+    assert load_study(study_file, ["offline={preset: paper}"]).config.offline.trials == 256

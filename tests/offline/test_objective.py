@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adaptune.archive import Archive
+from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import steps
 from adaptune.odometry import Registration
@@ -62,11 +62,12 @@ def test_wrong_objectives_are_refused(study_file, override, message):
 
 def test_a_sum_is_a_mean_over_sequences_and_a_limit_holds_on_each():
     of = config(objective={"rte": 1, "ms_per_scan": 0.1}, limits={"ms_per_scan": {"max": 20}})
-    runs = [{"rte": 1.0, "ms_per_scan": 10.0}, {"rte": 3.0, "ms_per_scan": 30.0}]
-    verdict = judge(of, {"a": 1}, runs)
+    runs = [Summary({"a": 1}, 1.0, 0, 0, 10.0), Summary({"a": 1}, 3.0, 0, 0, 30.0)]
+    verdict = judge(of, runs)
+    assert verdict.parameters == {"a": 1}
     assert verdict.values == pytest.approx((0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0),))
     assert verdict.excess == pytest.approx(0.5)
-    assert judge(of, {"a": 1}, runs[:1]).feasible
+    assert judge(of, runs[:1]).feasible
 
 
 def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
@@ -75,6 +76,22 @@ def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
     of = config(limits={"ms_per_scan": {"max": 20}})
     with pytest.raises(AdaptuneError, match=r"none of 1 .* keeps ms_per_scan <= 20 .* 10% beyond"):
         choose_fixed(of, verdicts[1:2])
+
+
+def test_of_repeated_trials_the_surely_best_is_taken():
+    def summary(*errors):
+        repeats = [{"rte": e} for e in errors]
+        return Summary({}, float(np.mean(errors)), 0, 0, 1.0, repeats=repeats)
+
+    steady, lucky = [summary(1.1, 1.1, 1.1)] * 2, [summary(0.2, 0.9, 1.9), summary(1.0, 1.0, 1.0)]
+    verdicts = [judge(config(repeats=3), runs) for runs in (steady, lucky)]
+    assert verdicts[0].margin == 0.0
+    # The standard error of the mean of two means of three, times Student's t with four degrees.
+    error = np.sqrt(np.var([0.2, 0.9, 1.9], ddof=1) / 3) / 2
+    assert verdicts[1].margin == pytest.approx(2.1318 * error, rel=1e-4)
+    assert verdicts[1].values < verdicts[0].values
+    assert choose_fixed(config(), verdicts) == 0
+    assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
 
 
 def test_samplers_are_told_a_penalty():
@@ -188,7 +205,9 @@ def test_limits_that_no_set_keeps(study_file, tmp_path):
 
 def test_kittis_error_needs_its_length(study_file, tmp_path):
     study = load_study(study_file, ["offline.objective=kitti"], tmp_path / "study")
-    with pytest.raises(AdaptuneError, match=r"(one|two): its path holds no .* of 100 m"):
+    with pytest.raises(
+        AdaptuneError, match=r"(one|two): its path holds no sub-trajectory of 100 m"
+    ):
         train(study)
 
 

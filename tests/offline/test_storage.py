@@ -105,7 +105,7 @@ def test_a_damaged_journal_is_made_anew(study, harm):
 
 
 def test_what_is_no_number_is_a_failed_trial(study):
-    open_mirror(study, {}).tell(1, lambda n: told(n)._replace(value=float("nan")))
+    open_mirror(study, {}).tell(1, lambda n: told(n)._replace(values=(float("nan"),)))
     (trial,) = in_journal(study).get_trials()
     assert trial.state == optuna.trial.TrialState.FAIL
 

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 
 import drives
 import numpy as np
@@ -6,11 +7,11 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
-from adaptune.metrics import sub_trajectory_rte
+from adaptune.metrics import sub_trajectory_rte, window_ends
 from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.study import Study, load_study
-from offline.trial import PreparedSequence, run_trials
+from offline.trial import PreparedSequence, episodes, run_trials
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 
@@ -117,6 +118,94 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monk
     (whole,) = run_trials(study, sequence, [GOOD], whole=True)
     assert not whole.restarted.any()
     assert np.isfinite(whole.errors[:29]).all()
+
+
+def test_repeats_are_averaged_and_kept(study, monkeypatch):
+    made = []
+
+    class Wavering(KeyframeGicp):
+        """The second instance drifts to the side, the third loses track."""
+
+        def __init__(self, *args):
+            super().__init__(*args)
+            made.append(self)
+            self.number, self.scan = len(made), 0
+
+        def register(self, prepared):
+            self.scan += 1
+            T, ok = super().register(prepared)
+            T = T.copy()
+            T[1, 3] += 0.01 * self.scan * (self.number == 3)
+            T[1, 3] += 5.0 * (self.number == 4 and self.scan == 10)
+            return Registration(T, ok)
+
+    monkeypatch.setattr(Study, "odometry", lambda self, p=None: Wavering(p, self.settings))
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(with_offline(study, repeats=3), sequence, [GOOD])
+    assert len(made) == 4
+    errors = [of_run["rte"] for of_run in trial.repeats]
+    assert errors[0] < errors[1] < errors[2]
+    assert trial.mean_error == pytest.approx(np.mean(errors))
+    assert trial.errors[5] > 10.0
+    assert np.flatnonzero(trial.restarted).tolist() == [10]
+    assert trial.metrics["ape"] == pytest.approx(np.mean([r["ape"] for r in trial.repeats]))
+    (alone,) = run_trials(study, sequence, [GOOD])
+    np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
+
+
+@pytest.mark.parametrize("length", [1.0, 2.5, 3.0, 50.0])
+def test_every_sub_trajectory_lies_in_an_episode(study, length):
+    T = PreparedSequence(study, "one", 1e9).frames.T_ref_sensor
+    pieces = episodes(T, length)
+    assert pieces[0][0] == 0
+    assert pieces[-1][1] == len(T)
+    assert (len(pieces) == 1) == (4 * length > 11.7)
+    ends = window_ends(T, length)
+    for (begin, end), (after, _) in itertools.pairwise([*pieces, (len(T), 0)]):
+        assert begin < after <= end
+        assert ends[begin:after].max() < end
+
+
+def test_episodes_begin_anew_and_do_not_hide_what_happens_between(study, monkeypatch):
+    boxes = []
+
+    def odometry(self, parameters=None):
+        boxes.append(Slipping(parameters, self.settings))
+        return boxes[-1]
+
+    monkeypatch.setattr(Study, "odometry", odometry)
+    short = dataclasses.replace(
+        study, config=study.config.model_copy(update={"sub_trajectory": 1.0})
+    )
+    short = with_offline(short, runs="episodes")
+    sequence = PreparedSequence(short, "one", 1e9)
+    (trial,) = run_trials(short, sequence, [GOOD])
+    pieces = episodes(sequence.frames.T_ref_sensor, 1.0)
+    assert [b.starts[0][0] for b in boxes[1:]] == [0] * len(pieces)
+    for begin, _ in pieces:
+        np.testing.assert_array_equal(
+            trial.T_odom_sensor[begin], sequence.frames.T_ref_sensor[begin]
+        )
+    assert not trial.restarted.any()
+    # Each piece slips at its own tenth scan by 0.31 m, which is an error, not a failure.
+    assert np.isfinite(
+        trial.errors[: window_ends(sequence.frames.T_ref_sensor, 1.0).argmax()]
+    ).all()
+    assert trial.errors[8] > 20.0
+    slipped = 0.31 * np.sqrt(len([b for b, e in pieces if e > b + 10]) / 39)
+    assert trial.metrics["rpe"] == pytest.approx(slipped, rel=0.2)
+
+
+def test_whole_runs_as_trials(study):
+    sequence = PreparedSequence(study, "one", 1e9)
+    (a,) = run_trials(with_offline(study, runs="whole", repeats=1), sequence, [GOOD])
+    (b,) = run_trials(study, sequence, [GOOD], whole=True)
+    np.testing.assert_array_equal(a.errors, b.errors)
+
+
+def with_offline(study, **changes):
+    offline = study.config.offline.model_copy(update=changes)
+    return dataclasses.replace(study, config=study.config.model_copy(update={"offline": offline}))
 
 
 def test_a_reference_of_another_time_is_refused(study, tmp_path):

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 
 import numpy as np
@@ -13,6 +14,7 @@ from offline.validation import (
     Validation,
     ValidationError,
     leave_one_out,
+    training_data,
     validate,
 )
 
@@ -121,6 +123,31 @@ def test_verdicts(ratios, verdict):
 def test_one_sequence_cannot_be_validated():
     with pytest.raises(ValidationError, match="one sequence"):
         leave_one_out(two_kinds(np.random.default_rng(0))[:1], SETS)
+
+
+def test_a_sequence_is_left_out_with_its_views():
+    sequences = two_kinds(np.random.default_rng(4))[:3]
+    seen = [
+        dataclasses.replace(s, name=f"{s.name}+noise", errors=s.errors + np.float32(100 + i))
+        for i, s in enumerate(sequences)
+    ]
+    Cheat.fitted = ()
+    validation = leave_one_out([*sequences, *seen], SETS, {"cheat": Cheat})
+    assert [s.name for s in validation.left_out] == [s.name for s in sequences]
+    for i, data in enumerate(Cheat.fitted):
+        fitted = {e.tobytes() for e in data.errors}
+        assert not fitted & {e.tobytes() for e in (*sequences[i].errors, *seen[i].errors)}
+        assert len(fitted) == 4 * 80
+    with pytest.raises(ValidationError, match="one sequence"):
+        leave_one_out([sequences[0], seen[0]], SETS)
+
+
+def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
+    sequences = two_kinds(np.random.default_rng(5))
+    for value, expected in (([5, 4, 3, 2, 1], 4), ([np.inf, 1, 2, 3, 4], 1)):
+        judged = [dataclasses.replace(s, values=np.array(value, float)) for s in sequences]
+        data, _ = training_data(judged, SETS)
+        assert data.fixed == expected
 
 
 def test_validates_a_study(study_file, tmp_path):
