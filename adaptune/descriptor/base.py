@@ -20,6 +20,9 @@ ENTRY_POINTS = "adaptune.descriptors"
 
 DESCRIPTORS = {
     "ndt": "adaptune.descriptor.ndt:describe",
+    "ring_heights": "adaptune.descriptor.polar:ring_heights",
+    "range_image": "adaptune.descriptor.polar:range_image",
+    "fpfh": "adaptune.descriptor.fpfh:fpfh",
 }
 
 

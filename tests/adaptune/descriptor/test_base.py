@@ -71,7 +71,7 @@ def test_every_descriptor_tells_places_apart_and_not_headings(name):
     # The street's end, and the same place faced backwards: columns of rays stay where they were.
     turned = here * np.array([-1, -1, 1], np.float32)
     one, other, again = (describe(Scan(0, points)) for points in (here, there, turned))
-    assert np.linalg.norm(one - again) < 0.2 * np.linalg.norm(one - other)
+    assert np.linalg.norm(one - again) < 0.3 * np.linalg.norm(one - other)
 
 
 def test_several_descriptors_stand_one_after_the_other():
