@@ -1,5 +1,6 @@
 """What selection rules learn from, and what they answer."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple, Self
@@ -80,11 +81,19 @@ class Selection(NamedTuple):
         Percent.
     predicted_fixed : float
         Percent, what the fixed set is predicted to have here.
+    familiarity : float
+        Share of the training frames that are farther from the other training sequences than the
+        scan is from all of them; NaN where the rule does not ask.
+    sequences : float
+        How many training sequences this rests on: one over the sum of their squared weights; NaN
+        where they have none.
     """
 
     set_index: int
     predicted_error: float
     predicted_fixed: float
+    familiarity: float = math.nan
+    sequences: float = math.nan
 
 
 class Rule(ABC):
@@ -110,5 +119,13 @@ class Rule(ABC):
         """
 
     @abstractmethod
-    def select(self, feature: NDArray[np.float64]) -> Selection:
-        """Choose a set for one scan described by `feature`, of shape (n_features,)."""
+    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
+        """Choose a set for one scan.
+
+        Parameters
+        ----------
+        feature
+            What the scan looks like, of shape (n_features,).
+        current
+            Index of the set that the odometry has now, for rules that weigh what a switch costs.
+        """
