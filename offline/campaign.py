@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from offline.objective import (
 )
 from offline.samplers import propose
 from offline.storage import Told, open_mirror
+from offline.validation import labelled_sequences, tune
 from offline.workers import Task, Workers, run
 
 Progress = Callable[[str, int, int], None]
@@ -85,6 +87,8 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
         fixed = choose_fixed(config, verdicts)
         whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
     model = fit(study, archive, verdicts, fixed)
+    settings = tune(labelled_sequences(study, model), model.space.to_unit(model.sets))
+    model = replace(model, paired=settings)
     model.save(study.folder / "model.npz")
     finished = {
         name: [archive.finished(name)[n] for n in range(len(verdicts))] for name in study.training

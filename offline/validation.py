@@ -5,8 +5,8 @@ others; on the one left out they are given the errors that were recorded for the
 period by period.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,14 @@ from adaptune.archive import Archive
 from adaptune.descriptor import ScaledPCA, averaged
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
-from adaptune.model import RULES, ErrorModel, Rule, TrainingData
+from adaptune.model import (
+    RULES,
+    ErrorModel,
+    PairedExpectedRatio,
+    Rule,
+    Settings,
+    TrainingData,
+)
 from adaptune.model.base import mean_errors
 from adaptune.study import Study, origin
 from offline.objective import weighted
@@ -27,6 +34,14 @@ MIN_SEQUENCES = 6
 """Fewer say too little about places they are not to advise for adapting."""
 NO_WORSE = 1.05
 """A rule may not have more than this much of the fixed set's error on any sequence left out."""
+SAFE = 1.02
+"""The same for its settings, which are chosen on few sequences."""
+SETTINGS = tuple(
+    Settings(n_sets=n_sets, sharpness=sharpness)
+    for n_sets in (2, 3, 5)
+    for sharpness in (6.0, 3.0, 12.0)
+)
+"""What `tune` chooses from; of equally good ones the first."""
 
 
 class ValidationError(AdaptuneError):
@@ -72,11 +87,14 @@ class LeftOut(NamedTuple):
         For every mode the capped error in percent at each frame, of shape (n,).
     adapted : dict
         For every rule the share of periods in which it did not choose the fixed set.
+    familiarity : ndarray of shape (n,)
+        See `Selection`; NaN without a rule that tells it.
     """
 
     name: str
     errors: dict[str, NDArray[np.float64]]
     adapted: dict[str, float]
+    familiarity: NDArray[np.float64]
 
 
 @dataclass
@@ -165,32 +183,7 @@ def validate(
         If there is but one training sequence.
     """
     model = ErrorModel.load(study.folder / "model.npz")
-    archive = Archive(study.folder / "trials")
-    numbers = model.provenance["trials"]
-    objective = study.config.offline.objective[0]
-    sequences = []
-    for name in model.sequences:
-        frames = archive.read_frames(name)
-        errors = archive.read_errors(name, numbers)
-        labelled = ~np.isnan(errors).all(axis=1)
-        described = averaged(
-            frames.descriptors, frames.stamps, model.window, study.config.online.period
-        )
-        blocks = tuple(frames.blocks.values())
-        since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
-        period = (since // study.config.online.period).astype(np.int64)
-        values = [weighted(objective, archive.finished(name)[n].metrics) for n in numbers]
-        sequences.append(
-            LabelledSequence(
-                name,
-                period,
-                described[labelled],
-                errors[labelled],
-                blocks,
-                archive.read(name, 0).errors[labelled],
-                np.array(values),
-            )
-        )
+    sequences = labelled_sequences(study, model)
     validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
     rows: list[dict[str, Any]] = []
     for i, sequence in enumerate(validation.left_out):
@@ -204,10 +197,49 @@ def validate(
     return validation, rows
 
 
+def labelled_sequences(study: Study, model: ErrorModel) -> list[LabelledSequence]:
+    """The training sequences of a model, from the archive that it was fitted on."""
+    archive = Archive(study.folder / "trials")
+    period = study.config.online.period
+    numbers = model.provenance["trials"]
+    objective = study.config.offline.objective[0]
+    sequences = []
+    for name in model.sequences:
+        frames = archive.read_frames(name)
+        errors = archive.read_errors(name, numbers)
+        labelled = ~np.isnan(errors).all(axis=1)
+        described = averaged(frames.descriptors, frames.stamps, model.window, period)
+        since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
+        values = [weighted(objective, archive.finished(name)[n].metrics) for n in numbers]
+        sequences.append(
+            LabelledSequence(
+                name,
+                (since // period).astype(np.int64),
+                described[labelled],
+                errors[labelled],
+                tuple(frames.blocks.values()),
+                archive.read(name, 0).errors[labelled],
+                np.array(values),
+            )
+        )
+    return sequences
+
+
+Maker = Callable[[Sequence[LabelledSequence], NDArray[np.float64]], Rule]
+"""Makes a rule, with settings chosen on the sequences that it will be fitted on."""
+
+
+def _maker(name: str) -> Maker:
+    def make(others: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Rule:
+        return RULES[name](tune(others, sets) if name == "paired" else Settings(), 0.0)
+
+    return make
+
+
 def leave_one_out(
     sequences: Sequence[LabelledSequence],
     sets: NDArray[np.float64],
-    rules: dict[str, Callable[[], Rule]] | None = None,
+    rules: Mapping[str, Maker] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Validation:
     """Leave each sequence out in turn, with all views of it.
@@ -219,7 +251,8 @@ def leave_one_out(
     sets
         The parameter sets in the unit cube, of shape (n_sets, n_parameters).
     rules
-        By name, how to make each; those of `adaptune.model.RULES` when left out.
+        By name, how to make each; when left out, those of `adaptune.model.RULES` with settings that
+        `tune` chooses anew on the other sequences.
     progress
         Told about every sequence.
 
@@ -228,21 +261,33 @@ def leave_one_out(
     ValidationError
         If there are fewer than two sequences.
     """
-    groups = dict.fromkeys(origin(s.name) for s in sequences)
-    if len(groups) < 2:
+    if len({origin(s.name) for s in sequences}) < 2:
         raise ValidationError(
             "training: one sequence cannot be validated, for nothing remains to train on when it "
             "is left out; add sequences"
         )
+    rules = rules or {name: _maker(name) for name in RULES}
     left_out = []
-    # Views say nothing new of the place that they are of.
-    seen = [s for s in sequences if s.name in groups]
-    for i, sequence in enumerate(seen):
-        progress(i, len(seen))
-        others = [s for s in sequences if origin(s.name) != sequence.name]
-        left_out.append(_leave_out(sequence, others, sets, rules or RULES))
-    progress(len(seen), len(seen))
+    folds = _folds(sequences)
+    for i, (sequence, others) in enumerate(folds):
+        progress(i, len(folds))
+        left_out.append(_leave_out(sequence, others, sets, rules))
+    progress(len(folds), len(folds))
     return Validation(left_out)
+
+
+def _folds(
+    sequences: Sequence[LabelledSequence],
+) -> list[tuple[LabelledSequence, list[LabelledSequence]]]:
+    """Each sequence, and those that are not views of it.
+
+    Views themselves are not left out: they say nothing new of the place that they are of.
+    """
+    return [
+        (sequence, [other for other in sequences if origin(other.name) != sequence.name])
+        for sequence in sequences
+        if origin(sequence.name) == sequence.name
+    ]
 
 
 def training_data(
@@ -265,22 +310,92 @@ def _leave_out(
     sequence: LabelledSequence,
     others: Sequence[LabelledSequence],
     sets: NDArray[np.float64],
-    rules: dict[str, Callable[[], Rule]] | dict[str, type[Rule]],
+    rules: Mapping[str, Maker],
 ) -> LeftOut:
+    sequence, others, sets = _comparable(sequence, others, sets)
     data, pca = training_data(others, sets)
     features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)
-    _, first, period = np.unique(sequence.period, return_index=True, return_inverse=True)
+    first, period = _periods(sequence)
     frames = np.arange(len(capped))
     baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
     errors = {"baseline": baseline, "fixed": capped[:, data.fixed]}
-    adapted = {}
+    chosen: dict[str, NDArray[np.intp]] = {}
+    familiarity = np.full(len(first), np.nan)
     for name, make in rules.items():
-        rule = make().fit(data)
-        chosen = np.array([rule.select(features[i]).set_index for i in first])
-        errors[name] = capped[frames, chosen[period]]
-        adapted[name] = float(np.mean(chosen != data.fixed))
+        rule = make(others, sets).fit(data)
+        selections = [rule.select(features[i]) for i in first]
+        chosen[name] = np.array([selection.set_index for selection in selections])
+        errors[name] = capped[frames, chosen[name][period]]
+        if not np.isnan(selections[0].familiarity):
+            familiarity = np.array([selection.familiarity for selection in selections])
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     best = np.array([capped[period == p].mean(axis=0).argmin() for p in range(len(first))])
     errors["oracle, period"] = capped[frames, best[period]]
-    return LeftOut(sequence.name, errors, adapted)
+    adapted = {name: float(np.mean(sets != data.fixed)) for name, sets in chosen.items()}
+    return LeftOut(sequence.name, errors, adapted, familiarity[period])
+
+
+def _comparable(
+    sequence: LabelledSequence, others: Sequence[LabelledSequence], sets: NDArray[np.float64]
+) -> tuple[LabelledSequence, list[LabelledSequence], NDArray[np.float64]]:
+    """All of it for those sets only that were run on the sequence left out: others tell nothing."""
+    run = ~np.isnan(sequence.errors).any(axis=0)
+    if run.all():
+        return sequence, list(others), sets
+    few = [
+        replace(s, errors=s.errors[:, run], values=None if s.values is None else s.values[run])
+        for s in (sequence, *others)
+    ]
+    return few[0], [s for s in few[1:] if not np.isnan(s.errors).all()], sets[run]
+
+
+def _periods(sequence: LabelledSequence) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First frame of every period, and number of every frame's period among them."""
+    _, first, period = np.unique(sequence.period, return_index=True, return_inverse=True)
+    return first, period
+
+
+def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Settings:
+    """Choose the settings of the paired rule, leaving each of these sequences out in turn.
+
+    Of the settings with which it was nowhere worse than the fixed set by more than `SAFE`, those
+    with the least geometric mean; where there are none, those with which it always takes the fixed
+    set. Of fewer than `MIN_SEQUENCES` sequences nothing is concluded: the usual settings.
+
+    Parameters
+    ----------
+    sequences
+        Those that the rule will be fitted on, and no others.
+    sets
+        The parameter sets in the unit cube, of shape (n_sets, n_parameters).
+    """
+    folds = _folds(sequences)
+    if len(folds) < MIN_SEQUENCES:
+        return Settings()
+    logs = np.array([_tried(sequence, others, sets, SETTINGS) for sequence, others in folds])
+    means = np.where(logs.max(axis=0) <= np.log(SAFE), logs.mean(axis=0), np.inf)
+    best = int(np.argmin(means))
+    return SETTINGS[best] if means[best] < 0.0 else Settings(n_sets=1)
+
+
+def _tried(
+    sequence: LabelledSequence,
+    others: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    settings: Sequence[Settings],
+) -> list[float]:
+    """With each of the settings, logarithm of the ratio to the fixed set's error."""
+    sequence, others, sets = _comparable(sequence, others, sets)
+    data, pca = training_data(others, sets)
+    rule = PairedExpectedRatio(settings[0]).fit(data)
+    first, period = _periods(sequence)
+    evidence = [rule.evidence(x) for x in pca.transform(sequence.descriptors[first])]
+    capped = cap(sequence.errors)
+    logs = []
+    for some in settings:
+        rule.configure(some)
+        chosen = np.array([rule.choose(e).set_index for e in evidence])
+        errors = capped[np.arange(len(capped)), chosen[period]]
+        logs.append(float(np.log(errors.mean() / capped[:, data.fixed].mean())))
+    return logs

@@ -72,7 +72,7 @@ class Replay:
     seconds: float
 
 
-def adaptive(model: ErrorModel, rule: str) -> Policy:
+def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
     """A policy that asks an error model.
 
     Parameters
@@ -81,9 +81,11 @@ def adaptive(model: ErrorModel, rule: str) -> Policy:
         Fitted offline.
     rule
         One of `adaptune.model.RULES`.
+    price
+        What a switch must promise, as a share of the fixed set's error.
     """
     pca = model.pca()
-    fitted = RULES[rule]().fit(model.training_data(pca))
+    fitted = RULES[rule](model.paired, price).fit(model.training_data(pca))
     describe = Describer(model.blocks)
     if describe.blocks != model.blocks:
         raise DescriptorError(
@@ -91,15 +93,20 @@ def adaptive(model: ErrorModel, rule: str) -> Policy:
             f"{describe.blocks}; run `adaptune offline` again"
         )
     last: deque[NDArray[np.float32]] = deque(maxlen=model.window)
+    current: int | None = None
 
     def select(scan: Scan) -> Selection:
+        nonlocal current
         last.append(describe(scan))
         mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
-        return fitted.select(pca.transform(mean.astype(np.float32))[0])
+        selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
+        current = selection.set_index
+        return selection
 
     # The first call loads compiled code; the robot should not wait for that.
     select(Scan(0, np.zeros((0, 3), np.float32)))
     last.clear()
+    current = None
     return select
 
 
@@ -244,13 +251,12 @@ def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None
         beside.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
-        writer.writerow(
-            ["stamp_ns", "set", "predicted_error_percent", "predicted_fixed_percent", "ms", *names]
-        )
+        columns = "stamp_ns set predicted_error_percent predicted_fixed_percent"
+        writer.writerow([*columns.split(), "familiarity", "sequences", "ms", *names])
         for choice in result.choices:
-            index, error, fixed = choice.selection
+            index, *numbers = choice.selection
             writer.writerow(
-                [choice.stamp, index, f"{error:.4f}", f"{fixed:.4f}", f"{1e3 * choice.seconds:.3f}"]
+                [choice.stamp, index, *(f"{x:.4f}" for x in numbers), f"{1e3 * choice.seconds:.3f}"]
                 + [choice.parameters[name] for name in names]
             )
     with (

@@ -1,13 +1,21 @@
 """The error model: from what a scan looks like to the parameter set with the least error."""
 
+from collections.abc import Callable
+
 from adaptune.model.base import Rule, Selection, TrainingData
 from adaptune.model.file import ErrorModel, ModelError
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
-from adaptune.model.paired import PairedExpectedRatio
+from adaptune.model.paired import PairedExpectedRatio, Settings
 from adaptune.model.portfolio import portfolio, restrict
 
-RULES: dict[str, type[Rule]] = {"paired": PairedExpectedRatio, "paper": NearestNeighbours}
-"""Selection rules by name; the first is the default."""
+RULES: dict[str, Callable[[Settings, float], Rule]] = {
+    "paired": PairedExpectedRatio,
+    "paper": lambda *_: NearestNeighbours(),
+}
+"""By name, how to make a selection rule of the settings it may heed and of the price of a switch.
+
+The first is the default.
+"""
 
 __all__ = [
     "RULES",
@@ -18,6 +26,7 @@ __all__ = [
     "ProductKNeighborsRegressor",
     "Rule",
     "Selection",
+    "Settings",
     "TrainingData",
     "portfolio",
     "restrict",

@@ -70,6 +70,45 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     return np.asarray(np.mean(means, axis=0))
 
 
+def complementary(
+    errors: NDArray[np.floating], sequence: NDArray[np.intp], fixed: int, size: int
+) -> list[int]:
+    """Choose sets so that at every training frame one of them does well.
+
+    Greedily, beginning with the fixed set: each next one lowers the mean error most if the best of
+    the chosen ones could be known at every frame.
+
+    Parameters
+    ----------
+    errors
+        Percent, of shape (n_frames, n_sets); NaN where a set was never run, where it lowers
+        nothing.
+    sequence
+        Number of each frame's sequence, of shape (n_frames,).
+    fixed
+        The fixed set.
+    size
+        How many to choose; fewer where more would lower nothing.
+
+    Returns
+    -------
+    list of int
+        Numbers of the sets, the fixed one first.
+    """
+    capped = np.where(np.isnan(errors), np.inf, cap(errors))
+    chosen = [fixed]
+    least = capped[:, fixed]
+    while len(chosen) < size:
+        means = mean_errors(np.minimum(capped, least[:, None]), sequence)
+        best = int(np.argmin(means))
+        # A set that is chosen already, as the fixed one, lowers nothing.
+        if not means[best] < means[fixed]:
+            break
+        chosen.append(best)
+        least = np.minimum(least, capped[:, best])
+    return chosen
+
+
 class Selection(NamedTuple):
     """The set chosen for a scan.
 

@@ -19,6 +19,7 @@ from adaptune.descriptor import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.model.base import TrainingData
+from adaptune.model.paired import Settings
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
 FORMAT = 2
@@ -53,6 +54,7 @@ class _Header(BaseModel):
     sequences: list[str]
     blocks: dict[str, PositiveInt]
     window: PositiveInt
+    paired: Settings = Settings()
     provenance: dict[str, Any]
     validation: dict[str, Any]
 
@@ -87,6 +89,8 @@ class ErrorModel:
         float32 percent, infinite where the track was lost, NaN where the set was never run.
     provenance : dict
         Where the model comes from, for people.
+    paired : Settings
+        Of the paired rule, chosen on the training sequences.
     validation : dict
         By selection rule what `adaptune validate` found, for people; empty before.
     """
@@ -103,6 +107,7 @@ class ErrorModel:
     sequence: NDArray[np.intp]
     errors: NDArray[np.float32]
     provenance: dict[str, Any]
+    paired: Settings = field(default_factory=Settings)
     validation: dict[str, Any] = field(default_factory=dict)
 
     def pca(self) -> ScaledPCA:
@@ -136,6 +141,7 @@ class ErrorModel:
             "sequences": self.sequences,
             "blocks": self.blocks,
             "window": self.window,
+            "paired": self.paired.model_dump(),
         }
 
     @property
@@ -188,6 +194,7 @@ class ErrorModel:
                     sequence=_read(file, size, "sequence").astype(np.intp),
                     errors=_read(file, size, "errors"),
                     provenance=header.provenance,
+                    paired=header.paired,
                     validation=header.validation,
                 )
                 model.check()

@@ -204,7 +204,11 @@ class NearestNeighbours(Rule):
         """See `Rule.predict`."""
         return self.regressor_.predict_one(feature)
 
-    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:  # noqa: ARG002
+    def select(
+        self,
+        feature: NDArray[np.float64],
+        current: int | None = None,  # noqa: ARG002
+    ) -> Selection:
         """See `Rule.select`."""
         predicted = self.predict(feature)
         index = int(np.argmin(predicted))

@@ -1,24 +1,31 @@
 """Selection by the paired expected ratio."""
 
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+)
 
 from adaptune.metrics import FAILURE
-from adaptune.model.base import Rule, Selection, TrainingData
+from adaptune.model.base import Rule, Selection, TrainingData, complementary
 from adaptune.model.knn import nearest_frames
-from adaptune.model.portfolio import complementary
 
 ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
 NOVEL = 0.1
 """What is farther from all training than this share of it is from the rest counts less and less."""
-_QUANTILES = 100
+_QUANTILES = 25
 """By which each training sequence tells how far its frames are from the other sequences."""
 
 
-class Settings(NamedTuple):
+class Settings(BaseModel):
     """Settings of the paired rule.
 
     Attributes
@@ -36,11 +43,13 @@ class Settings(NamedTuple):
         Logarithm of the ratio that a set must stay below to be taken.
     """
 
-    n_sets: int | None = 2
-    sharpness: float = 6.0
-    width: float = 0.05
-    n_frames: int = 30
-    threshold: float = -0.1
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    n_sets: PositiveInt | None = 2
+    sharpness: NonNegativeFloat = 6.0
+    width: PositiveFloat = 0.05
+    n_frames: PositiveInt = 30
+    threshold: Annotated[float, Field(le=0.0)] = -0.1
 
 
 class Evidence(NamedTuple):
@@ -101,8 +110,8 @@ class PairedExpectedRatio(Rule):
         return self.configure(self.settings)
 
     def configure(self, settings: Settings) -> Self:
-        """Change the settings of a fitted rule, but for `n_frames`, on which its fit rests."""
-        self.settings = settings._replace(n_frames=self.settings.n_frames)
+        """Change the settings of a fitted rule, but for `n_frames`, which `evidence` rests on."""
+        self.settings = settings
         data = self.data_
         n_sets = len(data.sets) if settings.n_sets is None else settings.n_sets
         self.candidates_ = np.arange(len(data.sets))

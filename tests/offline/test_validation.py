@@ -1,10 +1,10 @@
-import dataclasses
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from adaptune.model import Selection
+from adaptune.model import Selection, Settings
 from adaptune.model.base import Rule
 from adaptune.study import load_study
 from offline.campaign import train
@@ -15,6 +15,7 @@ from offline.validation import (
     ValidationError,
     leave_one_out,
     training_data,
+    tune,
     validate,
 )
 
@@ -59,7 +60,7 @@ class Cheat(Rule):
     def predict(self, feature):
         raise NotImplementedError
 
-    def select(self, _feature):
+    def select(self, _feature, _current=None):
         return Selection(0, 0.0, 0.0)
 
 
@@ -70,7 +71,7 @@ def test_the_sequence_left_out_is_never_seen():
         for i, s in enumerate(sequences)
     ]
     Cheat.fitted = ()
-    leave_one_out(marked, SETS, {"cheat": Cheat})
+    leave_one_out(marked, SETS, {"cheat": lambda *_: Cheat()})
     for i, data in enumerate(Cheat.fitted):
         seen = {e.tobytes() for e in data.errors}
         assert not seen & {e.tobytes() for e in marked[i].errors}
@@ -81,12 +82,12 @@ def test_a_selection_holds_for_its_second():
     asked = []
 
     class Remember(Cheat):
-        def select(self, feature):
+        def select(self, feature, _current=None):
             asked.append(feature)
             return Selection(len(asked) % 2, 0.0, 0.0)
 
     sequences = two_kinds(np.random.default_rng(2))[:2]
-    validation = leave_one_out(sequences, SETS, {"r": Remember})
+    validation = leave_one_out(sequences, SETS, {"r": lambda *_: Remember()})
     assert len(asked) == 2 * 8
     expected = np.where(np.arange(80) // 10 % 2 == 0, 1, 0)
     np.testing.assert_allclose(
@@ -114,10 +115,36 @@ def test_the_oracle_is_never_worse_than_anything():
 )
 def test_verdicts(ratios, verdict):
     left_out = [
-        LeftOut(str(i), {"fixed": np.ones(9), "rule": np.full(9, r)}, {})
+        LeftOut(str(i), {"fixed": np.ones(9), "rule": np.full(9, r)}, {}, np.ones(9))
         for i, r in enumerate(ratios)
     ]
     assert Validation(left_out).verdict("rule").startswith(verdict)
+
+
+def test_settings_are_chosen_on_the_sequences_at_hand():
+    sequences = two_kinds(np.random.default_rng(0))
+    # Set 2 everywhere, 0 in one kind of place and 4 in the other.
+    assert tune(sequences, SETS) == Settings(n_sets=3)
+    # Where nothing is to be gained anywhere, nothing is tried.
+    same = [replace(s, errors=np.ones_like(s.errors)) for s in sequences]
+    assert tune(same, SETS) == Settings(n_sets=1)
+    # The last set is good in half of the sequences, and nothing tells which.
+    rng = np.random.default_rng(5)
+    random = [
+        sequence(str(i), [9.0, 9.0, 1.0, 9.0, 0.5 if i % 2 else 2.5], 0, rng) for i in range(8)
+    ]
+    assert tune(random, SETS) == Settings(n_sets=1)
+    assert tune(sequences[:5], SETS) == Settings()
+
+
+def test_a_sequence_left_out_is_judged_on_the_sets_it_has_seen():
+    sequences = two_kinds(np.random.default_rng(0))
+    for i, s in enumerate(sequences):
+        s.errors[:, 1 + i % 2 * 2] = np.nan
+    validation = leave_one_out(sequences, SETS)
+    for mode, ratios in validation.ratios.items():
+        assert np.isfinite(ratios).all(), mode
+    np.testing.assert_allclose(validation.ratios["paired"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
 
 
 def test_one_sequence_cannot_be_validated():
@@ -128,11 +155,11 @@ def test_one_sequence_cannot_be_validated():
 def test_a_sequence_is_left_out_with_its_views():
     sequences = two_kinds(np.random.default_rng(4))[:3]
     seen = [
-        dataclasses.replace(s, name=f"{s.name}+noise", errors=s.errors + np.float32(100 + i))
+        replace(s, name=f"{s.name}+noise", errors=s.errors + np.float32(100 + i))
         for i, s in enumerate(sequences)
     ]
     Cheat.fitted = ()
-    validation = leave_one_out([*sequences, *seen], SETS, {"cheat": Cheat})
+    validation = leave_one_out([*sequences, *seen], SETS, {"cheat": lambda *_: Cheat()})
     assert [s.name for s in validation.left_out] == [s.name for s in sequences]
     for i, data in enumerate(Cheat.fitted):
         fitted = {e.tobytes() for e in data.errors}
@@ -145,7 +172,7 @@ def test_a_sequence_is_left_out_with_its_views():
 def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
     sequences = two_kinds(np.random.default_rng(5))
     for value, expected in (([5, 4, 3, 2, 1], 4), ([np.inf, 1, 2, 3, 4], 1)):
-        judged = [dataclasses.replace(s, values=np.array(value, float)) for s in sequences]
+        judged = [replace(s, values=np.array(value, float)) for s in sequences]
         data, _ = training_data(judged, SETS)
         assert data.fixed == expected
 

@@ -71,7 +71,7 @@ def test_the_least_prediction_is_chosen(seed):
     feature = np.random.default_rng(seed).normal(size=4)
     predicted = rule.predict(feature)
     selection = rule.select(feature)
-    assert selection == (predicted.argmin(), predicted.min(), predicted[data.fixed])
+    assert selection[:3] == (predicted.argmin(), predicted.min(), predicted[data.fixed])
     assert isinstance(selection.set_index, int)
 
 
@@ -103,7 +103,7 @@ def test_a_single_set_and_frame():
         np.full((1, 2), 0.4),
         0,
     )
-    assert NearestNeighbours().fit(data).select(np.ones(3)) == (0, 2.5, 2.5)
+    assert NearestNeighbours().fit(data).select(np.ones(3))[:3] == (0, 2.5, 2.5)
 
 
 @modest

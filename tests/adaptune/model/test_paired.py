@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptune.model import RULES, PairedExpectedRatio, TrainingData
+from adaptune.model import RULES, PairedExpectedRatio, Settings, TrainingData
+from adaptune.model.base import complementary
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -30,15 +31,14 @@ def random_data(seed, n_frames, n_sets, n_sequences=3, n_features=3, n_parameter
     )
 
 
-def plain_ratios(data, feature, m, h, tau):
-    """Expected ratio of every set, and the fixed set's expected error, in plain loops."""
-    n_sets = len(data.sets)
+def plain_evidence(data, feature, m, sequences):
+    """For each sequence: distance, ratio of every set, and the fixed set's error, in loops."""
 
     def error(i, j):
         return min(float(data.errors[i, j]), 30.0)
 
     distances, ratios, fixed = [], [], []
-    for s in sorted(set(data.sequence.tolist())):
+    for s in sequences:
         frames = [i for i in range(len(data.features)) if data.sequence[i] == s]
         frames.sort(key=lambda i: (math.dist(data.features[i], feature), i))
         frames = frames[:m]
@@ -47,21 +47,46 @@ def plain_ratios(data, feature, m, h, tau):
         ratios.append(
             [
                 sum((error(i, j) + 0.02) / (error(i, data.fixed) + 0.02) for i in frames) / n
-                for j in range(n_sets)
+                for j in range(len(data.sets))
             ]
         )
         fixed.append(sum(error(i, data.fixed) for i in frames) / n)
+    return distances, ratios, fixed
+
+
+def plain_familiarity(data, distance, m):
+    """Share of training that is farther from other sequences than `distance`, in loops."""
+    names = sorted(set(data.sequence.tolist()))
+    if len(names) < 2:
+        return 1.0
+    far = []
+    for s in names:
+        own = [x for x, of in zip(data.features, data.sequence, strict=True) if of == s]
+        others = [o for o in names if o != s]
+        some = own[:: max(1, len(own) // 25)]
+        nearest = [min(plain_evidence(data, x, m, others)[0]) for x in some]
+        far.extend(np.quantile(nearest, [(q + 0.5) / 25 for q in range(25)]))
+    return sum(f >= distance for f in far) / len(far)
+
+
+def plain_ratios(data, feature, m, h, tau):
+    """Expected ratio of every set, and the fixed set's expected error, in plain loops."""
+    names = sorted(set(data.sequence.tolist()))
+    distances, ratios, fixed = plain_evidence(data, feature, m, names)
     middle = statistics.median(distances)
     weights = [math.exp(-tau * (a - min(distances)) / middle) for a in distances]
     weights = [w / sum(weights) for w in weights]
+    n_sets = len(data.sets)
     mixed = [sum(w * r[j] for w, r in zip(weights, ratios, strict=True)) for j in range(n_sets)]
+    familiar = min(1.0, plain_familiarity(data, min(distances), m) / 0.1)
     smooth = []
     for j in range(n_sets):
         kernel = [
             math.exp(-0.5 * math.dist(data.sets[j], data.sets[l]) ** 2 / h**2)
             for l in range(n_sets)  # noqa: E741
         ]
-        smooth.append(sum(k * r for k, r in zip(kernel, mixed, strict=True)) / sum(kernel))
+        ratio = sum(k * r for k, r in zip(kernel, mixed, strict=True)) / sum(kernel)
+        smooth.append(1.0 + familiar * (ratio - 1.0))
     return smooth, sum(w * f for w, f in zip(weights, fixed, strict=True))
 
 
@@ -75,26 +100,37 @@ def plain_ratios(data, feature, m, h, tau):
 )
 def test_it_follows_its_definition(seed, n_frames, n_sets, n_sequences, constants):
     data = random_data(seed, n_frames, n_sets, n_sequences)
-    rule = PairedExpectedRatio(*constants).fit(data)
+    m, h, tau = constants
+    rule = PairedExpectedRatio(Settings(n_sets=None, n_frames=m, width=h, sharpness=tau)).fit(data)
     for feature in np.random.default_rng(seed).normal(size=(3, 3)):
         ratio, fixed = plain_ratios(data, feature, *constants)
         np.testing.assert_allclose(rule.predict(feature), np.multiply(ratio, fixed), rtol=1e-6)
+        ratio[data.fixed] = 1.0
         best = int(np.argmin(ratio))
         selection = rule.select(feature)
         assert selection.predicted_fixed == pytest.approx(fixed, rel=1e-6)
-        if math.log(ratio[best]) < -0.1:
-            assert selection.set_index == best
-            assert selection.predicted_error == pytest.approx(ratio[best] * fixed, rel=1e-6)
-        else:
-            assert selection.set_index == data.fixed
-            assert selection.predicted_error == pytest.approx(fixed, rel=1e-6)
+        chosen = best if math.log(ratio[best]) < -0.1 else data.fixed
+        assert selection.set_index == chosen
+        assert selection.predicted_error == pytest.approx(ratio[chosen] * fixed, rel=1e-6)
+
+
+@modest
+@given(seeds, st.integers(10, 60), st.integers(2, 8), st.integers(1, 4))
+def test_it_chooses_among_complementary_sets(seed, n_frames, n_sets, n_sequences):
+    data = random_data(seed, n_frames, n_sets, n_sequences)
+    few = complementary(data.errors, data.sequence, data.fixed, 2)
+    rule = PairedExpectedRatio(Settings(n_sets=2)).fit(data)
+    predicted = rule.predict(np.zeros(3))
+    assert np.isfinite(predicted[few]).all()
+    assert np.isinf(np.delete(predicted, few)).all()
+    assert rule.select(np.zeros(3)).set_index in few
+    assert rule.configure(Settings(n_sets=1)).select(np.zeros(3)).set_index == data.fixed
 
 
 def test_its_constants():
-    rule = PairedExpectedRatio()
-    assert (rule.n_frames, rule.width, rule.sharpness, rule.threshold) == (30, 0.12, 3.0, -0.1)
+    assert tuple(Settings().model_dump().values()) == (2, 6.0, 0.05, 30, -0.1)
     assert next(iter(RULES)) == "paired"
-    assert RULES["paired"] is PairedExpectedRatio
+    assert isinstance(RULES["paired"](Settings(), 0.0), PairedExpectedRatio)
 
 
 def two_sets(fixed, other, n=40):
@@ -168,7 +204,80 @@ def test_neighbouring_sets_share_their_evidence():
     sets = np.array([[0.0, 0.0], [0.5, 0.5], [0.55, 0.5], [0.9, 0.9], [0.9, 0.95], [0.95, 0.9]])
     data = TrainingData(np.zeros((30, 2)), np.zeros(30, int), errors, sets, 0)
     # Set 1 is the best by itself, but next to a cliff.
-    assert PairedExpectedRatio().fit(data).select(np.zeros(2)).set_index in {3, 4, 5}
+    rule = PairedExpectedRatio(Settings(n_sets=None)).fit(data)
+    assert rule.select(np.zeros(2)).set_index in {3, 4, 5}
+
+
+def test_a_sequence_says_nothing_of_sets_it_has_not_seen():
+    n = 40
+    errors = np.ones((2 * n, 3), np.float32)
+    errors[:n, 1], errors[n:, 1] = 0.5, np.nan
+    errors[:n, 2], errors[n:, 2] = 0.6, 0.6
+    data = TrainingData(
+        np.zeros((2 * n, 2)),
+        np.repeat([0, 1], n),
+        errors,
+        np.array([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
+        0,
+    )
+    rule = PairedExpectedRatio(Settings(n_sets=None)).fit(data)
+    # Half of the evidence, of 0.52 / 1.02, and half of 1; against 0.62 / 1.02 on all of it.
+    np.testing.assert_allclose(
+        rule.predict(np.zeros(2)), [1.0, 0.5 * (0.52 / 1.02 + 1.0), 0.62 / 1.02], rtol=1e-6
+    )
+    assert rule.select(np.zeros(2)).set_index == 2
+
+
+def test_evidence_on_a_near_set_counts():
+    n = 30
+    errors = np.ones((2 * n, 3), np.float32)
+    errors[:n, 1], errors[n:, 1] = 0.5, np.nan
+    errors[:n, 2], errors[n:, 2] = np.nan, 0.5
+    sets = np.array([[0.0, 0.0], [0.5, 0.5], [0.5, 0.51]])
+    data = TrainingData(np.zeros((2 * n, 2)), np.repeat([0, 1], n), errors, sets, 0)
+    predicted = PairedExpectedRatio(Settings(n_sets=None)).fit(data).predict(np.zeros(2))
+    # Smoothing halves what is known of each, and takes the other sequence's half from its twin.
+    assert predicted[1] == pytest.approx(0.5 * (0.52 / 1.02 + 1.0), rel=0.01)
+
+
+def test_beyond_all_training_it_takes_the_fixed_set():
+    rng = np.random.default_rng(0)
+    n = 50
+    errors = np.tile(np.array([[1.0, 0.5]], np.float32), (4 * n, 1))
+    features = np.concatenate([rng.normal(s, 1.0, (n, 2)) for s in range(4)])
+    data = TrainingData(
+        features, np.repeat(np.arange(4), n), errors, np.array([[0.0, 0.0], [1.0, 1.0]]), 0
+    )
+    rule = PairedExpectedRatio().fit(data)
+    near, far = rule.select(np.full(2, 1.5)), rule.select(np.full(2, 50.0))
+    assert near.set_index == 1
+    assert near.familiarity > 0.5
+    assert (far.set_index, far.familiarity) == (0, 0.0)
+    # In between it trusts the ratio less and less.
+    along = [rule.select(np.full(2, x)) for x in np.linspace(4.0, 9.0, 30)]
+    ratios = [s.predicted_error / s.predicted_fixed for s in along]
+    assert np.all(np.diff([s.familiarity for s in along]) <= 0.0)
+    assert np.all(np.diff(ratios) >= -1e-9)
+    assert len(set(np.round(ratios, 6))) > 2
+
+
+def test_a_switch_must_pay():
+    data = two_sets(1.0, 0.8)
+    data.errors[:, 1] = 0.8
+    rule = PairedExpectedRatio(price=0.3).fit(data)
+    assert rule.select(np.zeros(2)).set_index == 1
+    assert rule.select(np.zeros(2), current=0).set_index == 0
+    assert rule.select(np.zeros(2), current=1).set_index == 1
+    cheap = PairedExpectedRatio(price=0.1).fit(data)
+    assert cheap.select(np.zeros(2), current=0).set_index == 1
+    # A set that is not among those chosen from is left whatever it costs.
+    assert rule.select(np.zeros(2), current=7).set_index == 1
+
+
+def test_it_says_how_many_sequences_it_rests_on():
+    assert PairedExpectedRatio().fit(two_sets(1.0, 0.5)).select(np.zeros(2)).sequences == 1.0
+    data = random_data(3, 80, 4, n_sequences=4)
+    assert 1.0 < PairedExpectedRatio().fit(data).select(np.zeros(3)).sequences <= 4.0
 
 
 def test_a_scan_from_nowhere_gets_an_answer():
