@@ -5,6 +5,8 @@ PointCloud2 messages, which it does not document: hence the pinned version.
 """
 
 import contextlib
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
@@ -12,21 +14,25 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
-from adaptune.sequence import Scan
+from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value, nearest
 
 MIN_POINTS = 20
+GRAVITY = 9.80665
 
-POINT: Any = np.dtype(
-    {
-        "names": ["x", "y", "z", "t", "row", "col"],
-        "formats": ["<f4", "<f4", "<f4", "<u4", "<u2", "<u2"],
-    }
-)
-"""A point as evalio reads it: metres, nanoseconds since the scan's stamp, laser and firing."""
+_BEHIND = 2
+"""Scans that LIO-SAM waits for before it registers one."""
+
+_SMOOTH = 3
+"""Scans over which the velocity is taken that carries its poses on."""
+
+FIELDS = ("x", "y", "z", "t", "row")
+"""A point as evalio reads it, four bytes each: float32 metres, uint32 nanoseconds since the scan's
+stamp, uint32 laser. The laser is left out where the pipeline does not ask for it."""
 
 
 class Settings(BaseSettings):
@@ -49,7 +55,7 @@ class Settings(BaseSettings):
 
 
 class GridSettings(Settings):
-    """Settings of pipelines that want scans as complete images.
+    """Settings of pipelines that see scans as images.
 
     Attributes
     ----------
@@ -72,28 +78,33 @@ class Prepared:
     Attributes
     ----------
     stamp : int
-    cloud : ndarray of `POINT`, of shape (rows, columns)
-        One row, where the pipeline does not want an image.
+    cloud : ndarray of shape (n, 4) or (n, 5)
+        float32, the last columns holding bytes of uint32, see `FIELDS`; of an image, row by row.
+    shape : tuple of int
+        Rows and columns.
     size : int
         Number of points in range.
     timed : bool
         Whether the points have times that differ.
+    imu : Imu, optional
     """
 
     stamp: int
-    cloud: NDArray[Any]
+    cloud: NDArray[np.float32]
+    shape: tuple[int, int]
     size: int
     timed: bool
+    imu: Imu | None
 
     @property
     def nbytes(self) -> int:
         """Memory, in bytes."""
-        return 256 + self.cloud.nbytes
+        return 256 + self.cloud.nbytes + (0 if self.imu is None else self.imu.nbytes)
 
 
 @cache
 def _evalio() -> Any:
-    """The modules of evalio that are needed, and the description of `POINT`.
+    """The modules of evalio that are needed, and the description of `FIELDS`.
 
     Raises
     ------
@@ -107,14 +118,10 @@ def _evalio() -> Any:
         raise OdometryError(
             f"evalio cannot be imported ({error}); run `pip install 'adaptune[evalio]'`"
         ) from error
-    kinds = {
-        "f": helpers.DataType.FLOAT32,
-        "I": helpers.DataType.UINT32,
-        "H": helpers.DataType.UINT16,
-    }
+    kinds = (*(helpers.DataType.FLOAT32,) * 3, *(helpers.DataType.UINT32,) * 2)
     fields = [
-        helpers.Field(name=name, datatype=kinds[POINT[name].char], offset=POINT.fields[name][1])
-        for name in POINT.names
+        helpers.Field(name=name, datatype=kind, offset=4 * i)
+        for i, (name, kind) in enumerate(zip(FIELDS, kinds, strict=True))
     ]
     return pipelines, types, helpers, fields
 
@@ -128,7 +135,8 @@ class Pipeline(Odometry):
     """A pipeline of evalio (Potokar and Kaess).
 
     Pipelines read their parameters only when they begin, and begin at rest. The pose is that of
-    the moment to which the pipeline brings the scan, its start or its end.
+    the moment to which the pipeline brings the scan, its start or its end. Those with an IMU give
+    poses of the IMU, which become the LiDAR's here.
 
     Attributes
     ----------
@@ -174,25 +182,24 @@ class Pipeline(Odometry):
 
     def prepare(self, scan: Scan) -> Prepared:
         """See `Odometry.prepare`."""
-        cloud, size = self._layout(self._crop(scan))
-        times = cloud["t"]
-        return Prepared(scan.stamp, cloud, size, bool(size) and int(times.max()) > int(times.min()))
+        if self.needs_imu and scan.imu is None:
+            raise OdometryError(
+                f"{self.pipeline} needs an IMU, and the scans do not bring along what one measured"
+            )
+        cropped = self._crop(scan)
+        cloud, shape = self._layout(cropped)
+        timed = cropped.times is not None and bool(np.ptp(cropped.times) if len(cropped) else 0)
+        return Prepared(scan.stamp, cloud, shape, len(cropped), timed, scan.imu)
 
     def _crop(self, scan: Scan) -> Scan:
         squared = np.einsum("ij,ij->i", scan.points, scan.points)
         low, high = self.settings.min_range, self.settings.max_range
-        return scan.select((squared >= low * low) & (squared <= high * high))
+        kept = (squared >= low * low) & (squared <= high * high)
+        return scan if kept.all() else scan.select(kept)
 
-    def _layout(self, scan: Scan) -> tuple[NDArray[Any], int]:
-        """Points as `POINT`, and how many they are."""
-        cloud = np.zeros((1, len(scan)), POINT)
-        for axis, values in zip("xyz", scan.points.T, strict=True):
-            cloud[axis] = values
-        if scan.times is not None:
-            cloud["t"] = nanoseconds(scan.times)
-        if scan.rings is not None:
-            cloud["row"] = scan.rings
-        return cloud, len(scan)
+    def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        """Points as `FIELDS` has them, and how many rows and columns they are."""
+        return _cloud(scan, 4), (1, len(scan))
 
     def start(
         self,
@@ -210,7 +217,7 @@ class Pipeline(Odometry):
     def _begin(self, prepared: Prepared) -> None:
         """Make a new pipeline, whose own frame is that of its first estimate."""
         pipelines, types, *_ = _evalio()
-        self._shape = prepared.cloud.shape
+        self._shape = prepared.shape
         parameters = self._defaults | self.untuned | self._given
         if "deskew" in self._defaults and "deskew" not in self.settings.parameters:
             parameters["deskew"] = self.settings.deskew and prepared.timed
@@ -226,16 +233,23 @@ class Pipeline(Odometry):
                 max_range=self.settings.max_range,
             )
         )
-        pipeline.set_imu_T_lidar(types.SE3.identity())
+        self._T_imu_sensor = np.eye(4)
+        if prepared.imu is not None:
+            self._T_imu_sensor = invert(prepared.imu.T_sensor_imu)
+            pipeline.set_imu_params(_imu_parameters(prepared.imu))
+        pipeline.set_imu_T_lidar(types.SE3.from_mat(self._T_imu_sensor))
         pipeline.initialize()
         self._pipeline = pipeline
         self._T_odom_own: Poses | None = None
+        self._measure(prepared.imu)
         self._add(prepared)
 
     def register(self, prepared: Prepared) -> Registration:
         """See `Odometry.register`."""
         T_odom_previous = self._T_odom_sensor
         self._T_odom_sensor = T_odom_previous @ self._T_previous_current
+        if self._pipeline is not None:
+            self._measure(prepared.imu)
         if prepared.size < MIN_POINTS:
             return Registration(self._T_odom_sensor, registered=False)
         if self._pipeline is None:
@@ -245,32 +259,76 @@ class Pipeline(Odometry):
         self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
         return Registration(self._T_odom_sensor)
 
+    def _measure(self, imu: Imu | None) -> None:
+        """Hand over what the IMU measured."""
+        if imu is None or not self.needs_imu:
+            return
+        types = _evalio()[1]
+        for stamp, gyro, acceleration in zip(
+            imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True
+        ):
+            self._pipeline.add_imu(
+                types.ImuMeasurement(types.Stamp.from_nsec(stamp), gyro, acceleration)
+            )
+
     def _add(self, prepared: Prepared) -> bool:
         """Hand a scan over, and tell whether a pose came back."""
-        _, types, helpers, fields = _evalio()
-        size, itemsize = prepared.cloud.size, POINT.itemsize
-        layout = helpers.PointCloudMetadata(
-            stamp=types.Stamp.from_nsec(prepared.stamp),
-            width=size,
-            height=1,
-            point_step=itemsize,
-            row_step=size * itemsize,
-            is_bigendian=0,
-            is_dense=1,
-        )
-        self._pipeline.add_lidar(helpers.pc2_to_evalio(layout, fields, prepared.cloud.tobytes()))
-        estimates = self._pipeline.saved_estimates()
-        if not estimates:
+        T_own_sensor = self._estimate(prepared)
+        if T_own_sensor is None:
             return False
-        T_own_sensor = estimates[-1][1].to_mat()
         if self._T_odom_own is None:
             self._T_odom_own = self._T_odom_sensor @ invert(T_own_sensor)
         self._T_odom_sensor = self._T_odom_own @ T_own_sensor
         return True
 
+    def _estimate(self, prepared: Prepared) -> Poses | None:
+        """Hand a scan over, and take the last pose that comes back."""
+        _, types, helpers, fields = _evalio()
+        size, n_fields = prepared.cloud.shape
+        layout = helpers.PointCloudMetadata(
+            stamp=types.Stamp.from_nsec(prepared.stamp),
+            width=size,
+            height=1,
+            point_step=4 * n_fields,
+            row_step=4 * n_fields * size,
+            is_bigendian=0,
+            is_dense=1,
+        )
+        cloud = helpers.pc2_to_evalio(layout, fields[:n_fields], prepared.cloud.tobytes())
+        self._pipeline.add_lidar(cloud)
+        estimates = self._pipeline.saved_estimates()
+        if not estimates:
+            return None
+        T_own_imu: Poses = estimates[-1][1].to_mat()
+        return T_own_imu @ self._T_imu_sensor
 
-class _Grid(Pipeline):
-    """A pipeline that wants a complete image of rows x columns, and ends the process otherwise."""
+
+def _cloud(scan: Scan, n_fields: int) -> NDArray[np.float32]:
+    """Points with the first so many of `FIELDS`."""
+    cloud = np.empty((len(scan), n_fields), np.float32)
+    cloud[:, :3] = scan.points
+    whole = cloud.view(np.uint32)
+    whole[:, 3] = 0 if scan.times is None else nanoseconds(scan.times)
+    if n_fields > 4:
+        whole[:, 4] = 0 if scan.rings is None else scan.rings
+    return cloud
+
+
+def _imu_parameters(imu: Imu) -> Any:
+    noise = imu.noise
+    rate = 1e9 / float(np.median(np.diff(imu.stamps))) if len(imu) > 1 else 100.0
+    return _evalio()[1].ImuParams(
+        gyro=noise.gyroscope,
+        accel=noise.accelerometer,
+        gyro_bias=noise.gyroscope_walk,
+        accel_bias=noise.accelerometer_walk,
+        gravity=np.array([0.0, 0.0, -GRAVITY]),
+        rate=rate,
+    )
+
+
+class _Ringed(Pipeline):
+    """A pipeline that asks which laser measured each point."""
 
     settings_type: ClassVar[type[BaseSettings]] = GridSettings
 
@@ -280,15 +338,15 @@ class _Grid(Pipeline):
         super().__init__(parameters, settings)
         self._rows, self._columns = self.settings.rows, self.settings.columns
 
-    def _layout(self, scan: Scan) -> tuple[NDArray[Any], int]:
+    def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         if scan.rings is None:
             raise OdometryError(
                 f"{self.pipeline} needs to know which laser measured each point, and the scans do "
                 f"not tell; record clouds with a `ring` field"
             )
-        points, size = super()._layout(scan)
-        if size < MIN_POINTS:
-            return points, size
+        points = _cloud(scan, 5)
+        if len(scan) < MIN_POINTS:
+            return points, (1, len(scan))
         counts = np.bincount(scan.rings)
         self._rows = self._rows or next(
             n for n in (16, 32, 64, 128, 256, 65536) if n >= len(counts)
@@ -299,25 +357,37 @@ class _Grid(Pipeline):
                 f"odometry.settings.rows: {self._rows} rows do not hold laser number "
                 f"{len(counts) - 1}; set it to the sensor's number of lasers"
             )
+        return points, (self._rows, self._columns)
+
+
+class _Grid(_Ringed):
+    """A pipeline that wants a complete image of rows x columns, and ends the process otherwise."""
+
+    def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        points, (rows, columns) = super()._layout(scan)
+        if len(scan) < MIN_POINTS:
+            return points, (rows, columns)
         # The seam lies behind the sensor.
-        turn = np.arctan2(scan.points[:, 1], scan.points[:, 0]) / (2 * np.pi) + 0.5
-        place = turn * self._columns
+        place = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+        place *= columns / (2 * np.pi)
+        place += columns / 2
         # Firings that fall on the borders between columns would share every other one.
         place -= np.angle(np.exp(2j * np.pi * place[::16]).mean()) / (2 * np.pi)
-        points["col"] = np.rint(place).astype(np.int64) % self._columns
+        column = np.rint(place).astype(np.int64) % columns
         # Rays that did not come back lie at the origin, where every pipeline drops them.
-        image = np.zeros((self._rows, self._columns), POINT)
-        image["row"], image["col"] = np.arange(self._rows)[:, None], np.arange(self._columns)
-        image[points["row"], points["col"]] = points
-        return image, size
+        image = np.zeros((rows * columns, 5), np.float32)
+        row = image.view(np.uint32)[:, 4]
+        row[:] = np.repeat(np.arange(rows, dtype=np.uint32), columns)
+        image[points.view(np.uint32)[:, 4] * np.int64(columns) + column] = points
+        return image, (rows, columns)
 
-    def _add(self, prepared: Prepared) -> bool:
-        if prepared.cloud.shape != self._shape:
+    def _estimate(self, prepared: Prepared) -> Poses | None:
+        if prepared.shape != self._shape:
             raise OdometryError(
                 f"{self.pipeline} began with scans of {self._shape[0]} x {self._shape[1]} points "
-                f"and cannot go on with {prepared.cloud.shape[0]} x {prepared.cloud.shape[1]}"
+                f"and cannot go on with {prepared.shape[0]} x {prepared.shape[1]}"
             )
-        return super()._add(prepared)
+        return super()._estimate(prepared)
 
 
 def nanoseconds(times: NDArray[np.float32]) -> NDArray[np.uint32]:
@@ -360,7 +430,7 @@ class CtIcp(Pipeline):
         }
     )
 
-    def _layout(self, scan: Scan) -> tuple[NDArray[Any], int]:
+    def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         if scan.times is None:
             raise OdometryError(
                 "ct_icp needs to know when each point was measured, and the scans do not tell; "
@@ -433,5 +503,105 @@ class Form(_Grid):
             "radius": Float(low=0.3, high=3.0, baseline=1.0, log=True),
             "keyscan_match_ratio": Float(low=0.02, high=0.5, baseline=0.1, log=True),
             "max_num_keyscans": Integer(low=5, high=200, baseline=50, log=True),
+        }
+    )
+
+
+class LioSam(_Ringed):
+    """LIO-SAM (Shan et al., IROS 2020), in the version of E. Potokar, without loop closure.
+
+    It is always two scans behind. Its pose is carried on to the present scan with the gyroscope's
+    rotation and the mean velocity of the last scans.
+    """
+
+    pipeline = "liosam"
+    needs_imu = True
+    untuned: ClassVar[ParameterSet] = {"numberOfCores": 1, "mappingProcessInterval": 0.0}
+    space = ParameterSpace(
+        {
+            "edgeThreshold": Float(low=0.1, high=10.0, baseline=1.0, log=True),
+            "surfThreshold": Float(low=0.01, high=1.0, baseline=0.1, log=True),
+            "odometrySurfLeafSize": Float(low=0.1, high=1.5, baseline=0.4, log=True),
+            "mappingCornerLeafSize": Float(low=0.05, high=1.0, baseline=0.2, log=True),
+            "mappingSurfLeafSize": Float(low=0.1, high=1.5, baseline=0.4, log=True),
+            "surroundingkeyframeAddingDistThreshold": Float(
+                low=0.2, high=5.0, baseline=1.0, log=True
+            ),
+            "surroundingKeyframeSearchRadius": Float(low=10.0, high=100.0, baseline=50.0, log=True),
+        }
+    )
+
+    def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        points, shape = super()._layout(scan)
+        if len(scan) and scan.times is not None:
+            # It takes the last point's time for the scan's end.
+            points = np.concatenate([points, points[[int(scan.times.argmax())]]])
+        return points, shape
+
+    def _begin(self, prepared: Prepared) -> None:
+        self._scans: deque[Prepared] = deque(maxlen=_BEHIND + 1)
+        self._own: deque[tuple[int, Poses]] = deque(maxlen=_SMOOTH + 1)
+        super()._begin(prepared)
+
+    def _estimate(self, prepared: Prepared) -> Poses | None:
+        T_own_then = super()._estimate(prepared)
+        self._scans.append(prepared)
+        if T_own_then is None or len(self._scans) <= _BEHIND:
+            return None
+        then = self._scans[0].stamp
+        if not self._own:
+            self._own.append((then, T_own_then))
+            return T_own_then @ self._T_previous_current @ self._T_previous_current
+        if np.array_equal(self._own[-1][1], T_own_then):
+            # It waits for measurements.
+            return None
+        self._own.append((then, T_own_then))
+        before, T_own_before = self._own[0]
+        velocity = (T_own_then[:3, 3] - T_own_before[:3, 3]) / (then - before)
+        T_own_sensor = T_own_then.copy()
+        T_own_sensor[:3, 3] += velocity * (prepared.stamp - then)
+        T_own_sensor[:3, :3] @= _turned([s.imu for s in self._scans if s.imu], then, prepared.stamp)
+        return T_own_sensor
+
+
+def _turned(measured: Sequence[Imu], start: int, stop: int) -> NDArray[np.float64]:
+    """Rotation of the LiDAR from one stamp to another, by the gyroscope's mean rate."""
+    stamps = np.concatenate([imu.stamps for imu in measured])
+    rates = np.concatenate([imu.angular_velocity for imu in measured])
+    rates = rates[(stamps > start) & (stamps <= stop)]
+    if not len(rates):
+        return np.eye(3)
+    turn = measured[0].T_sensor_imu[:3, :3] @ rates.mean(axis=0) * (stop - start) * 1e-9
+    R: NDArray[np.float64] = Rotation.from_rotvec(turn).as_matrix()
+    return R
+
+
+class Dlio(Pipeline):
+    """DLIO (Chen et al., ICRA 2023).
+
+    It learns which way is down from its first measurements, and takes biases to be small. What it
+    would adapt by rules of its own (`adaptive_params`) is tuned here. Its pose is that of a scan's
+    end.
+    """
+
+    pipeline = "dlio"
+    needs_imu = True
+    untuned: ClassVar[ParameterSet] = {
+        "adaptive_params": False,
+        # By default it wants to stand still for 3 s, and gives no pose before.
+        "imu_calib_time": 0.05,
+        "calibrate_gyro": False,
+        "calibrate_accel": False,
+    }
+    space = ParameterSpace(
+        {
+            "vf_res": Float(low=0.1, high=1.0, baseline=0.25, log=True),
+            "gicp_max_corr_dist": Float(low=0.2, high=3.0, baseline=0.5, log=True),
+            "gicp_k_correspondences": Integer(low=8, high=32, baseline=16, log=True),
+            "keyframe_thresh_dist": Float(low=0.3, high=10.0, baseline=1.0, log=True),
+            "submap_knn": Integer(low=2, high=30, baseline=10, log=True),
+            "geo_Kp": Float(low=1.0, high=10.0, baseline=4.5, log=True),
+            "geo_Kv": Float(low=2.0, high=25.0, baseline=11.25, log=True),
+            "geo_Kq": Float(low=1.0, high=10.0, baseline=4.0, log=True),
         }
     )

@@ -8,11 +8,13 @@ ENTRY_POINTS = "adaptune.odometries"
 
 BOXES = {
     "ct_icp": "adaptune.odometry.evalio:CtIcp",
+    "dlio": "adaptune.odometry.evalio:Dlio",
     "evalio_kiss_icp": "adaptune.odometry.evalio:KissIcp",
     "form": "adaptune.odometry.evalio:Form",
     "genz_icp": "adaptune.odometry.evalio:GenzIcp",
     "gicp": "adaptune.odometry.gicp:KeyframeGicp",
     "kiss_icp": "adaptune.odometry.kiss_icp:Kiss",
+    "lio_sam": "adaptune.odometry.evalio:LioSam",
     "loam": "adaptune.odometry.evalio:Loam",
     "mad_icp": "adaptune.odometry.evalio:MadIcp",
     "ndt": "adaptune.odometry.ndt:KeyframeNdt",
