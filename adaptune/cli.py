@@ -236,6 +236,18 @@ def offline(
     )
     console.print(f"Baseline: {_short(loaded.space.baseline)}", highlight=False)
     console.print(f"Fixed: {_short(model.sets[model.fixed])}", highlight=False)
+    if model.paired.n_sets == 1:
+        console.print(
+            "On the training sequences left out in turn adapting did not pay: `paired` will always "
+            "take the fixed set.",
+            highlight=False,
+        )
+    elif len(model.sequences) == 1:
+        console.print(
+            "Selections will rest on a single training sequence: nothing shows that they hold "
+            "elsewhere.",
+            highlight=False,
+        )
     console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)
 
 
@@ -244,6 +256,9 @@ def validate(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
+    curve: Annotated[
+        bool, typer.Option("--learning-curve", help="Tell what fewer sequences would gain, too.")
+    ] = False,
 ) -> None:
     """Tell whether adapting would pay in places that were not trained on.
 
@@ -256,7 +271,7 @@ def validate(
 
     loaded = load_study(study, override, folder)
     with _progress() as progress:
-        validation, rows = validate_study(loaded, lambda i, n: progress("sequences", i, n))
+        validation, rows = validate_study(loaded, curve, progress)
     console.print(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",
@@ -264,8 +279,13 @@ def validate(
             "Oracles know the errors: the best set of the sequence, and of every period.",
         )
     )
+    known = ", ".join(f"{ratio:.2f}" for ratio in validation.portfolio())
+    console.print(
+        f"If the best of 1, 2, ... complementary sets were always known: {known}.", highlight=False
+    )
     for rule in loaded.config.online.rules:
         console.print(validation.verdict(rule), highlight=False)
+    console.print(f"Tables and picture: {loaded.folder / 'validation'}.*", highlight=False)
 
 
 @app.command()

@@ -195,3 +195,83 @@ def draw_front(
     axis.legend(frameon=False)
     with replacing(path) as beside:
         figure.savefig(beside, dpi=110)
+
+
+def draw_validation(
+    path: Path,
+    title: str,
+    ratios: Mapping[str, NDArray[np.float64]],
+    sequences: Sequence[str],
+    familiarity: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    portfolio: NDArray[np.float64],
+    learning: Sequence[Mapping[str, Any]],
+) -> None:
+    """Draw what was found on the sequences left out, as PNG.
+
+    Parameters
+    ----------
+    path
+        The picture.
+    title
+        What it shows.
+    ratios
+        By mode, the ratio to the fixed set's error on each sequence.
+    sequences
+        Their names.
+    familiarity, gain
+        Of every frame; the ratio to the fixed set's error, of shape (n,).
+    portfolio
+        Ratio if the best of 1, 2, ... sets were known.
+    learning
+        Rows of a learning curve, or none.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{title}: error over the fixed set's on sequences left out")
+    by_sequence, by_novelty, by_size = figure.subplots(1, 3, width_ratios=(2, 1, 1))
+    at = np.arange(len(sequences))
+    for mode, of_mode in ratios.items():
+        if mode != "fixed":
+            oracle = mode.startswith("oracle")
+            by_sequence.plot(
+                at,
+                of_mode,
+                "_" if oracle else "o",
+                color=COLOURS.get(mode, "#bbbbbb"),
+                label=mode,
+                alpha=0.6 if mode == "baseline" else 1.0,
+            )
+    by_sequence.set_xticks(at, sequences, rotation=60, ha="right")
+    by_sequence.set_yscale("log")
+    by_sequence.legend(fontsize="small")
+    known = ~np.isnan(familiarity)
+    if known.any():
+        order = np.argsort(familiarity[known], kind="stable")
+        parts = [p for p in np.array_split(order, 10) if len(p)]
+        by_novelty.plot(
+            [familiarity[known][p].mean() for p in parts],
+            [np.exp(np.log(gain[known][p]).mean()) for p in parts],
+            "o-",
+            color=COLOURS["paired"],
+        )
+    by_novelty.set_xlabel("familiarity (0: unlike all training)")
+    by_novelty.set_title("tenths of the frames")
+    by_size.plot(np.arange(1, len(portfolio) + 1), portfolio, "s--", color="#bbbbbb")
+    by_size.set_xlabel("sets, if the best were known")
+    if learning:
+        sizes = [row["sequences"] for row in learning]
+        middle = np.array([row["geometric"] for row in learning])
+        bounds = [[row[key] for row in learning] for key in ("low", "high")]
+        by_size.errorbar(
+            sizes, middle, np.abs(bounds - middle), fmt="o-", color=COLOURS["paired"], capsize=3
+        )
+        by_size.set_xlabel("dashed: sets, if the best were known; solid: training sequences")
+    for axes in (by_sequence, by_novelty, by_size):
+        axes.axhline(1.0, color=COLOURS["fixed"], lw=1.0)
+        axes.grid(alpha=0.3)
+    with replacing(path) as beside:
+        figure.savefig(beside, format="png", dpi=110)

@@ -26,7 +26,7 @@ from adaptune.model import (
     Settings,
     TrainingData,
 )
-from adaptune.model.base import mean_errors
+from adaptune.model.base import complementary, mean_errors
 from adaptune.study import Study, origin
 from offline.objective import weighted
 
@@ -36,6 +36,8 @@ NO_WORSE = 1.05
 """A rule may not have more than this much of the fixed set's error on any sequence left out."""
 SAFE = 1.02
 """The same for its settings, which are chosen on few sequences."""
+MOST_SETS = 6
+"""Complementary sets whose worth is told."""
 SETTINGS = tuple(
     Settings(n_sets=n_sets, sharpness=sharpness)
     for n_sets in (2, 3, 5)
@@ -89,12 +91,15 @@ class LeftOut(NamedTuple):
         For every rule the share of periods in which it did not choose the fixed set.
     familiarity : ndarray of shape (n,)
         See `Selection`; NaN without a rule that tells it.
+    portfolio : ndarray of shape (MOST_SETS,)
+        Mean error in percent if of 1, 2, ... complementary sets the best were always known.
     """
 
     name: str
     errors: dict[str, NDArray[np.float64]]
     adapted: dict[str, float]
     familiarity: NDArray[np.float64]
+    portfolio: NDArray[np.float64]
 
 
 @dataclass
@@ -137,6 +142,18 @@ class Validation:
             "arithmetic": float(mean / fixed),
         }
 
+    def portfolio(self) -> NDArray[np.float64]:
+        """Ratio to the fixed set's error, in geometric mean, if the best of K sets were known.
+
+        Returns
+        -------
+        ndarray of shape (MOST_SETS,)
+            For K = 1 (the fixed set), 2, ...
+        """
+        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out])
+        portfolios = np.array([s.portfolio for s in self.left_out])
+        return np.asarray(np.exp(np.log(portfolios / fixed[:, None]).mean(axis=0)))
+
     def verdict(self, rule: str) -> str:
         """What to do, in a sentence or two."""
         s = self.summary(rule)
@@ -157,17 +174,21 @@ class Validation:
 
 
 def validate(
-    study: Study, progress: Callable[[int, int], None] = lambda *_: None
+    study: Study,
+    curve: bool = False,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> tuple[Validation, list[dict[str, Any]]]:
     """Validate the selection rules on a study's training sequences.
 
     Parameters
     ----------
     study
-        A study that the offline stage has finished; its folder receives ``validation.csv`` and
-        ``validation.json``.
+        A study that the offline stage has finished; its folder receives ``validation.csv``,
+        ``validation.json`` and ``validation.png``, and its model what was found.
+    curve
+        Tell, too, what fewer training sequences would gain: ``learning.csv``, ``learning.json``.
     progress
-        Told about every sequence.
+        Told what is done, and about every sequence.
 
     Returns
     -------
@@ -184,7 +205,10 @@ def validate(
     """
     model = ErrorModel.load(study.folder / "model.npz")
     sequences = labelled_sequences(study, model)
-    validation = leave_one_out(sequences, model.space.to_unit(model.sets), progress=progress)
+    sets = model.space.to_unit(model.sets)
+    validation = leave_one_out(
+        sequences, sets, progress=lambda i, n: progress("sequences left out", i, n)
+    )
     rows: list[dict[str, Any]] = []
     for i, sequence in enumerate(validation.left_out):
         rows.append({"left out": sequence.name, "fixed [%]": sequence.errors["fixed"].mean()})
@@ -194,7 +218,71 @@ def validate(
         row |= {m: validation.summary(m)[key] for m in validation.ratios if m != "fixed"}
         rows.append(row)
     report.write_rows(study.folder, "validation", rows)
+    learning = []
+    if curve:
+        learning = learning_curve(
+            sequences, sets, progress=lambda i, n: progress("learning curve", i, n)
+        )
+        report.write_rows(study.folder, "learning", learning)
+    report.draw_validation(
+        study.folder / "validation.png",
+        study.name,
+        validation.ratios,
+        [s.name for s in validation.left_out],
+        *_by_familiarity(validation),
+        validation.portfolio(),
+        learning,
+    )
+    found = {rule: validation.summary(rule) for rule in RULES}
+    replace(model, validation=found).save(study.folder / "model.npz")
     return validation, rows
+
+
+def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Familiarity of every frame left out, and its error by the default rule over the fixed's."""
+    rule = next(iter(RULES))
+    familiarity = np.concatenate([s.familiarity for s in validation.left_out])
+    ratio = np.concatenate(
+        [(s.errors[rule] + 0.02) / (s.errors["fixed"] + 0.02) for s in validation.left_out]
+    )
+    return familiarity, ratio
+
+
+def learning_curve(
+    sequences: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    rule: str = "paired",
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda *_: None,
+) -> list[dict[str, Any]]:
+    """What a rule gains with fewer training sequences.
+
+    Each sequence is left out in turn, and the rule and its settings are fitted on some of the
+    others, drawn by chance.
+
+    Returns
+    -------
+    list of dict
+        For each number of training sequences the ratio to the error of the set that is fixed on
+        the same ones: geometric mean with its 95 % interval (Student's, over sequences), and the
+        worst.
+    """
+    folds = _folds(sequences)
+    most = len(folds) - 1
+    sizes = sorted({n for n in (3, 5, 8, 11, 16, 24, 32) if n < most} | {most})
+    rows = []
+    for i, size in enumerate(sizes):
+        rng = np.random.default_rng((seed, size))
+        left_out = []
+        for j, (sequence, others) in enumerate(folds):
+            progress(i * len(folds) + j, len(sizes) * len(folds))
+            names = sorted({origin(other.name) for other in others})
+            drawn = set(rng.choice(names, size, replace=False))
+            some = [other for other in others if origin(other.name) in drawn]
+            left_out.append(_leave_out(sequence, some, sets, {rule: _maker(rule)}))
+        rows.append({"sequences": size} | Validation(left_out).summary(rule))
+    progress(len(sizes) * len(folds), len(sizes) * len(folds))
+    return rows
 
 
 def labelled_sequences(study: Study, model: ErrorModel) -> list[LabelledSequence]:
@@ -330,10 +418,13 @@ def _leave_out(
         if not np.isnan(selections[0].familiarity):
             familiarity = np.array([selection.familiarity for selection in selections])
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    best = np.array([capped[period == p].mean(axis=0).argmin() for p in range(len(first))])
-    errors["oracle, period"] = capped[frames, best[period]]
+    of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
+    errors["oracle, period"] = capped[frames, of_periods.argmin(axis=1)[period]]
     adapted = {name: float(np.mean(sets != data.fixed)) for name, sets in chosen.items()}
-    return LeftOut(sequence.name, errors, adapted, familiarity[period])
+    few = complementary(data.errors, data.sequence, data.fixed, MOST_SETS)
+    least = np.minimum.accumulate(of_periods[:, few], axis=1)[period].mean(axis=0)
+    portfolio = least[np.minimum(np.arange(MOST_SETS), len(few) - 1)]
+    return LeftOut(sequence.name, errors, adapted, familiarity[period], portfolio)
 
 
 def _comparable(

@@ -13,6 +13,7 @@ from offline.validation import (
     LeftOut,
     Validation,
     ValidationError,
+    learning_curve,
     leave_one_out,
     training_data,
     tune,
@@ -115,7 +116,7 @@ def test_the_oracle_is_never_worse_than_anything():
 )
 def test_verdicts(ratios, verdict):
     left_out = [
-        LeftOut(str(i), {"fixed": np.ones(9), "rule": np.full(9, r)}, {}, np.ones(9))
+        LeftOut(str(i), {"fixed": np.ones(9), "rule": np.full(9, r)}, {}, np.ones(9), np.ones(6))
         for i, r in enumerate(ratios)
     ]
     assert Validation(left_out).verdict("rule").startswith(verdict)
@@ -145,6 +146,23 @@ def test_a_sequence_left_out_is_judged_on_the_sets_it_has_seen():
     for mode, ratios in validation.ratios.items():
         assert np.isfinite(ratios).all(), mode
     np.testing.assert_allclose(validation.ratios["paired"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
+
+
+def test_what_several_sets_would_be_worth():
+    validation = leave_one_out(two_kinds(np.random.default_rng(0)), SETS)
+    # With two sets the second is for the other kind of place, of which one more was trained on.
+    np.testing.assert_allclose(
+        validation.portfolio(), [1.0, 1.0, *[np.sqrt(0.5 * 0.4)] * 4], rtol=0.05
+    )
+
+
+def test_more_sequences_teach_more():
+    sequences = two_kinds(np.random.default_rng(0))
+    rows = learning_curve(sequences, SETS)
+    assert [row["sequences"] for row in rows] == [3, 5, 7]
+    assert rows[-1]["geometric"] == pytest.approx(np.sqrt(0.5 * 0.4), rel=0.05)
+    assert rows[-1]["geometric"] <= rows[0]["geometric"] + 1e-9
+    assert learning_curve(sequences, SETS) == rows
 
 
 def test_one_sequence_cannot_be_validated():
@@ -180,7 +198,7 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
 def test_validates_a_study(study_file, tmp_path):
     study = load_study(study_file, [], tmp_path / "study")
     train(study)
-    validation, rows = validate(study)
+    validation, rows = validate(study, curve=False)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
     assert (study.folder / "validation.csv").exists()
