@@ -236,12 +236,11 @@ def draw_validation(
     at = np.arange(len(sequences))
     for mode, of_mode in ratios.items():
         if mode != "fixed":
-            oracle = mode.startswith("oracle")
             by_sequence.plot(
                 at,
                 of_mode,
-                "_" if oracle else "o",
-                color=COLOURS.get(mode, "#bbbbbb"),
+                {"oracle, sequence": "_", "oracle, period": "x"}.get(mode, "o"),
+                color=COLOURS.get(mode, "#999999"),
                 label=mode,
                 alpha=0.6 if mode == "baseline" else 1.0,
             )
@@ -259,17 +258,30 @@ def draw_validation(
             color=COLOURS["paired"],
         )
     by_novelty.set_xlabel("familiarity (0: unlike all training)")
-    by_novelty.set_title("tenths of the frames")
-    by_size.plot(np.arange(1, len(portfolio) + 1), portfolio, "s--", color="#bbbbbb")
-    by_size.set_xlabel("sets, if the best were known")
+    by_novelty.set_title("paired, tenths of the frames", fontsize="medium")
+    by_size.plot(
+        np.arange(1, len(portfolio) + 1),
+        portfolio,
+        "s--",
+        color="#bbbbbb",
+        label="of so many sets the best, if known",
+    )
+    by_size.set_xlabel("sets")
     if learning:
         sizes = [row["sequences"] for row in learning]
         middle = np.array([row["geometric"] for row in learning])
         bounds = [[row[key] for row in learning] for key in ("low", "high")]
         by_size.errorbar(
-            sizes, middle, np.abs(bounds - middle), fmt="o-", color=COLOURS["paired"], capsize=3
+            sizes,
+            middle,
+            np.abs(bounds - middle),
+            fmt="o-",
+            color=COLOURS["paired"],
+            capsize=3,
+            label="paired, by training sequences",
         )
-        by_size.set_xlabel("dashed: sets, if the best were known; solid: training sequences")
+        by_size.set_xlabel("sets; training sequences")
+    by_size.legend(fontsize="small")
     for axes in (by_sequence, by_novelty, by_size):
         axes.axhline(1.0, color=COLOURS["fixed"], lw=1.0)
         axes.grid(alpha=0.3)

@@ -1,6 +1,5 @@
 """The mirror of a study's trials in Optuna's storages."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +92,7 @@ def empty(journal):
 
 def lock(journal):
     """What a killed driver may leave behind."""
-    os.symlink(journal, f"{journal}.lock")
+    Path(f"{journal}.lock").symlink_to(journal)
 
 
 @pytest.mark.parametrize("harm", [cut_short, garble, empty, Path.unlink, lock])
