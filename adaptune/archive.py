@@ -329,9 +329,14 @@ class Archive:
             raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
-        """Errors of several trials on a sequence, of shape (n_frames, n_trials)."""
+        """Errors of several trials on a sequence, of shape (n_frames, n_trials).
+
+        Those of a trial that was not run on it are NaN.
+        """
         read: NDArray[np.float32] | None = None
         for i, number in enumerate(numbers):
+            if number not in self.finished(sequence):
+                continue
             path = self.trial_path(sequence, number)
             try:
                 # Arrays are loaded when they are asked for: poses, most of the file, are not.
@@ -339,7 +344,7 @@ class Archive:
             except KeyError as error:
                 raise ArchiveError(f"{path}: lacks {error}; remove it and run again") from error
             if read is None:
-                read = np.empty((len(errors), len(numbers)), np.float32)
+                read = np.full((len(errors), len(numbers)), np.nan, np.float32)
             if len(errors) != len(read):
                 raise ArchiveError(
                     f"{self.folder / sequence}: trials are of recordings of different lengths; "

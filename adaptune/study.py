@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, TypeVar
+from typing import IO, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -135,6 +135,8 @@ class OfflineConfig(_Section):
         Runs of every trial, for odometries that differ from run to run.
     augment : list of ViewConfig
         Each adds a view of every training sequence to the training.
+    pruning : str
+        How trials are given up that promise little, see `offline.pruning`.
     preset : str, optional
         `paper`: as Koide et al. (IROS 2021) did, see `PRESETS`.
     """
@@ -154,7 +156,14 @@ class OfflineConfig(_Section):
     runs: Literal["restart", "whole", "episodes"] = "restart"
     repeats: int = Field(1, ge=1)
     augment: tuple[ViewConfig, ...] = ()
+    pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
     preset: Literal["paper"] | None = None
+
+    @model_validator(mode="after")
+    def _check_pruning(self) -> Self:
+        if self.pruning != "none" and len(self.objective) > 1:
+            raise ValueError("pruning goes by one objective; give one, or set pruning: none")
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -491,7 +500,7 @@ def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
             lasting[f"{kind}.{name}"] = entry
     offline = config.get("offline", {})
     searched = ("sampler", "initial", "batch", "seed", "objective", "limits", "runs", "repeats")
-    lasting["offline"] = {k: offline.get(k) for k in (*searched, "augment")}
+    lasting["offline"] = {k: offline.get(k) for k in (*searched, "augment", "pruning")}
     return lasting
 
 

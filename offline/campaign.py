@@ -1,7 +1,7 @@
 """The offline stage: run trials batch by batch, then fit the error model."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,11 +22,13 @@ from offline.objective import (
     label,
     pareto_front,
     told,
+    weighted,
 )
+from offline.pruning import estimate, rungs, survivors
 from offline.samplers import propose
 from offline.storage import Told, open_mirror
 from offline.validation import labelled_sequences, tune
-from offline.workers import Task, Workers, run
+from offline.workers import Pool, Task, Workers, run
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -83,17 +85,20 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
     archive = Archive(study.folder / "trials")
     archive.tidy()
     with Workers(study, config.workers or available()) as workers:
-        verdicts = _run_batches(study, archive, workers, progress)
+        verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
         whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
     model = fit(study, archive, verdicts, fixed)
-    settings = tune(labelled_sequences(study, model), model.space.to_unit(model.sets))
-    model = replace(model, paired=settings)
+    model = replace(model, paired=tune(*labelled_sequences(study, model)))
     model.save(study.folder / "model.npz")
     finished = {
-        name: [archive.finished(name)[n] for n in range(len(verdicts))] for name in study.training
+        name: [archive.finished(name).get(n) for n in range(len(verdicts))]
+        for name in study.training
     }
-    means = {name: [trial.mean_error for trial in trials] for name, trials in finished.items()}
+    means = {
+        name: [trial.mean_error if trial else np.nan for trial in trials]
+        for name, trials in finished.items()
+    }
     write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
     table = _trial_rows(config, verdicts, finished)
     report.write_rows(study.folder, "trials", table)
@@ -105,12 +110,14 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
 
 
 def _trial_rows(
-    config: OfflineConfig, verdicts: Sequence[Verdict], finished: Mapping[str, Sequence[Summary]]
+    config: OfflineConfig,
+    verdicts: Sequence[Verdict],
+    finished: Mapping[str, Sequence[Summary | None]],
 ) -> list[dict[str, Any]]:
     """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for n, verdict in enumerate(verdicts):
-        runs = [trials[n] for trials in finished.values()]
+        runs = [run for trials in finished.values() if (run := trials[n])]
         rows.append({"trial": n, **verdict.parameters})
         if config.metrics != {"rte"}:
             judged = zip(config.objective, verdict.values, strict=True)
@@ -121,22 +128,26 @@ def _trial_rows(
             rows[-1]["excess"] = verdict.excess
         if config.repeats > 1:
             rows[-1]["margin"] = verdict.margin
-        rows[-1]["mean"] = float(np.mean([run.mean_error for run in runs]))
-        rows[-1] |= {name: trials[n].mean_error for name, trials in finished.items()}
+        mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
+        rows[-1]["mean"] = mean
+        for name, trials in finished.items():
+            rows[-1][name] = run.mean_error if (run := trials[n]) else None
     return rows
 
 
 def _training_rows(
     config: OfflineConfig,
     verdicts: Sequence[Verdict],
-    finished: Mapping[str, Sequence[Summary]],
+    finished: Mapping[str, Sequence[Summary | None]],
     fixed: int,
     whole: Mapping[str, tuple[float, float]],
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
-    for name, runs in finished.items():
-        best = choose_fixed(config, [judge(config, [run]) for run in runs])
+    for name, trials in finished.items():
+        runs = {n: run for n, run in enumerate(trials) if run}
+        alone = {n: judge(config, [run]) for n, run in runs.items()}
+        best = list(runs)[choose_fixed(config, list(alone.values()))]
         rows.append(
             {
                 "sequence": name,
@@ -168,9 +179,22 @@ def _write_pareto(
     )
 
 
-def _run_batches(
-    study: Study, archive: Archive, workers: Workers, progress: Progress
+def run_batches(
+    study: Study, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
 ) -> list[Verdict]:
+    """Run all trials that are not in the archive yet, and tell how each did.
+
+    Parameters
+    ----------
+    study
+        The study, whose folder is there.
+    archive
+        Its trials.
+    workers
+        Who runs them.
+    progress
+        Told about every finished trial.
+    """
     config = study.config.offline
     names, described = study.training, study.config.descriptor.names
     finished = {name: archive.finished(name) for name in names}
@@ -178,7 +202,7 @@ def _run_batches(
     verdicts: list[Verdict] = []
 
     def of(number: int) -> Told:
-        trials = {name: finished[name][number] for name in names}
+        trials = {name: of[number] for name, of in finished.items() if number in of}
         attributes = {name: trial.mean_error for name, trial in trials.items()}
         attributes["lost"] = sum(trial.lost for trial in trials.values())
         attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
@@ -187,25 +211,29 @@ def _run_batches(
         return Told(verdicts[number].parameters, verdicts[number].values, attributes)
 
     total = config.trials * len(names)
-    done = 0
-    progress("trials", 0, total)
     for batch in range(-(-config.trials // config.batch)):
         first = batch * config.batch
         numbers = range(first, min(first + config.batch, config.trials))
-        missing = {name: [n for n in numbers if n not in finished[name]] for name in names}
-        n_missing = sum(map(len, missing.values()))
-        done += len(numbers) * len(names) - n_missing
-        progress("trials", done, total)
+        progress("trials", first * len(names), total)
+        order = _hardest_first(config, finished) if batch else names
+        alive = list(numbers)
+        sets: list[ParameterSet] = []
         unframed = [name for name in names if not archive.has_frames(name, described)]
-        if n_missing or unframed:
-            sets = propose(study.space, config, batch, told(verdicts))
-            tasks = _tasks(missing, unframed, sets, first, workers.n)
-            for task in _run(archive, workers, tasks):
-                done += len(task.numbers)
-                progress("trials", done, total)
-        verdicts += [judge(config, [finished[name][n] for name in names]) for n in numbers]
+        for m in rungs(config.pruning, batch, len(names)):
+            missing = {name: [n for n in alive if n not in finished[name]] for name in order[:m]}
+            done = first * len(names) + m * len(alive) - sum(map(len, missing.values()))
+            if any(missing.values()) or unframed:
+                sets = sets or propose(study.space, config, batch, told(verdicts))
+                tasks = _tasks(missing, unframed, sets, first, len(workers.workers()))
+                for task in _run(archive, workers, tasks):
+                    done += len(task.numbers)
+                    progress("trials", done, total)
+                unframed = []
+            if m < len(names):
+                alive = _survivors(config, order, finished, m, alive, first)
+        verdicts += [_verdict(config, order, finished, n) for n in numbers]
         mirror.tell(len(verdicts), of)
-        best = min(range(len(verdicts)), key=lambda n: (verdicts[n].excess, verdicts[n].values[0]))
+        best = min(range(len(verdicts)), key=lambda n: _rank(verdicts[n]))
         _log.info(
             "trials %d to %d done; best so far: trial %d with %s %.3f%s",
             numbers[0],
@@ -215,7 +243,61 @@ def _run_batches(
             verdicts[best].values[0],
             "" if verdicts[best].feasible else " (none keeps the limits)",
         )
+    progress("trials", total, total)
     return verdicts
+
+
+def _rank(verdict: Verdict) -> tuple[bool, float, float]:
+    return not verdict.complete, verdict.excess, verdict.values[0]
+
+
+Finished = Mapping[str, Mapping[int, Summary]]
+"""The finished trials on every sequence, by number."""
+
+
+def _values(config: OfflineConfig, order: Sequence[str], finished: Finished, n: int) -> list[float]:
+    """A trial's first objective on the sequences that it was run on."""
+    runs = [finished[name][n] for name in order if n in finished[name]]
+    return [weighted(config.objective[0], run.metrics) for run in runs]
+
+
+def _hardest_first(config: OfflineConfig, finished: Finished) -> list[str]:
+    """The sequences by falling mean of the first objective over the first batch."""
+    first = range(min(config.batch, config.trials))
+    means = {
+        name: np.mean([weighted(config.objective[0], trials[n].metrics) for n in first])
+        for name, trials in finished.items()
+    }
+    return sorted(means, key=lambda name: -means[name])
+
+
+def _survivors(
+    config: OfflineConfig,
+    order: Sequence[str],
+    finished: Finished,
+    m: int,
+    alive: Sequence[int],
+    first: int,
+) -> list[int]:
+    """Those of a batch that begins with trial `first` that go on beyond `m` sequences."""
+
+    def values(numbers: Iterable[int], seen: Sequence[str]) -> dict[int, list[float]]:
+        return {
+            n: _values(config, seen, finished, n)
+            for n in numbers
+            if _verdict(config, seen, finished, n).feasible
+        }
+
+    return survivors(config.pruning, m, values(alive, order[:m]), values(range(first), order))
+
+
+def _verdict(config: OfflineConfig, order: Sequence[str], finished: Finished, n: int) -> Verdict:
+    """What a trial came to, or would have if it had not been given up."""
+    verdict = judge(config, [finished[name][n] for name in order if n in finished[name]])
+    if all(n in finished[name] for name in order):
+        return verdict
+    value = estimate(_values(config, order, finished, n), _values(config, order, finished, 0))
+    return verdict._replace(values=(value,), complete=False)
 
 
 def _tasks(
@@ -226,7 +308,7 @@ def _tasks(
     n_workers: int,
 ) -> list[Task]:
     """Share every sequence's trials between the workers; reading it again is a task of its own."""
-    return [Task(name, (), (), frames=True) for name in unframed if not missing[name]] + [
+    return [Task(name, (), (), frames=True) for name in unframed if not missing.get(name)] + [
         Task(name, tuple(some), tuple(sets[n - first] for n in some), frames=name in unframed)
         for name, numbers in missing.items()
         for share in range(n_workers)
@@ -234,7 +316,7 @@ def _tasks(
     ]
 
 
-def _run(archive: Archive, workers: Workers, tasks: list[Task]) -> Iterator[Task]:
+def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[Task]:
     """Run tasks, and yield each when its results are in the archive."""
     for task, result in run(workers, tasks):
         if result.frames is not None:
@@ -272,6 +354,8 @@ def _run_whole(
 
 def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int) -> ErrorModel:
     """Make the error model of all trials that keep the limits.
+
+    Sets that were given up have no errors (NaN) on the sequences that they were not run on.
 
     Parameters
     ----------

@@ -52,12 +52,15 @@ class Verdict(NamedTuple):
     margin : float
         From the first value to the upper end of its one-sided 95 % confidence interval, where
         trials are repeated; 0 where they are not.
+    complete : bool
+        Whether it was run on all sequences; if not, its value is an estimate.
     """
 
     parameters: ParameterSet
     values: tuple[float, ...]
     excess: float
     margin: float = 0.0
+    complete: bool = True
 
     @property
     def feasible(self) -> bool:
@@ -182,7 +185,7 @@ def choose_fixed(config: OfflineConfig, verdicts: Sequence[Verdict]) -> int:
     AdaptuneError
         If there is none.
     """
-    feasible = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
+    feasible = [n for n, verdict in enumerate(verdicts) if verdict.feasible and verdict.complete]
     if not feasible:
         nearest = min(range(len(verdicts)), key=lambda n: verdicts[n].excess)
         limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())

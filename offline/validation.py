@@ -204,8 +204,7 @@ def validate(
         If there is but one training sequence.
     """
     model = ErrorModel.load(study.folder / "model.npz")
-    sequences = labelled_sequences(study, model)
-    sets = model.space.to_unit(model.sets)
+    sequences, sets = labelled_sequences(study, model)
     validation = leave_one_out(
         sequences, sets, progress=lambda i, n: progress("sequences left out", i, n)
     )
@@ -285,11 +284,22 @@ def learning_curve(
     return rows
 
 
-def labelled_sequences(study: Study, model: ErrorModel) -> list[LabelledSequence]:
-    """The training sequences of a model, from the archive that it was fitted on."""
+def labelled_sequences(
+    study: Study, model: ErrorModel
+) -> tuple[list[LabelledSequence], NDArray[np.float64]]:
+    """The training sequences of a model, and its sets in the unit cube, from the archive.
+
+    Only of sets that were run on all sequences: what was given up has no error to be looked up.
+    """
     archive = Archive(study.folder / "trials")
     period = study.config.online.period
-    numbers = model.provenance["trials"]
+    finished = [archive.finished(name) for name in model.sequences]
+    of_number = {
+        n: parameters
+        for n, parameters in zip(model.provenance["trials"], model.sets, strict=True)
+        if all(n in trials for trials in finished)
+    }
+    numbers = list(of_number)
     objective = study.config.offline.objective[0]
     sequences = []
     for name in model.sequences:
@@ -310,7 +320,7 @@ def labelled_sequences(study: Study, model: ErrorModel) -> list[LabelledSequence
                 np.array(values),
             )
         )
-    return sequences
+    return sequences, model.space.to_unit(list(of_number.values()))
 
 
 Maker = Callable[[Sequence[LabelledSequence], NDArray[np.float64]], Rule]

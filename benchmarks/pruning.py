@@ -1,0 +1,122 @@
+"""How much of the work pruning saves, and what it loses, on simulated studies.
+
+    python benchmarks/pruning.py [--seeds 0 1 2] [--trials 64] [--length 40] [--folder FOLDER]
+
+For each seed, two caves, two open grounds and two streets are simulated, and all sets of a Sobol
+sequence are run on all of them, once. Every rule is then given the results it asks for: the same
+trials, so that what differs is the rule. Printed are the scans that it has registered and the RTE
+of its fixed set, as ratios to those of the study without pruning. The limits are 0.5 and 1.02.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Collection
+from pathlib import Path
+
+from adaptune import yaml
+from adaptune.archive import Archive
+from adaptune.simulation import record
+from adaptune.study import Study, load_study
+from offline.campaign import run_batches, train
+from offline.objective import choose_fixed
+from offline.workers import Outcome, Result, Task
+
+RULES = ("halving", "hyperband", "wilcoxon")
+
+
+class Recorded:
+    """A pool whose one worker has done everything before.
+
+    Parameters
+    ----------
+    archive
+        All trials.
+    """
+
+    def __init__(self, archive: Archive):
+        self._archive = archive
+        self._tasks: list[Task] = []
+
+    def workers(self) -> Collection[int]:
+        """See `offline.workers.Pool`."""
+        return range(1)
+
+    def start(self, _worker: int, task: Task) -> None:
+        """See `offline.workers.Pool`."""
+        self._tasks.append(task)
+
+    def wait(self) -> list[tuple[int, Outcome]]:
+        """See `offline.workers.Pool`."""
+        task = self._tasks.pop()
+        trials = [self._archive.read(task.sequence, n) for n in task.numbers]
+        frames = self._archive.read_frames(task.sequence) if task.frames else None
+        return [(0, Result(trials, frames))]
+
+
+def study_file(folder: Path, seed: int, trials: int, length: float) -> Path:
+    """Write a study of six courses."""
+    scenes = [(scene, i) for scene in ("cave", "open", "street") for i in range(2)]
+    courses = {
+        f"{scene}_{i}": {"scenes": [scene], "length": length, "seed": 10 * seed + i}
+        for scene, i in scenes
+    }
+    study = {
+        "odometry": {"name": "gicp", "settings": {"downsampling": 0.5}},
+        "courses": courses,
+        "training": list(courses),
+        "sub_trajectory": 10.0,
+        "offline": {"sampler": "sobol", "trials": trials, "batch": max(4, trials // 8)},
+    }
+    path = folder / f"pruning_{seed}.yaml"
+    path.write_text(yaml.dump(study))
+    return path
+
+
+def scans(study: Study) -> int:
+    """Number of scans registered in all trials of a study."""
+    archive = Archive(study.folder / "trials")
+    return sum(
+        len(archive.finished(name)) * len(archive.read_frames(name).stamps)
+        for name in study.training
+    )
+
+
+def main() -> None:
+    """Measure everything."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--trials", type=int, default=64)
+    parser.add_argument("--length", type=float, default=40.0)
+    parser.add_argument("--folder", type=Path, help="to keep the full studies in")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = given.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for seed in given.seeds:
+            path = study_file(folder, seed, given.trials, given.length)
+            full = load_study(path, [], folder / f"full_{seed}")
+            for name, course in full.config.courses.items():
+                if not full.recording(name).exists():
+                    record(course, full.recording(name))
+            training = train(full)
+            value = min(
+                sum(means) / len(means) for means in zip(*training.means.values(), strict=True)
+            )
+            print(f"seed {seed}: {scans(full)} scans, fixed set {value:.3f} %", flush=True)
+            for rule in RULES:
+                pruned = load_study(
+                    path, [f"offline.pruning={rule}"], Path(temporary) / f"{rule}_{seed}"
+                )
+                pruned.folder.mkdir()
+                pool = Recorded(Archive(full.folder / "trials"))
+                verdicts = run_batches(pruned, Archive(pruned.folder / "trials"), pool)
+                best = verdicts[choose_fixed(pruned.config.offline, verdicts)].values[0]
+                print(
+                    f"  {rule:10} scans {scans(pruned) / scans(full):.2f}   "
+                    f"RTE of the fixed set {best / value:.3f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

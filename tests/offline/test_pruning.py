@@ -1,0 +1,120 @@
+"""Trials that are given up before they have seen all sequences."""
+
+import csv
+import dataclasses
+import math
+
+import drives
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptune.archive import Archive
+from adaptune.model import ErrorModel
+from adaptune.study import ConfigurationError, load_study
+from offline.campaign import train
+from offline.pruning import estimate, rungs, survivors
+from offline.validation import validate
+
+
+@given(st.sampled_from(["halving", "hyperband", "wilcoxon"]), st.integers(1, 50), st.integers(1, 9))
+def test_shares_grow_to_all_sequences(rule, n, batch):
+    sizes = rungs(rule, batch, n)
+    assert sizes[-1] == n
+    assert sizes == sorted(set(sizes))
+    assert sizes[0] >= min(n, 2)
+    assert rungs(rule, 0, n) == rungs("none", batch, n) == [n]
+
+
+def test_the_rungs():
+    assert rungs("halving", 1, 16) == [3, 6, 16]
+    assert rungs("halving", 1, 3) == [3]
+    assert [rungs("hyperband", b, 16)[0] for b in range(1, 7)] == [6, 16, 3, 6, 16, 3]
+    assert rungs("wilcoxon", 1, 5) == [2, 3, 4, 5]
+
+
+def test_the_best_third_of_all_that_came_so_far_goes_on():
+    before = {0: [1.0, 9.0], 1: [2.0, 4.0], 2: [0.5], 3: [8.0, 1.0]}
+    batch = {4: [0.1], 5: [0.7], 6: [3.0], 7: [4.0], 8: [5.0]}
+    assert survivors("halving", 1, batch, before) == [4, 5]
+    # On two sequences the means are 5.0, 3.0 and 4.5, and those of the batch 2.9 and 0.2.
+    assert survivors("halving", 2, {4: [2.9, 2.9], 5: [0.2, 0.2]}, before) == [4, 5]
+    assert survivors("halving", 1, batch, {}) == list(batch)
+
+
+@pytest.mark.parametrize("rule", ["halving", "hyperband", "wilcoxon"])
+def test_what_cannot_win_any_more_is_given_up(rule):
+    before = {0: [3.0, 2.0, 2.0, 1.0], 1: [9.0, 9.0, 9.0, 9.0], 2: [0.1, 0.1]}
+    assert survivors(rule, 2, {4: [7.0, 1.1], 5: [0.0, 0.1]}, before) == [5]
+
+
+def test_what_is_surely_worse_than_the_best_is_given_up():
+    rng = np.random.default_rng(0)
+    best = rng.uniform(0.5, 1.0, 8)
+    before = {0: (best + 1.0).tolist(), 1: best.tolist(), 2: [0.0]}
+    batch = {3: (best[:6] + 0.1).tolist(), 4: (best[:6] - 0.1).tolist()}
+    assert survivors("wilcoxon", 6, batch, before) == [4]
+    # Two sequences cannot tell.
+    assert survivors("wilcoxon", 2, {5: (best[:2] + 1.0).tolist()}, before) == [5]
+
+
+@given(st.lists(st.floats(0.1, 30.0), min_size=2, max_size=9), st.floats(0.1, 5.0))
+def test_an_estimate_keeps_the_ratio_to_the_baseline(baseline, ratio):
+    for m in range(1, len(baseline) + 1):
+        values = [ratio * value for value in baseline[:m]]
+        assert estimate(values, baseline) == pytest.approx(ratio * np.mean(baseline))
+    assert estimate([2.0], [0.0, 1.0]) == 2.0
+
+
+@pytest.fixture(scope="module")
+def study_file(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pruned")
+    names = [f"s{i}" for i in range(4)]
+    for i, name in enumerate(names):
+        drives.write_bag(folder / f"{name}.bag", drives.scans(i, 16))
+    bags = "\n".join(f"  {n}: {{bag: {n}.bag, points: /points, reference: /truth}}" for n in names)
+    (folder / "pruned.yaml").write_text(
+        f"odometry:\n  name: gicp\n  settings: {{downsampling: 0.5, min_range: 0.5}}\n"
+        f"  parameters:\n    max_correspondence_distance: {{low: 0.05, high: 5.0, log: true}}\n"
+        f"    keyframe_interval: {{low: 0.5, high: 15.0, baseline: 1.0, log: true}}\n"
+        f"sequences:\n{bags}\ntraining: [{', '.join(names)}]\nsub_trajectory: 3.0\n"
+        f"offline: {{trials: 9, initial: 6, batch: 3, seed: 3, workers: 2, pruning: halving}}\n"
+    )
+    return folder / "pruned.yaml"
+
+
+def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
+    study = load_study(study_file, [], tmp_path / "study")
+    training = train(study)
+    archive = Archive(study.folder / "trials")
+    seen = [[n in archive.finished(name) for name in study.training] for n in range(9)]
+    n_seen = np.sum(seen, axis=1)
+    assert (n_seen[:3] == 4).all()
+    assert n_seen.min() == 3
+    model = ErrorModel.load(study.folder / "model.npz")
+    for s, (row, means) in enumerate(zip(np.transpose(seen), training.means.values(), strict=True)):
+        errors = model.errors[model.sequence == s]
+        assert (np.isnan(errors).all(axis=0) == ~row).all()
+        assert (np.isnan(errors).any(axis=0) == ~row).all()
+        assert [math.isnan(mean) for mean in means] == (~row).tolist()
+    assert n_seen[training.fixed] == 4
+    rows = list(csv.DictReader((study.folder / "trials.csv").open()))
+    assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
+    before = (study.folder / "model.npz").read_bytes()
+    validation, _ = validate(study)
+    assert len(validation.left_out) == 4
+
+    # Some of it lost, as to a killed driver, and made again.
+    for number in (4, 7):
+        for name in study.training[:2]:
+            archive.trial_path(name, number).unlink(missing_ok=True)
+    train(dataclasses.replace(study))
+    assert (study.folder / "model.npz").read_bytes() == before
+    again = Archive(study.folder / "trials")
+    assert [[n in again.finished(name) for name in study.training] for n in range(9)] == seen
+
+
+def test_pruning_goes_by_one_objective(study_file):
+    with pytest.raises(ConfigurationError, match="pruning goes by one objective"):
+        load_study(study_file, ["offline.objective=[rte, ape]"])
