@@ -319,6 +319,37 @@ def online(
 
 
 @app.command()
+def switching(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    seconds: Annotated[
+        float, typer.Option(help="How much of every training sequence to use.", min=10.0)
+    ] = 60.0,
+) -> None:
+    """Measure what it costs to change parameters on the way.
+
+    Drives the training sequences with the odometry's own parameters, changing every 5 s to the
+    same ones: by every mechanism that the odometry can have, and for several lengths of warm-up.
+    The price of the study's own mechanism is kept with it, for selections to weigh.
+    """
+    from adaptune import report
+    from online.switching import measure_switching
+
+    loaded = load_study(study, override, folder)
+    with _progress() as progress:
+        rows = measure_switching(loaded, seconds, progress)
+    console.print(
+        report.table(
+            f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
+            rows,
+            f"This study switches by {loaded.mechanism}, at a price of {loaded.price():.1%}; kept "
+            f"in {loaded.folder / 'switching.json'}.",
+        )
+    )
+
+
+@app.command()
 def compare(
     study: StudyFile,
     override: Override = [],  # noqa: B006

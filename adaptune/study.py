@@ -37,6 +37,7 @@ from adaptune.odometry import (
     Limits,
     Odometry,
     OdometryError,
+    WarmUp,
     box_class,
 )
 from adaptune.sequence import SequenceConfig, open_sequence
@@ -44,7 +45,7 @@ from adaptune.sequence.bag import bag_paths
 from adaptune.sequence.config import ViewConfig, expand
 from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course, as_sequence
-from adaptune.space import ParameterSet, ParameterSpace, nearest
+from adaptune.space import ParameterSet, ParameterSpace, Value, nearest
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 """Becomes a file's name."""
@@ -220,6 +221,12 @@ class DescriptorConfig(_Section):
         return {"names": data} if isinstance(data, list) else data
 
 
+def _catches_up(beside: int) -> int:
+    if beside == 1:
+        raise ValueError("with 1 a new instance would never catch up; give 0, or 2 or more")
+    return beside
+
+
 class SwitchingConfig(_Section):
     """How an odometry comes by other parameters on the way.
 
@@ -228,16 +235,39 @@ class SwitchingConfig(_Section):
     mechanism : str
         `live`: by itself. `hand_over`: a new instance takes over. `bank`: instances with a few
         complementary sets run side by side. `auto`: the first of live, bank (where there is more
-        than one core) and hand-over that can be had.
-    warm_up : float
-        Seconds of scans that a new instance sees before it takes over.
+        than one core, and memory) and hand-over that can be had.
+    warm_up : float, optional
+        Seconds of scans that a new instance sees before it takes over; the odometry's own when
+        left out, as the next two.
+    full_rate : float, optional
+        Seconds of the most recent ones, of which it sees all.
+    stride : int, optional
+        Every how many of those before it sees.
+    beside : int
+        How many of them it sees with every new scan while the old instance still gives the poses;
+        with 0, all at once.
     size : int
         Instances in the bank.
+    sets : list of int or dict, optional
+        Parameter sets in the bank, or numbers of trials; those that complement each other best
+        when left out.
+    cores, memory : int, float, optional
+        What `auto` may spend on a bank: cores, all there are when left out; gigabytes, of which
+        each instance may take `isolation.memory`.
     """
 
     mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"
-    warm_up: float = Field(8.0, gt=0)
+    warm_up: float | None = Field(None, gt=0, allow_inf_nan=False)
+    full_rate: float | None = Field(None, ge=0, allow_inf_nan=False)
+    stride: int | None = Field(None, ge=1)
+    beside: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
     size: int = Field(3, ge=2, le=4)
+    sets: Annotated[
+        tuple[Annotated[int, Field(ge=0)] | dict[str, Value], ...] | None,
+        Field(min_length=2, max_length=4),
+    ] = None
+    cores: int | None = Field(None, ge=1)
+    memory: float = Field(16.0, gt=0, allow_inf_nan=False)
 
 
 class OnlineConfig(_Section):
@@ -356,7 +386,52 @@ class Study:
             return asked
         if self.box.live:
             return "live"
-        return "bank" if available() > 1 else "hand_over"
+        switching = self.config.online.switching
+        instances = switching.size if switching.sets is None else len(switching.sets)
+        cores = available() if switching.cores is None else switching.cores
+        enough = instances * self.config.isolation.memory <= switching.memory
+        return "bank" if cores > 1 and enough else "hand_over"
+
+    @cached_property
+    def warm_up(self) -> WarmUp:
+        """Which of the last scans a new instance sees."""
+        switching = self.config.online.switching
+        usual = self.box.warm_up
+        return WarmUp(
+            usual.seconds if switching.warm_up is None else switching.warm_up,
+            usual.full_rate if switching.full_rate is None else switching.full_rate,
+            usual.stride if switching.stride is None else switching.stride,
+        )
+
+    def price(self) -> float:
+        """By how much switching as this study does raises the RTE, as `adaptune switching` found.
+
+        Returns
+        -------
+        float
+            A share of the RTE; 0.0 if it was not measured, or with another odometry or warm-up.
+        """
+        path = self.folder / "switching.json"
+        try:
+            measured = json.loads(path.read_text(encoding="utf-8"))
+            if measured["of"] != self.switching_about():
+                return 0.0
+            return max(0.0, float(measured["price"]))
+        except FileNotFoundError:
+            return 0.0
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigurationError(
+                f"{path}: is damaged ({error}); remove it, or run `adaptune switching` again"
+            ) from error
+
+    def switching_about(self) -> dict[str, Any]:
+        """What the price of switching depends on, as plain data."""
+        return {
+            "odometry": self.config.odometry.name,
+            "settings": self.settings.model_dump(mode="json"),
+            "mechanism": self.mechanism,
+            "warm_up": self.warm_up._asdict(),
+        }
 
     def recording(self, course: str) -> Path:
         """Where a simulated course's bag is kept."""
@@ -664,6 +739,15 @@ def _check_box(config: StudyConfig, problems: list[_Problem]) -> None:
         for name, course in config.courses.items():
             if course.imu is None:
                 problems.append((("courses", name), f"{needs}; simulate one, imu: 200"))
+    _check_switching(config, box, problems)
+
+
+def _check_switching(config: StudyConfig, box: type[Odometry], problems: list[_Problem]) -> None:
+    for i, given in enumerate(config.online.switching.sets or ()):
+        for name in given if isinstance(given, dict) else ():
+            if name not in box.space.names:
+                key = ("online", "switching", "sets", i, name)
+                problems.append((key, f"no such parameter; {nearest(name, box.space.names)}"))
     if config.online.switching.mechanism == "live" and not box.live:
         problems.append(
             (

@@ -1,13 +1,16 @@
 """What adapters add to their odometries, and what changing parameters on the way costs.
 
-    python benchmarks/odometry.py adapters RECORDING.bag
+    python benchmarks/odometry.py adapters RECORDING.bag [METRES]
     python benchmarks/odometry.py switching RECORDING.bag [ODOMETRY ...]
+    python benchmarks/odometry.py faults
 
-The recording is a simulated course's, as `adaptune simulate` leaves it. *adapters* runs every
-odometry that can be had with its default parameters and tells what a scan takes, how much of that
-is not spent in the odometry's own code, and how much more a process of its own takes. Limit: 5 %
-of the odometry's time, or 0.3 ms where that is more. *switching* hands over to the same parameters
-every 5 s. RTE over 25 m, one core.
+The recording is a simulated course's, as `adaptune simulate` leaves it, or another one with the
+same topics. *adapters* runs every odometry that can be had with its default parameters and tells
+what a scan takes, how much of that is not spent in the odometry's own code, and how much more a
+process of its own takes. Limit: 5 % of the odometry's time, or 0.3 ms where that is more.
+*switching* hands over to the same parameters every 5 s. RTE over 25 m, or as many as are given; one
+core, seconds of its own time, so that other work on the machine counts less. *faults* plants each
+kind of fault at the fourth scan.
 """
 
 import sys
@@ -22,11 +25,13 @@ import small_gicp
 from adaptune import cores, open3d
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import BOXES, Box, HandOver, Isolated, Limits, box_class
-from adaptune.sequence import Scan, SequenceConfig, open_sequence
+from adaptune.odometry import BOXES, Box, HandOver, Isolated, Limits, WarmUp, box_class
+from adaptune.sequence import Scan, SequenceError, open_sequence
+from adaptune.sequence.views import WithImu
+from adaptune.simulation import Course, as_sequence
 
 LENGTH = 25.0
-WARM_UPS = (1.0, 2.0, 4.0, 8.0, 12.0)
+WARM_UPS = (*(WarmUp(seconds, seconds, 1) for seconds in (2.0, 4.0, 8.0, 12.0)), WarmUp(12.0, 4.0, 2))
 EVERY = 5.0
 
 
@@ -40,11 +45,11 @@ class Clock:
         """A function that does the same on the clock."""
 
         def timed(*args: Any, **kwargs: Any) -> Any:
-            begin = time.perf_counter()
+            begin = time.process_time()
             try:
                 return function(*args, **kwargs)
             finally:
-                self.seconds += time.perf_counter() - begin
+                self.seconds += time.process_time() - begin
 
         return timed
 
@@ -65,9 +70,12 @@ class Timed:
 
 def read(path: Path) -> tuple[list[Scan], Poses]:
     """Scans, and the reference at their stamps."""
-    sequence = open_sequence(
-        SequenceConfig(bag=str(path), points="/velodyne_points", reference="/gt_poses")
-    )
+    course = Course(scenes=("garden",), imu=200)
+    sequence: Any
+    try:
+        sequence = WithImu(open_sequence(as_sequence(course, path)))
+    except SequenceError:
+        sequence = open_sequence(as_sequence(course.model_copy(update={"imu": None}), path))
     scans = list(sequence)
     reference = sequence.reference()
     if reference is None:
@@ -103,18 +111,18 @@ def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
         if hasattr(box, attribute):
             setattr(box, attribute, Timed(getattr(box, attribute), clock))
     poses, own = [np.eye(4)], []
-    begin = time.perf_counter()
+    begin = time.process_time()
     for scan in scans[1:]:
         at = clock.seconds
         poses.append(box.register(box.prepare(scan)).T_odom_sensor)
         own.append(clock.seconds - at)
-    whole = (time.perf_counter() - begin) / len(own)
+    whole = (time.process_time() - begin) / len(own)
     small_gicp.align, small_gicp.preprocess_points = originals
     registration.registration_ndt = ndt
     return np.array(poses), 1e3 * whole, 1e3 * float(np.mean(own))
 
 
-def adapters(path: Path) -> None:
+def adapters(path: Path, length: float) -> None:
     """Print a row for every odometry."""
     scans, T_ref = read(path)
     print("odometry          RTE %   ms   adapter ms    +process ms   changes by")
@@ -123,7 +131,7 @@ def adapters(path: Path) -> None:
         try:
             poses, whole, own = own_time(name, scans)
         except Exception as error:
-            print(f"{name:16} {error}")
+            print(f"{name:16} {error}", flush=True)
             continue
         isolated = ""
         if not cls.clean:
@@ -132,7 +140,7 @@ def adapters(path: Path) -> None:
             here = drive(box, some)[1]
             there = drive(Isolated(name, {}, cls.settings_type(), Limits()), some)[1]
             isolated = f"{1e3 * np.median(np.subtract(there, here)):.2f}"
-        rte = np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH))
+        rte = np.nanmean(sub_trajectory_rte(T_ref, poses, length))
         print(
             f"{name:16} {rte:6.3f} {whole:6.1f} {whole - own:6.2f} ({(whole - own) / own:4.0%})"
             f"  {isolated:>8}       {'itself' if cls.live else 'bank, hand-over'}",
@@ -165,7 +173,8 @@ def there_and_back(box: Any) -> None:
 def switching(path: Path, names: list[str]) -> None:
     """Print the RTE of hand-overs to the same parameters, for every length of warm-up."""
     scans, T_ref = read(path)
-    print("odometry           alone " + "".join(f"{w:8.0f} s" for w in WARM_UPS) + "   itself")
+    heads = [f"{w.seconds:.0f} s" for w in WARM_UPS[:-1]] + ["sparse"]
+    print("odometry           alone " + "".join(f"{head:>10}" for head in heads) + "   itself")
     for name in names:
         cls = box_class(name)
 
@@ -185,10 +194,32 @@ def switching(path: Path, names: list[str]) -> None:
         )
 
 
+def faults() -> None:
+    """Print what is told of every kind of fault, and whether the odometry went on."""
+    sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
+    import faulty
+
+    for fault in faulty.FAULTS:
+        settings = faulty.Settings(fault=fault)
+        box = Isolated("faulty:Faulty", {}, settings, Limits(seconds=1.0, memory=1.0))
+        scans = [Scan(i * 10**8, np.zeros((5, 3), np.float32)) for i in range(6)]
+        box.start(scans[0], np.eye(4))
+        lost = [i for i in range(1, 6) if np.isnan(box.register(scans[i]).T_odom_sensor).any()]
+        box.start(scans[5], np.eye(4))
+        again = fault == "shape" or np.isfinite(box.register(scans[5]).T_odom_sensor).all()
+        print(
+            f"{fault:20} lost from scan {lost[0]}, {'goes' if again else 'does not go'} on: ",
+            end="",
+        )
+        print(box.faults[0])
+
+
 if __name__ == "__main__":
     cores.pin(1)
-    if len(sys.argv) == 3 and sys.argv[1] == "adapters":
-        adapters(Path(sys.argv[2]))
+    if len(sys.argv) in (3, 4) and sys.argv[1] == "adapters":
+        adapters(Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else LENGTH)
+    elif sys.argv[1:] == ["faults"]:
+        faults()
     elif len(sys.argv) > 2 and sys.argv[1] == "switching":
         switching(Path(sys.argv[2]), sys.argv[3:] or ["gicp", "vgicp", "kiss_icp", "mad_icp"])
     else:

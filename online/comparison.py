@@ -127,16 +127,46 @@ def driven(study: Study, model: ErrorModel, mode: str) -> tuple[Box, Policy | No
     if study.mechanism == "live":
         return study.odometry(fixed), adaptive(model, mode)
     if study.mechanism == "hand_over":
-        return HandOver(study.odometry, fixed, switching.warm_up), adaptive(model, mode)
-    members = portfolio(model, switching.size)
-    few = restrict(model, members)
-    select = adaptive(few, mode)
+        box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
+        return box, adaptive(model, mode)
+    members, sets = bank_sets(study, model)
+    select = adaptive(restrict(model, members), mode)
 
     def policy(scan: Scan) -> Selection:
         selection = select(scan)
         return selection._replace(set_index=members[selection.set_index])
 
-    return Bank(study.odometry, few.sets, switching.warm_up), policy
+    return Bank(study.odometry, sets, study.warm_up), policy
+
+
+def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[ParameterSet]]:
+    """Numbers and parameters of the sets in a study's bank, the one to begin with first.
+
+    Raises
+    ------
+    ComparisonError
+        If the model knows nothing of a set that is named.
+    """
+    given = study.config.online.switching.sets
+    if given is None:
+        members = portfolio(model, study.config.online.switching.size)
+        return members, [model.sets[i] for i in members]
+    members = []
+    for i, named in enumerate(given):
+        number = named if isinstance(named, int) else _number(model, study.space.baseline | named)
+        if number >= len(model.sets):
+            raise ComparisonError(
+                f"online.switching.sets.{i}: is none of the {len(model.sets)} parameter sets that "
+                f"were tried, so nothing is known of its errors; name the number of a trial, or "
+                f"the parameters of one (trials.csv lists them)"
+            )
+        members.append(number)
+    return members, [model.sets[i] for i in members]
+
+
+def _number(model: ErrorModel, parameters: ParameterSet) -> int:
+    """Number of a set, the first that there is not if the model does not know it."""
+    return model.sets.index(parameters) if parameters in model.sets else len(model.sets)
 
 
 def check_model(study: Study, model: ErrorModel, path: Path) -> None:
@@ -193,8 +223,12 @@ def _setting(study: Study, name: str) -> dict[str, Any]:
 
 def _switching(study: Study) -> dict[str, Any]:
     """The mechanism and those of its settings that it heeds."""
-    heeded = {"live": set[str](), "hand_over": {"warm_up"}, "bank": {"warm_up", "size"}}
-    settings = study.config.online.switching.model_dump(include=heeded[study.mechanism])
+    heeded = {"live": set[str](), "hand_over": {"beside"}, "bank": {"size", "sets"}}
+    settings = study.config.online.switching.model_dump(
+        mode="json", include=heeded[study.mechanism]
+    )
+    if study.mechanism != "live":
+        settings["warm_up"] = study.warm_up._asdict()
     return {"mechanism": study.mechanism} | settings
 
 

@@ -1,6 +1,13 @@
 """Odometries as black boxes: scans and parameters in, poses out."""
 
-from adaptune.odometry.base import BaseSettings, Box, Odometry, OdometryError, Registration
+from adaptune.odometry.base import (
+    BaseSettings,
+    Box,
+    Odometry,
+    OdometryError,
+    Registration,
+    WarmUp,
+)
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import BOXES, box_class
@@ -18,5 +25,6 @@ __all__ = [
     "Odometry",
     "OdometryError",
     "Registration",
+    "WarmUp",
     "box_class",
 ]

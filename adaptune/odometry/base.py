@@ -21,6 +21,24 @@ class BaseSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class WarmUp(NamedTuple):
+    """Which of the last scans a new instance sees before it takes over.
+
+    Attributes
+    ----------
+    seconds : float
+        How far back they go.
+    full_rate : float
+        Seconds of the most recent ones, of which it sees all.
+    stride : int
+        Every how many of those before it sees.
+    """
+
+    seconds: float = 12.0
+    full_rate: float = 4.0
+    stride: int = 1
+
+
 class Registration(NamedTuple):
     """Where an odometry believes the sensor was.
 
@@ -74,6 +92,8 @@ class Odometry(ABC):
         own.
     needs_imu : bool
         Whether scans must bring along what an IMU measured; class attribute.
+    warm_up : WarmUp
+        What serves where a new instance takes over, unless a study says otherwise; class attribute.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -96,6 +116,7 @@ class Odometry(ABC):
     live: ClassVar[bool]
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
+    warm_up: ClassVar[WarmUp] = WarmUp()
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None

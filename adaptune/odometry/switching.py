@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, rectify
-from adaptune.odometry.base import Box, OdometryError, Registration
+from adaptune.odometry.base import Box, OdometryError, Registration, WarmUp
 from adaptune.odometry.isolation import Isolated
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
@@ -40,9 +40,10 @@ class _Past(NamedTuple):
 class _Recent:
     """The last seconds of scans, with the poses that were given for them."""
 
-    def __init__(self, seconds: float):
-        self._span = seconds * 1e9
+    def __init__(self, warm_up: WarmUp):
+        self._warm_up = warm_up
         self._past: deque[_Past] = deque()
+        self._forgotten = 0
 
     def __bool__(self) -> bool:
         return bool(self._past)
@@ -50,29 +51,65 @@ class _Recent:
     def begin(self, scan: Stamped, T_odom_sensor: Poses, motion: Poses | None) -> None:
         self._past.clear()
         self._past.append(_Past(*scan, T_odom_sensor, motion))
+        self._forgotten = 0
 
     def add(self, scan: Stamped, T_odom_sensor: Poses) -> None:
         T_previous_current = invert(self._past[-1].T_odom_sensor) @ T_odom_sensor
         self._past.append(_Past(*scan, T_odom_sensor, T_previous_current))
-        while len(self._past) > 1 and scan.stamp - self._past[0].stamp > self._span:
+        while len(self._past) > 1 and self._age(self._past[0]) > self._warm_up.seconds:
             self._past.popleft()
+            self._forgotten += 1
+
+    @property
+    def last(self) -> _Past:
+        return self._past[-1]
 
     @property
     def pose(self) -> Poses:
         return self._past[-1].T_odom_sensor
 
+    def newcomer(self, box: Box) -> "_Newcomer":
+        """Let a new instance begin with these scans."""
+        _, full_rate, stride = self._warm_up
+        seen = [
+            past
+            for number, past in enumerate(self._past, self._forgotten)
+            if self._age(past) <= full_rate or number % stride == 0
+        ]
+        return _Newcomer(box, seen)
+
     def warm_up(self, box: Box) -> Poses:
         """Let a new instance see these scans, and tell where it believes to be."""
-        first, *others = self._past
-        box.start(first.prepared, first.T_odom_sensor, first.T_previous_current)
-        T = first.T_odom_sensor
-        for past in others:
-            T = box.register(past.prepared).T_odom_sensor
-            if not np.isfinite(T).all():
-                last = others[-1]
-                box.start(last.prepared, last.T_odom_sensor, last.T_previous_current)
-                return last.T_odom_sensor
-        return T
+        newcomer = self.newcomer(box)
+        newcomer.go_on(len(self._past))
+        return newcomer.T_own_sensor
+
+    def _age(self, past: _Past) -> float:
+        return (self._past[-1].stamp - past.stamp) * 1e-9
+
+
+class _Newcomer:
+    """A new instance on its way through scans of the past."""
+
+    def __init__(self, box: Box, past: Iterable[_Past]):
+        self.box = box
+        self.waiting = deque(past)
+        self._start(self.waiting.popleft())
+
+    def go_on(self, n: int) -> None:
+        """See at most `n` scans more."""
+        for _ in range(min(n, len(self.waiting))):
+            past = self.waiting.popleft()
+            self.T_own_sensor = self.box.register(past.prepared).T_odom_sensor
+            if not np.isfinite(self.T_own_sensor).all():
+                # It begins without a past.
+                self._start(self.waiting.pop() if self.waiting else past)
+                self.waiting.clear()
+                return
+
+    def _start(self, past: _Past) -> None:
+        self.box.start(past.prepared, past.T_odom_sensor, past.T_previous_current)
+        self.T_own_sensor = past.T_odom_sensor
 
 
 def _between(T_odom_sensor: Poses, T_own_sensor: Poses) -> Poses:
@@ -85,7 +122,7 @@ def _between(T_odom_sensor: Poses, T_own_sensor: Poses) -> Poses:
 class HandOver:
     """An odometry that is replaced by a new instance when its parameters change.
 
-    The new instance is warmed up on the last seconds of scans, from the pose and the motion that
+    The new instance is warmed up on scans of the last seconds, from the pose and the motion that
     were given for the first of them. From then on its motions are chained on: no pose jumps. Its
     map is as old as the warm-up is long.
 
@@ -96,15 +133,21 @@ class HandOver:
     parameters
         Those to begin with.
     warm_up
-        Seconds of scans.
+        Which scans it sees.
+    beside
+        How many of them it sees with every new scan, while the old instance still gives the poses;
+        two at least, to catch up. With 0 it sees all at once, and the next scan waits.
     """
 
-    def __init__(self, make: Make, parameters: ParameterSet, warm_up: float):
+    def __init__(self, make: Make, parameters: ParameterSet, warm_up: WarmUp, beside: int = 0):
         self.parameters = dict(parameters)
         self._make = make
         self._recent = _Recent(warm_up)
+        self._beside = beside
         # What one instance has learnt from the first scan's layout must serve all.
         self._first = self._box = make(self.parameters)
+        self._present = self.parameters
+        self._newcomer: _Newcomer | None = None
         self._T_odom_own = np.eye(4)
 
     def prepare(self, scan: Scan) -> Stamped:
@@ -114,29 +157,56 @@ class HandOver:
     def start(
         self, prepared: Stamped, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`."""
+        """See `Odometry.start`; one that is being warmed up takes over."""
+        if self._newcomer is not None:
+            self._box, self._present, self._newcomer = self._newcomer.box, self.parameters, None
         self._box.start(prepared.prepared, T_odom_sensor, T_previous_current)
         self._T_odom_own = np.eye(4)
         self._recent.begin(prepared, T_odom_sensor, T_previous_current)
 
     def register(self, prepared: Stamped) -> Registration:
         """See `Odometry.register`."""
-        T_own_sensor, registered = self._box.register(prepared.prepared)
+        box, newcomer = self._box, self._newcomer
+        # One in a process of its own works while the newcomer looks back.
+        if isinstance(box, Isolated):
+            box.request(prepared.prepared)
+        if newcomer is not None:
+            newcomer.go_on(self._beside - 1)
+        T_own_sensor, registered = (
+            box.result() if isinstance(box, Isolated) else box.register(prepared.prepared)
+        )
         T_odom_sensor = self._T_odom_own @ T_own_sensor
         if np.isfinite(T_odom_sensor).all():
             self._recent.add(prepared, T_odom_sensor)
+            if newcomer is not None:
+                newcomer.waiting.append(self._recent.last)
+                newcomer.go_on(1)
+                if not newcomer.waiting:
+                    self._take_over(newcomer)
         return Registration(T_odom_sensor, registered)
 
     def configure(self, parameters: ParameterSet) -> None:
-        """Replace the instance, unless these are the parameters it has."""
+        """Begin to replace the instance, unless it has or will have these parameters."""
         wanted = self.parameters | parameters
         if wanted == self.parameters:
             return
-        self.parameters = wanted
-        self._box = self._make(wanted)
-        if self._recent:
-            T_own_sensor = self._recent.warm_up(self._box)
-            self._T_odom_own = _between(self._recent.pose, T_own_sensor)
+        self.parameters, self._newcomer = wanted, None
+        if wanted == self._present:
+            return
+        box = self._make(wanted)
+        if not self._recent:
+            self._box, self._present = box, wanted
+            return
+        newcomer = self._recent.newcomer(box)
+        if self._beside:
+            self._newcomer = newcomer
+        else:
+            newcomer.go_on(len(newcomer.waiting))
+            self._take_over(newcomer)
+
+    def _take_over(self, newcomer: _Newcomer) -> None:
+        self._box, self._present, self._newcomer = newcomer.box, self.parameters, None
+        self._T_odom_own = _between(self._recent.pose, newcomer.T_own_sensor)
 
 
 class Bank:
@@ -153,7 +223,7 @@ class Bank:
     sets
         Their parameters; the first is chosen to begin with.
     warm_up
-        Seconds of scans that an instance sees when it is started anew.
+        Which scans an instance sees when it is started anew.
 
     Attributes
     ----------
@@ -161,7 +231,7 @@ class Bank:
         How often an instance was started anew.
     """
 
-    def __init__(self, make: Make, sets: Sequence[ParameterSet], warm_up: float):
+    def __init__(self, make: Make, sets: Sequence[ParameterSet], warm_up: WarmUp):
         self.sets = [dict(parameters) for parameters in sets]
         self.restarts = 0
         self._boxes = [make(parameters) for parameters in self.sets]

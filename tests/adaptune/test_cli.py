@@ -71,7 +71,16 @@ def test_inspect_and_cache(study_file, tmp_path):
 def test_help_and_version(tmp_path):
     done = adaptune("--help", cwd=tmp_path)
     assert done.returncode == 0
-    for command in ("inspect", "simulate", "offline", "validate", "online", "compare", "cache"):
+    for command in (
+        "inspect",
+        "simulate",
+        "offline",
+        "validate",
+        "online",
+        "switching",
+        "compare",
+        "cache",
+    ):
         assert command in done.stdout
     assert adaptune("--version", cwd=tmp_path).stdout.startswith("adaptune 0.")
 

@@ -1,3 +1,5 @@
+import json
+
 import pytest
 
 from adaptune.study import ConfigurationError, load_study
@@ -23,6 +25,35 @@ def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
     for cores, mechanism in ((1, "hand_over"), (2, "bank")):
         monkeypatch.setattr("adaptune.study.available", lambda cores=cores: cores)
         assert load_study(study_file, stiff).mechanism == mechanism
+
+
+def test_a_bank_has_a_budget(study_file, monkeypatch):
+    monkeypatch.setattr("adaptune.study.available", lambda: 4)
+    stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
+    for given, mechanism in (
+        ("online.switching.memory=12", "bank"),
+        ("online.switching.memory=11", "hand_over"),
+        ("online.switching.cores=1", "hand_over"),
+        ("online.switching.size=4", "bank"),
+        ("isolation.memory=6", "hand_over"),
+    ):
+        assert load_study(study_file, [*stiff, given]).mechanism == mechanism
+
+
+def test_the_price_of_switching_is_kept_with_the_study(study_file, tmp_path):
+    study = load_study(study_file, folder=tmp_path)
+    assert study.price() == 0.0
+    found = {"of": study.switching_about(), "price": 0.07}
+    (tmp_path / "switching.json").write_text(json.dumps(found))
+    assert study.price() == 0.07
+    # Another mechanism has another price.
+    other = load_study(study_file, ["online.switching.mechanism=hand_over"], tmp_path)
+    assert other.price() == 0.0
+    (tmp_path / "switching.json").write_text(json.dumps(found | {"price": -0.02}))
+    assert study.price() == 0.0
+    (tmp_path / "switching.json").write_text("{")
+    with pytest.raises(ConfigurationError, match=r"switching\.json: is damaged"):
+        study.price()
 
 
 def test_an_odometry_that_needs_an_imu(study_file):
@@ -76,6 +107,12 @@ def test_reads_a_study(study_file, tmp_path):
         ("online.switching.warm_up=0", ["online.switching.warm_up", "not 0"]),
         ("online.switching.size=5", ["online.switching.size", "not 5"]),
         ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
+        ("online.switching.beside=1", ["online.switching.beside", "never catch up"]),
+        ("online.switching.sets=[0]", ["online.switching.sets"]),
+        (
+            "online.switching.sets=[0, {keyframe_intervall: 1.0}]",
+            ["online.switching.sets.1", "did you mean 'keyframe_interval'?"],
+        ),
         ("training=[ones]", ["training.0", "did you mean 'one'?"]),
         ("training=[]", ["training"]),
         ("test=[three, three]", ["test.1", "named twice"]),

@@ -9,7 +9,7 @@ from adaptune.model import ErrorModel, portfolio
 from adaptune.study import load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.campaign import train
-from online.comparison import ComparisonError, bootstrap, compare, run_replays
+from online.comparison import ComparisonError, bank_sets, bootstrap, compare, run_replays
 
 MODES = ["baseline", "fixed", "paired", "paper"]
 
@@ -70,7 +70,7 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
     folder = study.folder / "replays/three/paired"
     about = json.loads((folder / "replay.json").read_text())["about"]
     assert about["switching"]["mechanism"] == mechanism
-    assert about["switching"]["warm_up"] == 0.5
+    assert about["switching"]["warm_up"]["seconds"] == 0.5
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
     members = portfolio(model, 3) if mechanism == "bank" else range(len(model.sets))
@@ -80,6 +80,20 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
         chosen = model.sets[int(row["set"])]
         assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
     run_replays(trained, trained.folder / "model.npz")
+
+
+def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file):
+    model = ErrorModel.load(trained.folder / "model.npz")
+    bank = "online.switching.mechanism=bank"
+    named = load_study(study_file, [bank, "online.switching.sets=[3, 0]"], trained.folder)
+    assert bank_sets(named, model) == ([3, 0], [model.sets[3], model.sets[0]])
+    values = "{" + ", ".join(f"{k}: {v!r}" for k, v in model.sets[4].items()) + "}"
+    named = load_study(study_file, [bank, f"online.switching.sets=[{values}, 1]"], trained.folder)
+    assert bank_sets(named, model)[0] == [4, 1]
+    for unknown in ("[0, 10]", "[{keyframe_interval: 1.2345}, 0]"):
+        study = load_study(study_file, [bank, f"online.switching.sets={unknown}"], trained.folder)
+        with pytest.raises(ComparisonError, match=r"switching\.sets\..: is none of the 10"):
+            bank_sets(study, model)
 
 
 def test_replays_are_made_once(replayed, study_file):

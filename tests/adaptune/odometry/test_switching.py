@@ -11,6 +11,7 @@ from adaptune.odometry import (
     Odometry,
     OdometryError,
     Registration,
+    WarmUp,
 )
 from adaptune.odometry.gicp import KeyframeGicp, Settings
 from adaptune.sequence import Scan
@@ -48,6 +49,11 @@ class Walker(Odometry):
         return Registration(self.T, prepared != 4)
 
 
+def every(seconds):
+    """A warm-up on all scans of the last seconds."""
+    return WarmUp(seconds, seconds, 1)
+
+
 def at(second):
     return Scan(round(second * 1e9), np.zeros((0, 3), np.float32))
 
@@ -81,7 +87,7 @@ def makes(scripts=None):
 
 def test_hand_over_never_jumps_and_warms_up_on_the_last_seconds():
     make, made = makes()
-    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    box = HandOver(make, {"speed": 1.0}, warm_up=every(3.0))
     x = x_of(box, range(10), {6: {"speed": 2.0}})
     assert x == [0, 1, 2, 3, 4, 5, 7, 9, 11, 13]
     old, new = made
@@ -91,30 +97,64 @@ def test_hand_over_never_jumps_and_warms_up_on_the_last_seconds():
     assert new.starts == [(2, 2.0)]
 
 
+def test_hand_over_sees_less_of_what_is_long_ago():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, WarmUp(8.0, 2.0, 3))
+    x_of(box, range(14), {12: {"speed": 2.0}})
+    assert made[1].seen == [3, 6, 9, 10, 11, 12, 13]
+
+
+def test_hand_over_beside_the_old_instance():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, every(3.0), beside=2)
+    x = x_of(box, range(12), {6: {"speed": 2.0}})
+    # It sees 2, then 3 and 4 while scan 6 is registered, 5 and 6 at 7, 7 and 8 at 8.
+    assert made[1].seen == [*range(2, 12)]
+    assert x == [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14]
+    assert made[0].seen == [*range(9)]
+
+
+def test_hand_over_that_is_no_longer_wanted():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, every(3.0), beside=2)
+    x = x_of(box, range(10), {5: {"speed": 2.0}, 6: {"speed": 3.0}, 7: {"speed": 1.0}})
+    assert x == list(range(10))
+    assert [len(walker.seen) for walker in made] == [10, 3, 3]
+
+
+def test_a_new_start_lets_the_newcomer_begin():
+    make, made = makes()
+    box = HandOver(make, {"speed": 1.0}, every(9.0), beside=2)
+    x_of(box, range(6), {5: {"speed": 2.0}})
+    box.start(box.prepare(at(6)), np.eye(4))
+    assert box.register(box.prepare(at(7))).T_odom_sensor[0, 3] == 2.0
+    assert made[0].seen == [*range(6)]
+
+
 def test_hand_over_makes_nothing_for_the_parameters_it_has():
     make, made = makes()
-    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    box = HandOver(make, {"speed": 1.0}, warm_up=every(3.0))
     x_of(box, range(6), {0: {"speed": 1.0}, 3: {"speed": 1.0}})
     assert len(made) == 1
 
 
 def test_hand_over_before_the_first_scan():
     make, made = makes()
-    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    box = HandOver(make, {"speed": 1.0}, warm_up=every(3.0))
     assert x_of(box, range(3), {0: {"speed": 3.0}}) == [0, 3, 6]
     assert made[0].seen == []
 
 
 def test_hand_over_begins_without_warm_up_where_that_fails():
     make, made = makes({2.0: {4: np.nan}})
-    box = HandOver(make, {"speed": 1.0}, warm_up=3.0)
+    box = HandOver(make, {"speed": 1.0}, warm_up=every(3.0))
     assert x_of(box, range(8), {6: {"speed": 2.0}}) == [0, 1, 2, 3, 4, 5, 7, 9]
     assert made[1].starts == [(2, 2.0), (5, 5.0)]
 
 
 def test_a_new_start_forgets_what_was_before():
     make, made = makes()
-    box = HandOver(make, {"speed": 1.0}, warm_up=30.0)
+    box = HandOver(make, {"speed": 1.0}, warm_up=every(30.0))
     x_of(box, range(4))
     T = np.eye(4)
     T[0, 3] = 100.0
@@ -126,7 +166,10 @@ def test_a_new_start_forgets_what_was_before():
 
 def test_registrations_keep_their_word():
     make, _ = makes()
-    for box in (HandOver(make, {"speed": 1.0}, 3.0), Bank(make, [{"speed": 1.0}], 3.0)):
+    for box in (
+        HandOver(make, {"speed": 1.0}, every(3.0)),
+        Bank(make, [{"speed": 1.0}], every(3.0)),
+    ):
         box.start(box.prepare(at(3)), np.eye(4))
         assert not box.register(box.prepare(at(4))).registered
         assert box.register(box.prepare(at(5))).registered
@@ -134,7 +177,7 @@ def test_registrations_keep_their_word():
 
 def test_the_chosen_motion_is_taken_where_another_confirms_it():
     make, made = makes()
-    box = Bank(make, [{"speed": 1.0}, {"speed": 1.05}, {"speed": 1.09}], warm_up=3.0)
+    box = Bank(make, [{"speed": 1.0}, {"speed": 1.05}, {"speed": 1.09}], warm_up=every(3.0))
     x = x_of(box, range(7), {2: {"speed": 1.09}, 5: {"speed": 1.05}})
     np.testing.assert_allclose(np.diff(x), [1.0, 1.09, 1.09, 1.09, 1.05, 1.05])
     assert box.restarts == 0
@@ -143,7 +186,7 @@ def test_the_chosen_motion_is_taken_where_another_confirms_it():
 
 def test_the_medoid_stands_in_for_a_lost_one_which_is_started_anew():
     make, made = makes({1.0: {5: 4.0}})
-    box = Bank(make, [{"speed": 1.0}, {"speed": 1.02}, {"speed": 1.06}], warm_up=2.0)
+    box = Bank(make, [{"speed": 1.0}, {"speed": 1.02}, {"speed": 1.06}], warm_up=every(2.0))
     x = x_of(box, range(9))
     np.testing.assert_allclose(np.diff(x), [1, 1, 1, 1, 1.06, 1, 1, 1], atol=1e-12)
     assert box.restarts == 1
@@ -154,7 +197,7 @@ def test_the_medoid_stands_in_for_a_lost_one_which_is_started_anew():
 
 def test_without_a_majority_the_chosen_one_is_believed():
     make, _ = makes()
-    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=2.0)
+    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=every(2.0))
     assert x_of(box, range(5), {3: {"speed": 3.0}}) == [0, 1, 2, 5, 8]
     assert box.restarts == 0
 
@@ -162,7 +205,7 @@ def test_without_a_majority_the_chosen_one_is_believed():
 @pytest.mark.parametrize("chosen", [1.0, 3.0])
 def test_no_pose_is_worse_than_any(chosen):
     make, _ = makes({1.0: {3: np.nan}})
-    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=2.0)
+    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=every(2.0))
     x = x_of(box, range(6), {0: {"speed": chosen}})
     assert np.diff(x).tolist() == [chosen, chosen, 3.0, chosen, chosen]
     assert box.restarts == 1
@@ -170,7 +213,7 @@ def test_no_pose_is_worse_than_any(chosen):
 
 def test_no_pose_at_all_is_told():
     make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
-    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=2.0)
+    box = Bank(make, [{"speed": 1.0}, {"speed": 3.0}], warm_up=every(2.0))
     x = x_of(box, range(4))
     assert np.isnan(x[3])
     # The caller starts it anew.
@@ -183,7 +226,7 @@ def test_no_pose_at_all_is_told():
 def test_a_bank_has_no_other_sets():
     make, _ = makes()
     with pytest.raises(OdometryError, match="no instance of the bank has the parameters"):
-        Bank(make, [{"speed": 1.0}], 1.0).configure({"speed": 2.0})
+        Bank(make, [{"speed": 1.0}], every(1.0)).configure({"speed": 2.0})
 
 
 def drive(box, switch=None, n=30):
@@ -200,7 +243,7 @@ def drive(box, switch=None, n=30):
 
 
 def test_a_bank_of_equal_instances_is_the_single_run_bit_by_bit():
-    bank = Bank(lambda _: KeyframeGicp(NEAR), [NEAR, FAR], warm_up=1.0)
+    bank = Bank(lambda _: KeyframeGicp(NEAR), [NEAR, FAR], warm_up=every(1.0))
     switched = drive(bank, [NEAR, FAR], n=15)
     np.testing.assert_array_equal(switched, drive(KeyframeGicp(NEAR), n=15))
 
@@ -210,7 +253,8 @@ def test_a_bank_in_other_processes_is_the_same():
         return Isolated("gicp", parameters, Settings(), Limits())
 
     a, b = (
-        drive(Bank(make, [NEAR, FAR], 0.5), [NEAR, FAR], 15) for make in (KeyframeGicp, elsewhere)
+        drive(Bank(make, [NEAR, FAR], every(0.5)), [NEAR, FAR], 15)
+        for make in (KeyframeGicp, elsewhere)
     )
     np.testing.assert_array_equal(a, b)
 
@@ -218,9 +262,11 @@ def test_a_bank_in_other_processes_is_the_same():
 @pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
 def test_real_odometries_go_straight_on(mechanism):
     if mechanism == "bank":
-        box = Bank(KeyframeGicp, [NEAR, FAR, {**NEAR, "keyframe_interval": 2.0}], warm_up=0.5)
+        box = Bank(
+            KeyframeGicp, [NEAR, FAR, {**NEAR, "keyframe_interval": 2.0}], warm_up=every(0.5)
+        )
     else:
-        box = HandOver(KeyframeGicp, NEAR, warm_up=0.5)
+        box = HandOver(KeyframeGicp, NEAR, warm_up=every(0.5))
     poses = drive(box, [FAR, NEAR], n=15)
     steps = invert(poses[:-1]) @ poses[1:]
     np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
