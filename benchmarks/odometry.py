@@ -31,7 +31,10 @@ from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course, as_sequence
 
 LENGTH = 25.0
-WARM_UPS = (*(WarmUp(seconds, seconds, 1) for seconds in (2.0, 4.0, 8.0, 12.0)), WarmUp(12.0, 4.0, 2))
+WARM_UPS = (
+    *(WarmUp(seconds, seconds, 1) for seconds in (2.0, 4.0, 8.0, 12.0)),
+    WarmUp(12.0, 4.0, 2),
+)
 EVERY = 5.0
 
 
