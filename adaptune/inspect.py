@@ -17,9 +17,10 @@ from adaptune import geometry, yaml
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.sequence import Scan, SequenceConfig, SequenceError, cache, open_sequence
-from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, POSES, BagSource, bag_paths, header_stamp
+from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, POSES, BagSource, bag_paths
 from adaptune.sequence.pointcloud2 import RING_FIELDS
 from adaptune.sequence.sequence import RecordedSequence
+from adaptune.sequence.serialized import header_stamp
 from adaptune.sequence.timing import TIME_FIELDS
 from adaptune.trajectory import Trajectory
 
@@ -178,7 +179,7 @@ def _kind(path: Path) -> str:
 
 def _any_bag(path: Path) -> BagSource:
     """The bag, opened without asking for point clouds."""
-    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0}
+    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
     return BagSource(bag_paths([str(path)]), about=about)
 
 
@@ -276,7 +277,12 @@ def _first_scan(
     layout: tuple[tuple[str, str, int], ...] = ()
     topics: tuple[Topic, ...] = ()
     options = {key: value for key, value in given.items() if key != "imu"}
-    sequence = open_sequence(SequenceConfig(**options, cache=False))
+    try:
+        sequence = open_sequence(SequenceConfig(**options, cache=False))
+    except SequenceError as error:
+        if "bag" not in given:
+            raise
+        return None, None, (), (), [str(error)]
     assert isinstance(sequence, RecordedSequence)
     source = sequence.source
     count = 0
@@ -300,7 +306,7 @@ def _layout(source: BagSource) -> tuple[tuple[tuple[str, str, int], ...], int]:
     """Fields of a point of the first cloud, and how many points it holds."""
     message = next(source.messages(source.points), None)
     if message is None or not hasattr(message, "fields"):
-        points = [] if message is None else list(message.points)
+        points = list(getattr(message, "points", ()))
         names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
         return tuple((name, "", 0) for name in names), len(points)
     kinds = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32"}

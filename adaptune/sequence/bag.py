@@ -1,10 +1,11 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
-import struct
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,29 +15,34 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune import geometry
-from adaptune.sequence import livox, pointcloud2
+from adaptune.sequence import livox, pointcloud2, velodyne
 from adaptune.sequence.imu import Imu
-from adaptune.sequence.pointcloud2 import PointCloudError, stamp_ns
+from adaptune.sequence.pointcloud2 import PointCloudError
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Frame, Repairs, SequenceError
+from adaptune.sequence.serialized import header_stamp
 from adaptune.sequence.timing import AUTO, Timing
 from adaptune.space import nearest
 from adaptune.trajectory import Trajectory
 
-POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *livox.TYPES)
+POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *livox.TYPES, *velodyne.TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
 _Pose = tuple[int, str, Any, Any]
 """Stamp, frame, translation, quaternion."""
 
 
+def _stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
 def _header_pose(message: Any, pose: Any) -> list[_Pose]:
-    return [(stamp_ns(message.header), message.header.frame_id, pose.position, pose.orientation)]
+    return [(_stamp(message), message.header.frame_id, pose.position, pose.orientation)]
 
 
 def _transforms(transforms: Iterable[Any]) -> list[_Pose]:
     return [
-        (stamp_ns(t.header), t.child_frame_id, t.transform.translation, t.transform.rotation)
+        (_stamp(t), t.child_frame_id, t.transform.translation, t.transform.rotation)
         for t in transforms
     ]
 
@@ -135,17 +141,28 @@ class BagSource:
         about: dict[str, Any] | None = None,
     ):
         self.paths, self.timing = tuple(paths), timing
+        self._ready: AnyReader | None = None
         if about is not None:
             self.topics: dict[str, str] = dict(about["topics"])
             self.points: str = about["points"]
             self.n_messages: int = about["n_messages"]
             self._duration: int = about["duration"]
+            self._begins: dict[str, int] = dict(about["begins"])
             return
-        with self.open() as reader:
-            self.topics = {c.topic: c.msgtype for c in reader.connections}
-            self.points = self.topic(points, POINTS_TYPES, "point clouds")
-            self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
-            self._duration = max(reader.end_time - reader.start_time, 0)
+        reader = self._opened()
+        weakref.finalize(self, _close, reader)
+        self.topics = {c.topic: c.msgtype for c in reader.connections}
+        self.points = self.topic(points, POINTS_TYPES, "point clouds")
+        self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
+        self._duration = max(reader.end_time - reader.start_time, 0)
+        self._begins = {}
+        for topic, kind in self.topics.items():
+            if topic == self.points or kind in POSES:
+                stamp = self._begin(reader, topic)
+                if stamp is not None:
+                    self._begins[topic] = stamp
+        # Opening reads the whole index: once for this and the first pass.
+        self._ready = reader
 
     def about(self) -> dict[str, Any]:
         """What opening the bags has told, as plain data."""
@@ -155,6 +172,7 @@ class BagSource:
             "points": self.points,
             "n_messages": self.n_messages,
             "duration": self._duration,
+            "begins": self._begins,
         }
 
     @property
@@ -183,10 +201,31 @@ class BagSource:
                     )
                 yield Frame(stamp, recorded, partial(self._load, decode, data, number))
 
+    def _begin(self, reader: AnyReader, topic: str) -> int | None:
+        """Stamp of the first message, none where it tells none; reading it on tells why."""
+        try:
+            connection, _, data = next(self.read(reader, topic))
+            if topic == self.points:
+                return header_stamp(data, reader.is2)
+            message = reader.deserialize(data, connection.msgtype)
+            return POSES[connection.msgtype](message)[0][0]
+        except Exception:
+            return None
+
     def span(self) -> tuple[int, int] | None:
         """First stamp, and the last one if the recorder's clock went as the sensor's."""
-        first = next(self.frames(), None)
-        return None if first is None else (first.stamp, first.stamp + self._duration)
+        first = self._begins.get(self.points)
+        return None if first is None else (first, first + self._duration)
+
+    def first_pose(self, name: str) -> int | None:
+        """Stamp of the first pose on a topic.
+
+        Raises
+        ------
+        SequenceError
+            If the topic is not there.
+        """
+        return self._begins.get(self.topic(name, POSES, "poses"))
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
@@ -236,7 +275,7 @@ class BagSource:
         stamps, values = [], []
         for message in self.messages(name):
             w, a = message.angular_velocity, message.linear_acceleration
-            stamps.append(stamp_ns(message.header))
+            stamps.append(_stamp(message))
             values.append((w.x, w.y, w.z, a.x, a.y, a.z))
         if not stamps:
             raise SequenceError(f"{self.name}: no measurement on {name}")
@@ -257,6 +296,8 @@ class BagSource:
         types = tuple(types)
         fitting = sorted(t for t, kind in self.topics.items() if kind in types)
         if name is None:
+            # Packets are often recorded beside the points that were made of them.
+            fitting = [t for t in fitting if self.topics[t] not in velodyne.TYPES] or fitting
             if len(fitting) != 1:
                 raise SequenceError(
                     f"{self.name}: {len(fitting)} topics with {what}"
@@ -272,13 +313,18 @@ class BagSource:
         )
 
     def check(self, reference: str | None, imu: str | None) -> None:
-        """Make sure that the named topics are there.
+        """Make sure that the named topics are there, and that the points can be decoded.
 
         Raises
         ------
         SequenceError
-            Naming what there is.
+            Naming what there is, or what to install.
         """
+        if self.topics[self.points] in velodyne.TYPES and find_spec("velodyne_decoder") is None:
+            raise SequenceError(
+                f"{self.name}: {self.points} holds raw packets of a Velodyne; install "
+                f"adaptune[velodyne], which decodes them"
+            )
         if reference is not None:
             self.topic(reference, POSES, "poses")
         if imu is not None:
@@ -317,6 +363,13 @@ class BagSource:
         SequenceError
             If they cannot be opened.
         """
+        reader, self._ready = self._ready or self._opened(), None
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+    def _opened(self) -> AnyReader:
         try:
             reader = AnyReader(self.paths, default_typestore=_typestore())
             reader.open()
@@ -326,10 +379,7 @@ class BagSource:
                 f"{self.name}: cannot be opened as a bag ({_say(error)}); if the recording was cut "
                 f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
             ) from error
-        try:
-            yield reader
-        finally:
-            reader.close()
+        return reader
 
     def read(
         self, reader: AnyReader, topic: str | None = None
@@ -355,17 +405,29 @@ class BagSource:
             yield message
 
     def _decoder(self, reader: AnyReader) -> Callable[[bytes], Scan]:
-        kind, types = self.topics[self.points], reader.typestore
+        kind, definitions = self.topics[self.points], reader.typestore.fielddefs
+        if kind in velodyne.TYPES:
+            return velodyne.decoder(reader.is2)
         if kind not in livox.TYPES:
-            # Scans are decoded after the reader has moved on, even after it was closed.
-            read = types.deserialize_cdr if reader.is2 else types.deserialize_ros1
-            return lambda data: pointcloud2.decode(read(data, kind), self.timing)
-        definitions = types.fielddefs
+            self._check_standard(definitions, reader.is2)
+            return partial(pointcloud2.decode, cdr=reader.is2, timing=self.timing)
         fields = tuple(definitions[kind][1])
         point = tuple(definitions[kind.replace("CustomMsg", "CustomPoint")][1])
         return partial(
             livox.decode, message=fields, point=point, cdr=reader.is2, timing=self.timing
         )
+
+    def _check_standard(self, definitions: Any, cdr: bool) -> None:
+        """Make sure that point clouds are laid out as they are decoded."""
+        standard = _typestore().fielddefs
+        for name in ("std_msgs/msg/Header", "sensor_msgs/msg/PointField", POINTS_TYPES[0]):
+            _, found = definitions.get(name, ((), ()))
+            fields = [field for field in found if cdr or field[0] != "seq"]
+            if fields != standard[name][1]:
+                raise SequenceError(
+                    f"{self.name}: its {name} is not as ROS defines it "
+                    f"({', '.join(field for field, _ in fields)})"
+                )
 
     def _load(self, decode: Callable[[bytes], Scan], data: bytes, number: int) -> Scan:
         try:
@@ -388,14 +450,9 @@ class BagSource:
         return [pose for pose in found if frame in (None, pose[1])]
 
 
-def header_stamp(data: bytes | memoryview, cdr: bool) -> int | None:
-    """Stamp of a serialised message that begins with a header; none if it is too short."""
-    if len(data) < 12:
-        return None
-    # Before the stamp come the encapsulation in ROS 2, and the sequence number in ROS 1.
-    little = not cdr or data[1] == 1
-    seconds, nanoseconds = struct.unpack_from("<II" if little else ">II", data, 4)
-    return int(seconds) * 10**9 + int(nanoseconds)
+def _close(reader: AnyReader) -> None:
+    if reader.stack is not None:
+        reader.close()
 
 
 def _say(error: Exception) -> str:

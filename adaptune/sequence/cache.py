@@ -27,7 +27,7 @@ from adaptune.sequence.scan import Scan
 
 _log = logging.getLogger(__name__)
 
-_VERSION = 1
+_VERSION = 2
 _SAMPLE = 1 << 16
 _CAP_GB = 50.0
 # A writer that has not written for this long is taken for dead.

@@ -11,6 +11,7 @@ from rosbags.interfaces import Nodetype
 
 from adaptune.sequence.pointcloud2 import PointCloudError, from_fields
 from adaptune.sequence.scan import Scan
+from adaptune.sequence.serialized import Serialized
 from adaptune.sequence.timing import Timing
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
@@ -58,46 +59,36 @@ def decode(
     PointCloudError
         If the message is not as its definition says.
     """
-    little = not cdr or data[1:2] == b"\x01"
-    order = "<" if little else ">"
     try:
-        stamp, raw = _parse(
-            data[4:] if cdr else data, tuple(message), tuple(point), cdr=cdr, order=order
-        )
+        stamp, raw = _parse(Serialized(data, cdr), tuple(message), tuple(point), cdr)
     except (struct.error, KeyError, ValueError, IndexError) as error:
         raise PointCloudError(f"not a Livox message as its definition says ({error})") from error
     return from_fields(raw, stamp, timing)
 
 
 def _parse(
-    data: bytes | memoryview, message: _Fields, point: _Fields, *, cdr: bool, order: str
+    body: Serialized, message: _Fields, point: _Fields, cdr: bool
 ) -> tuple[int, NDArray[Any]]:
-    # In ROS 1 a header begins with its sequence number.
-    at = 0 if cdr else 4
-    seconds, nanoseconds, length = struct.unpack_from(order + "III", data, at)
-    at += 12 + length
     if message[0][0] != "header":
         raise ValueError("it does not begin with a header")
+    stamp = body.header()
     for name, description in message[1:]:
         if name == "points":
             break
         size, number = _extent(description)
-        at = _aligned(at, size if cdr else 1) + size * number
+        body.align(size)
+        body.block(size * number)
     else:
         raise KeyError("points")
-    at = _aligned(at, 4 if cdr else 1)
-    (count,) = struct.unpack_from(order + "I", data, at)
-    at += 4
-    dtype, used = _point_dtype(point, cdr, order)
-    needed = at + (count - 1) * dtype.itemsize + used if count else at
-    if len(data) < needed:
-        raise ValueError(f"{count} points need {needed} bytes, there are {len(data)}")
-    raw = np.ndarray((max(count - 1, 0),), dtype, buffer=data, offset=at)
-    if count:
-        last = np.zeros(1, dtype)
-        last.view(np.uint8)[:used] = np.frombuffer(data, np.uint8, used, needed - used)
-        raw = np.concatenate([raw, last])
-    return seconds * 10**9 + nanoseconds, raw
+    count = body.uint32()
+    dtype, used = _point_dtype(point, cdr, body.order)
+    if not count:
+        return stamp, np.empty(0, dtype)
+    data = body.block((count - 1) * dtype.itemsize + used)
+    raw = np.ndarray((count - 1,), dtype, data)
+    last = np.zeros(1, dtype)
+    last.view(np.uint8)[:used] = np.frombuffer(data[-used:], np.uint8)
+    return stamp, np.concatenate([raw, last])
 
 
 @lru_cache(maxsize=8)

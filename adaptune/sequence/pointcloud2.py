@@ -1,15 +1,16 @@
 """sensor_msgs/PointCloud2 to scans."""
 
+import struct
 from collections.abc import Callable, Mapping
-from functools import cache, lru_cache
-from math import isfinite
-from typing import Any
+from functools import cache, lru_cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.sequence.scan import Scan
+from adaptune.sequence.serialized import Serialized
 from adaptune.sequence.timing import AUTO, TIME_FIELDS, Timing, TimingError
 
 # The numbers of sensor_msgs/PointField's datatypes.
@@ -22,36 +23,78 @@ class PointCloudError(AdaptuneError):
     """A message that does not describe a point cloud."""
 
 
-def stamp_ns(header: Any) -> int:
-    """Stamp of a std_msgs/Header in nanoseconds."""
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+Field = tuple[str, int, int, int]
+"""Name, offset, datatype and count, in the order of sensor_msgs/PointField."""
 
 
-def point_dtype(message: Any) -> np.dtype[Any]:
-    """Structured type of one point of a message.
+class PointCloud2(NamedTuple):
+    """What a message tells of its points, and their bytes."""
+
+    stamp: int
+    height: int
+    width: int
+    fields: tuple[Field, ...]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: memoryview
+
+
+def parse(data: bytes | memoryview, cdr: bool) -> PointCloud2:
+    """Read a serialised message without a copy of its points.
+
+    Parameters
+    ----------
+    data
+        The message as it lies in the bag.
+    cdr
+        Whether it is serialised as in ROS 2.
+
+    Raises
+    ------
+    PointCloudError
+        If it is cut short, or longer than it declares.
+    """
+    try:
+        body = Serialized(data, cdr)
+        cloud = PointCloud2(
+            stamp=body.header(),
+            height=body.uint32(),
+            width=body.uint32(),
+            fields=tuple(
+                (body.text(), body.uint32(), body.uint8(), body.uint32())
+                for _ in range(body.uint32())
+            ),
+            is_bigendian=bool(body.uint8()),
+            point_step=body.uint32(),
+            row_step=body.uint32(),
+            data=body.block(body.uint32()),
+        )
+        body.uint8()  # is_dense, which drivers set as they like
+        body.end()
+    except (struct.error, ValueError, IndexError) as error:
+        raise PointCloudError(f"not a whole PointCloud2 ({error})") from error
+    return cloud
+
+
+@lru_cache(maxsize=64)
+def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) -> np.dtype[Any]:
+    """Structured type of one point.
 
     Raises
     ------
     PointCloudError
         If fields are of an unknown type, repeat themselves or lie outside the point.
     """
-    fields = tuple((f.name, f.datatype, f.offset, f.count) for f in message.fields)
-    return _point_dtype(fields, bool(message.is_bigendian), int(message.point_step))
-
-
-@lru_cache(maxsize=64)
-def _point_dtype(
-    fields: tuple[tuple[str, int, int, int], ...], bigendian: bool, point_step: int
-) -> np.dtype[Any]:
     if point_step > _LARGEST_POINT:
         raise PointCloudError(f"a point of {point_step} bytes is none")
     names, formats, offsets = [], [], []
-    for name, datatype, offset, count in fields:
+    for name, offset, datatype, count in fields:
         if datatype not in _DATATYPES:
             raise PointCloudError(f"field {name!r} has unknown datatype {datatype}")
         if name in names:
             raise PointCloudError(f"field {name!r} appears twice")
-        single = np.dtype((">" if bigendian else "<") + _DATATYPES[datatype])
+        single = np.dtype((">" if is_bigendian else "<") + _DATATYPES[datatype])
         # Some drivers leave the count at zero.
         if offset + single.itemsize * max(count, 1) > point_step:
             raise PointCloudError(f"field {name!r} ends beyond the point's {point_step} bytes")
@@ -68,7 +111,7 @@ def _point_dtype(
     )
 
 
-def read_points(message: Any) -> NDArray[Any]:
+def read_points(cloud: PointCloud2) -> NDArray[Any]:
     """All points of a message as a structured array of shape (height * width,), without a copy.
 
     Raises
@@ -76,33 +119,33 @@ def read_points(message: Any) -> NDArray[Any]:
     PointCloudError
         If the message lacks x, y or z, or holds fewer bytes than it declares.
     """
-    height, width = int(message.height), int(message.width)
-    dtype = point_dtype(message)
+    height, width, size = cloud.height, cloud.width, len(cloud.data)
+    dtype = point_dtype(cloud.fields, cloud.is_bigendian, cloud.point_step)
     if not height * width:
         return np.empty(0, dtype)
-    row_step = max(int(message.row_step), width * dtype.itemsize)
+    row_step = max(cloud.row_step, width * dtype.itemsize)
     needed = (height - 1) * row_step + width * dtype.itemsize
-    if len(message.data) < needed:
+    if size < needed:
         raise PointCloudError(
             f"{height} x {width} points of {dtype.itemsize} bytes need {needed} bytes, "
-            f"there are {len(message.data)}"
+            f"there are {size}"
         )
-    rows = np.ndarray(
-        (height, width), dtype, buffer=message.data, strides=(row_step, dtype.itemsize)
-    )
+    rows = np.ndarray((height, width), dtype, cloud.data, strides=(row_step, dtype.itemsize))
     return rows.reshape(-1)
 
 
-def decode(message: Any, timing: Timing = AUTO) -> Scan:
-    """Decode a message.
+def decode(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
+    """Decode a serialised sensor_msgs/PointCloud2.
 
     Points that are not finite are dropped, and so are those at the very origin, by which drivers
     mark rays that did not come back.
 
     Parameters
     ----------
-    message
-        A sensor_msgs/PointCloud2 as rosbags gives it.
+    data
+        The message as it lies in the bag.
+    cdr
+        Whether it is serialised as in ROS 2.
     timing
         What its stamps mean.
 
@@ -111,7 +154,8 @@ def decode(message: Any, timing: Timing = AUTO) -> Scan:
     PointCloudError
         If the message is malformed, lacks x, y or z, or has times that cannot be.
     """
-    return from_fields(read_points(message), stamp_ns(message.header), timing)
+    cloud = parse(data, cdr)
+    return from_fields(read_points(cloud), cloud.stamp, timing)
 
 
 def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timing: Timing) -> Scan:
@@ -140,41 +184,31 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
             raise PointCloudError(f"field {name!r} is not one number for each point")
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = (np.asarray(columns[axis], np.float32) for axis in "xyz")
-        times = None if time is None else _native(columns[time])
-        rings = None if ring is None else np.ascontiguousarray(columns[ring], np.uint16)
-    points = np.empty((len(x), 3), np.float32)
-    gather, compact = _kernels()
-    if invalid := gather(x, y, z, points):
-        index = np.empty(len(points), np.int64)
-        compact(points, index)
-        count = len(points) - invalid
-        points, index = points[:count].copy(), index[:count]
-        times = None if times is None else times.take(index)
-        rings = None if rings is None else rings.take(index)
-    extent = _extent(times)
-    # The least and the greatest are not numbers if any is not.
-    if times is not None and not isfinite(extent[1] - extent[0]):
-        known = np.isfinite(times)
-        points, times = points[known], times[known]
-        rings = None if rings is None else rings[known]
-        extent = _extent(times)
+        given_rings = _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16)
+    given_times = _NO_TIMES if time is None else _native(columns[time])
+    n = len(x)
+    points = np.empty((n, 3), np.float32)
+    times = np.empty(len(given_times), given_times.dtype)
+    rings = np.empty(len(given_rings), np.uint16)
+    gather, compact = _kernels(times.dtype.str)
+    valid, low, high = gather(x, y, z, given_times, given_rings, points, times, rings)
+    if valid < n:
+        _, low, high = compact(points, times, rings)
+        # Others are not to be kept in memory with them.
+        points, times, rings = points[:valid].copy(), times[:valid].copy(), rings[:valid].copy()
     try:
-        start, seconds = timing.resolve(stamp, times, extent)
+        start, seconds = timing.resolve(stamp, None if time is None else times, (low, high))
     except TimingError as error:
         raise PointCloudError(str(error)) from error
-    return Scan(start, points, seconds, rings)
+    return Scan(start, points, seconds, None if ring is None else rings)
 
 
-def _extent(times: NDArray[Any] | None) -> tuple[float, float]:
-    """The least and the greatest, zeros where there is none."""
-    if times is None or not len(times):
-        return 0.0, 0.0
-    return times.min().item(), times.max().item()
+_NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
 
 
 def _native(values: NDArray[Any]) -> NDArray[Any]:
-    """Values in the machine's byte order, without gaps."""
-    return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+    """Values in the machine's byte order."""
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 # Single precision keeps the loops fast.
@@ -182,46 +216,80 @@ _ZERO, _INFINITE = np.float32(0.0), np.float32(np.inf)
 
 
 def _gather(
-    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], out: NDArray[np.float32]
-) -> int:
-    """Put coordinates side by side, and count the points that are not valid."""
-    count = 0
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
+    given_times: NDArray[Any],
+    given_rings: NDArray[np.uint16],
+    points: NDArray[np.float32],
+    times: NDArray[Any],
+    rings: NDArray[np.uint16],
+) -> tuple[int, Any, Any]:
+    """Put each field side by side; count the valid points, and find the extent of times."""
+    timed, ringed = len(given_times) > 0, len(given_rings) > 0
+    low = high = given_times[0] if timed else times.dtype.type(0)
+    valid = 0
     for i in range(len(x)):
         a, b, c = x[i], y[i], z[i]
-        out[i, 0] = a
-        out[i, 1] = b
-        out[i, 2] = c
+        points[i, 0] = a
+        points[i, 1] = b
+        points[i, 2] = c
         # Not a number or infinite if any coordinate is, zero if all of them are.
         square = a * a + b * b + c * c
-        if not (square > _ZERO and square < _INFINITE):
-            count += 1
-    return count
+        good = (square > _ZERO) & (square < _INFINITE)
+        if timed:
+            t = given_times[i]
+            times[i] = t
+            low, high = min(low, t), max(high, t)
+            good &= t - t == 0
+        if ringed:
+            rings[i] = given_rings[i]
+        valid += good
+    return valid, low, high
 
 
-def _compact(points: NDArray[np.float32], index: NDArray[np.int64]) -> None:
-    """Move the valid points, and where they were, to the front."""
+def _compact(
+    points: NDArray[np.float32], times: NDArray[Any], rings: NDArray[np.uint16]
+) -> tuple[int, Any, Any]:
+    """Move the valid points to the front; count them, and find the extent of their times."""
+    timed, ringed = len(times) > 0, len(rings) > 0
+    low = high = times.dtype.type(0)
     count = 0
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        square = x * x + y * y + z * z
+        good = (square > _ZERO) & (square < _INFINITE)
+        if timed:
+            t = times[i]
+            good &= t - t == 0
+        if not good:
+            continue
         points[count, 0] = x
         points[count, 1] = y
         points[count, 2] = z
-        index[count] = i
-        square = x * x + y * y + z * z
-        # The next point takes the place of one that is not valid.
-        if _ZERO < square < _INFINITE:
-            count += 1
+        if timed:
+            times[count] = t
+            low, high = (min(low, t), max(high, t)) if count else (t, t)
+        if ringed:
+            rings[count] = rings[i]
+        count += 1
+    return count, low, high
 
 
 @cache
-def _kernels() -> tuple[Callable[..., int], Callable[..., None]]:
+def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Gather and compact clouds whose times are of this type."""
     # Importing numba takes a while, and a bag may never be read.
     import numba
 
     # Fields lie at any offset; what is aligned may be taken for what is not.
-    column = numba.types.Array(numba.float32, 1, "A", readonly=True, aligned=False)
-    points = numba.types.Array(numba.float32, 2, "C")
-    index = numba.types.Array(numba.int64, 1, "C")
-    gather: Any = numba.njit(numba.int64(column, column, column, points), nogil=True, cache=True)
-    compact: Any = numba.njit(numba.void(points, index), nogil=True, cache=True)
-    return gather(_gather), compact(_compact)
+    def column(scalar: Any) -> Any:
+        return types.Array(scalar, 1, "A", readonly=True, aligned=False)
+
+    types: Any = numba.types
+    real, whole, time = numba.float32, numba.uint16, numba.from_dtype(np.dtype(kind))
+    scan = (types.Array(real, 2, "C"), types.Array(time, 1, "C"), types.Array(whole, 1, "C"))
+    told = types.Tuple((numba.int64, time, time))
+    compiled = partial(numba.njit, nogil=True, cache=True)
+    given = (column(real), column(real), column(real), column(time), column(whole))
+    return compiled(told(*given, *scan))(_gather), compiled(told(*scan))(_compact)

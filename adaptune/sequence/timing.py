@@ -105,7 +105,10 @@ class Timing:
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:
             times = np.ascontiguousarray(values)
         else:
-            times = ((values - values.dtype.type(zero)) * scale).astype(np.float32)
+            # The difference of small integers is not always one of them.
+            small = values.dtype.kind in "iu" and values.dtype.itemsize < 8
+            wide = values.astype(np.int64) if small else values
+            times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
         return stamp + round(begin * 1e9), times
 
     def _scale(self, dtype: np.dtype[Any], high: float) -> tuple[float, bool]:

@@ -15,10 +15,10 @@ def recording(path):
     scans, translations, quaternions = [], [], []
     with AnyReader([path]) as reader:
         for connection, _, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
             if connection.topic == "/velodyne_points":
-                scans.append(pointcloud2.decode(message))
+                scans.append(pointcloud2.decode(data, cdr=False))
             elif connection.topic == "/gt_poses":
+                message = reader.deserialize(data, connection.msgtype)
                 p, q = message.pose.position, message.pose.orientation
                 translations.append((p.x, p.y, p.z))
                 quaternions.append((q.x, q.y, q.z, q.w))

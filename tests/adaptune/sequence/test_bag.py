@@ -403,30 +403,6 @@ def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec: Any, tmp_pat
         opened(bag, points="/odd")
 
 
-def test_random_damage_gives_scans_or_an_error(rec: Any, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    sources = [
-        rec.drive(tmp_path / "a.bag", n=4),
-        rec.drive(tmp_path / "b.bag", n=4, compression="LZ4"),
-        file_of(rec.drive(tmp_path / "c.mcap", n=4)),
-        file_of(rec.drive(tmp_path / "d.sqlite3", n=4)),
-    ]
-    errors = 0
-    for number in range(120):
-        source = sources[number % len(sources)]
-        data = bytearray(source.read_bytes())
-        for at in rng.integers(0, len(data), rng.integers(1, 20)):
-            data[at] = rng.integers(0, 256)
-        copy = tmp_path / f"damaged{source.suffix}"
-        copy.write_bytes(data)
-        try:
-            for scan in opened(copy, points="/points"):
-                assert np.isfinite(scan.points).all()
-        except AdaptuneError:
-            errors += 1
-    assert 0 < errors < 120
-
-
 def test_the_botanic_garden_scan(recorded_data: Any) -> None:
     (scan,) = opened(recorded_data("botanic_garden_scan.bag"))
     assert len(scan) == 24_859

@@ -5,10 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from rosbags.typesys import Stores, get_typestore
 
-from adaptune.sequence.pointcloud2 import PointCloudError, decode, stamp_ns
-from adaptune.sequence.timing import Timing
+from adaptune.sequence import Scan, pointcloud2
+from adaptune.sequence.pointcloud2 import PointCloudError
+from adaptune.sequence.timing import AUTO, Timing
 
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = ["f4", "f8", "i2", "u1", "u2", "u4", "i4"]
 
 
@@ -20,6 +23,12 @@ def raw_of(n: int, **fields: Any) -> np.ndarray:
     for name, (_, values) in fields.items():
         raw[name] = values
     return raw
+
+
+def decode(message: Any, timing: Timing = AUTO) -> Scan:
+    """Decode a message of ROS 2 from what it is serialised to."""
+    data = _STORE.serialize_cdr(message, message.__msgtype__)
+    return pointcloud2.decode(bytes(data), cdr=True, timing=timing)
 
 
 @st.composite
@@ -135,6 +144,7 @@ DIALECTS = {
     ),
     "hesai, clock years off": ("timestamp", "<f8", [1e9, 1e9 + 0.1, 1e9 + 0.2], NS, None, 0),
     "livox": ("timestamp", "<f8", [NS, NS + 5e7, NS + 1e8], NS, [0, 0.05, 0.1], 0),
+    "ends of small integers": ("t", "<i1", [-128, 0, 127], NS, [0, 128e-9, 255e-9], 0),
     "microseconds, absolute": ("timestamp", "<f8", [S * 1e6, S * 1e6 + 1e5], NS, [0, 0.1], 0),
 }
 
@@ -235,8 +245,34 @@ def test_no_points_are_a_scan(rec: Any) -> None:
     assert scan.points.shape == (0, 3)
 
 
-def test_the_stamp_is_exact(rec: Any) -> None:
-    assert stamp_ns(rec.header(rec.START)) == rec.START
+@pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd"])
+def test_a_message_is_the_same_however_it_is_serialised(rec: Any, frame: str) -> None:
+    raw = rec.velodyne(rec.scans(1)[0])
+    forms = []
+    for store, serialise in (
+        (rec.ROS1, rec.ROS1.serialize_ros1),
+        (rec.ROS2, rec.ROS2.serialize_cdr),
+        (rec.ROS2, lambda m, kind: rec.ROS2.serialize_cdr(m, kind, little_endian=False)),
+    ):
+        message = rec.cloud(raw, store=store, header=rec.header(rec.START, frame, store))
+        forms.append((bytes(serialise(message, message.__msgtype__)), store is rec.ROS2))
+    for data, cdr in forms:
+        cloud = pointcloud2.parse(data, cdr)
+        assert cloud.stamp == rec.START
+        assert [name for name, *_ in cloud.fields] == list(raw.dtype.names or ())
+        assert np.array_equal(pointcloud2.read_points(cloud), raw)
+
+
+@pytest.mark.parametrize("cdr", [False, True])
+def test_a_message_cut_short_or_too_long_is_refused(rec: Any, cdr: bool) -> None:
+    store = rec.ROS2 if cdr else rec.ROS1
+    message = rec.cloud(rec.velodyne(rec.scans(1, 3)[0]), store=store)
+    serialise = store.serialize_cdr if cdr else store.serialize_ros1
+    data = bytes(serialise(message, message.__msgtype__))
+    assert len(pointcloud2.decode(data, cdr)) == 3
+    for damaged in [*(data[:n] for n in range(len(data))), data + bytes(4)]:
+        with pytest.raises(PointCloudError, match="not a whole PointCloud2"):
+            pointcloud2.decode(damaged, cdr)
 
 
 @settings(max_examples=200, deadline=None)

@@ -1,0 +1,62 @@
+"""velodyne_msgs/VelodyneScan, the raw packets of a turn, to scans."""
+
+import struct
+from collections.abc import Callable
+
+from adaptune.sequence.pointcloud2 import PointCloudError, from_fields
+from adaptune.sequence.scan import Scan
+from adaptune.sequence.serialized import Serialized
+from adaptune.sequence.timing import Timing
+
+TYPES = ("velodyne_msgs/msg/VelodyneScan",)
+_PACKET = 1206
+
+
+def decoder(cdr: bool) -> Callable[[bytes], Scan]:
+    """What decodes the messages of one LiDAR, whose model its packets tell.
+
+    A scan starts when its first packet was received, whatever the header's stamp marks.
+
+    Parameters
+    ----------
+    cdr
+        Whether they are serialised as in ROS 2.
+
+    Returns
+    -------
+    callable
+        Takes a message as it lies in the bag; raises PointCloudError if it is not whole, or not
+        of a model that is known.
+
+    Raises
+    ------
+    ImportError
+        If velodyne_decoder is not installed.
+    """
+    import velodyne_decoder
+
+    config = velodyne_decoder.Config()
+    config.timestamp_first_packet = True
+    turn = velodyne_decoder.ScanDecoder(config)
+
+    def decode(data: bytes) -> Scan:
+        try:
+            body = Serialized(data, cdr)
+            body.header()
+            packets = []
+            for _ in range(body.uint32()):
+                stamp = body.uint32() * 10**9 + body.uint32()
+                packets.append((stamp, bytes(body.block(_PACKET))))
+            body.end()
+        except (struct.error, ValueError, IndexError) as error:
+            raise PointCloudError(f"not a whole VelodyneScan ({error})") from error
+        if not packets:  # would crash it
+            raise PointCloudError("holds no packet")
+        raw = [velodyne_decoder.VelodynePacket(at * 1e-9, packet) for at, packet in packets]
+        try:
+            _, points = turn.decode(velodyne_decoder.PacketVector(raw), True)
+        except RuntimeError as error:
+            raise PointCloudError(str(error)) from error
+        return from_fields(points, packets[0][0], Timing("start"))
+
+    return decode

@@ -1,0 +1,274 @@
+"""Damages messages and bags at random, and looks at what the readers make of them.
+
+    python tests/support/fuzz.py [--messages 8000] [--bags 2000] [--seed 0]
+
+Whatever is damaged must become scans that can be or an error that says so: no other exception, no
+crash, no more than a few seconds of the processor, no more than two gigabytes.
+"""
+
+import argparse
+import contextlib
+import faulthandler
+import resource
+import signal
+import struct
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import get_types_from_msg
+
+from adaptune.errors import AdaptuneError
+from adaptune.sequence import Scan, SequenceConfig, livox, open_sequence, pointcloud2
+from adaptune.sequence.export import Messages
+from adaptune.sequence.pointcloud2 import PointCloudError
+from adaptune.sequence.timing import AUTO
+
+SECONDS, BYTES = 10, 2 << 30
+START = 1_700_000_000_123_456_789
+CLOUD, LIVOX = "sensor_msgs/msg/PointCloud2", livox.TYPES[0]
+# What a count or an offset is most wrong with.
+WORDS = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 0x10000, 0x7FC00000, 0x7F800000)
+LAYOUTS = {
+    "velodyne": [*((a, "<f4") for a in "xyz"), ("ring", "<u2"), ("time", "<f4")],
+    "plain": [(a, "<f4") for a in "xyz"],
+}
+
+Decode = Callable[[bytes], Scan]
+
+
+def stores() -> dict[bool, Messages]:
+    """What makes messages of ROS 1 and of ROS 2, Livox's among them."""
+    made = {False: Messages(1), True: Messages(2)}
+    types: Any = {}
+    for name, text in livox.DEFINITIONS.items():
+        types.update(get_types_from_msg(text, name))
+    for messages in made.values():
+        with contextlib.suppress(Exception):  # registered before
+            messages.typestore.register(types)
+    return made
+
+
+def message(made: Messages, kind: str, stamp: int, rng: np.random.Generator, n: int = 30) -> Any:
+    """A cloud or a Livox message of `n` points."""
+    header = made.header("/points", stamp, "lidar")
+    points = rng.normal(0, 10, (n, 3)).astype(np.float32)
+    if kind == LIVOX:
+        t = made.types
+        each = [
+            t[LIVOX.replace("Msg", "Point")](i * 1000, *map(float, p), 1, 2, i % 6)
+            for i, p in enumerate(points)
+        ]
+        return t[LIVOX](header, stamp, n, 1, np.zeros(3, np.uint8), each)
+    raw = np.zeros(n, LAYOUTS[kind])
+    raw["x"], raw["y"], raw["z"] = points.T
+    if kind == "velodyne":
+        raw["ring"], raw["time"] = np.arange(n) % 16, np.linspace(0, 0.1, n)
+    return made.cloud(header, raw)
+
+
+def samples() -> Iterator[tuple[bytes, Decode]]:
+    """Serialised messages of every kind, each with what decodes it."""
+    rng = np.random.default_rng(0)
+    for cdr, made in stores().items():
+        store = made.typestore
+        for kind in (*LAYOUTS, LIVOX):
+            typename = LIVOX if kind == LIVOX else CLOUD
+            sound = message(made, kind, START, rng)
+            if kind == LIVOX:
+                fields = store.fielddefs
+                decode: Decode = _livox(fields, cdr)
+            else:
+                decode = _cloud(cdr)
+            if cdr:
+                yield bytes(store.serialize_cdr(sound, typename)), decode
+                yield bytes(store.serialize_cdr(sound, typename, little_endian=False)), decode
+            else:
+                yield bytes(store.serialize_ros1(sound, typename)), decode
+
+
+def _cloud(cdr: bool) -> Decode:
+    return lambda data: pointcloud2.decode(data, cdr)
+
+
+def _livox(fields: Any, cdr: bool) -> Decode:
+    point = fields[LIVOX.replace("Msg", "Point")][1]
+    return lambda data: livox.decode(data, fields[LIVOX][1], point, cdr, AUTO)
+
+
+def damage(data: bytes, rng: np.random.Generator) -> bytes:
+    """Flip, overwrite, lose, repeat or insert some bytes."""
+    changed = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        if not changed:
+            break
+        # Headers and indices lie at both ends.
+        reach = min(len(changed), 300) if rng.random() < 0.4 else len(changed)
+        at = int(rng.integers(reach))
+        at = len(changed) - 1 - at if rng.random() < 0.3 else at
+        match rng.choice(6, p=[0.3, 0.25, 0.3, 0.05, 0.05, 0.05]):
+            case 0:
+                changed[at] ^= 1 << int(rng.integers(8))
+            case 1:
+                changed[at] = int(rng.integers(256))
+            case 2:
+                word = struct.pack(str(rng.choice(["<I", ">I"])), int(rng.choice(WORDS)))
+                changed[at : at + 4] = word[: len(changed) - at]
+            case 3:
+                del changed[at : at + int(rng.integers(1, 40))]
+            case 4:
+                changed[at:at] = changed[at : at + int(rng.integers(1, 40))]
+            case _:
+                del changed[max(at, 1) :]
+    return bytes(changed)
+
+
+def check(scan: Scan) -> None:
+    """Make sure that a scan can be one."""
+    assert np.isfinite(scan.points).all()
+    assert (scan.points != 0).any(axis=1).all()
+    for values in (scan.times, scan.rings):
+        assert values is None or len(values) == len(scan)
+    if scan.times is not None and len(scan):
+        assert scan.times.min() >= 0
+        assert scan.times.max() <= 10.001
+
+
+def fuzz_messages(number: int, seed: int) -> Counter[str]:
+    """Decode so many damaged messages, and count what became of them."""
+    rng = np.random.default_rng(seed)
+    sound = list(samples())
+    counts: Counter[str] = Counter()
+    for i in range(number):
+        data, decode = sound[i % len(sound)]
+        damaged = damage(data, rng)
+        with case(f"message {i} of seed {seed}"):
+            try:
+                check(decode(damaged))
+                counts["scans"] += 1
+            except PointCloudError:
+                counts["errors"] += 1
+    return counts
+
+
+def bags(folder: Path, scans: int = 4) -> list[Path]:
+    """Bags of every format and compression; of ROS 2, the files themselves and their folders."""
+    made = []
+    rng = np.random.default_rng(0)
+    for cdr, messages in stores().items():
+        store = messages.typestore
+        options: list[Any] = [None, "BZ2", "LZ4"]
+        if cdr:
+            options = [(s, c) for s in ("SQLITE3", "MCAP") for c in (None, "MESSAGE", "FILE")]
+            options += [("MCAP", "STORAGE")]
+        for option in options:
+            path = folder / f"{'ros2' if cdr else 'ros1'}_{option}.bag".replace("'", "")
+            path = path.with_suffix("") if cdr else path
+            with _writer(path, cdr, option) as writer:
+                topics = {
+                    kind: writer.add_connection(f"/{name}", kind, typestore=store)
+                    for name, kind in (("points", CLOUD), ("livox", LIVOX))
+                }
+                for i in range(scans):
+                    stamp = START + i * 10**8
+                    for kind, topic in topics.items():
+                        layout = "velodyne" if kind == CLOUD else LIVOX
+                        given = message(messages, layout, stamp, rng)
+                        serialise = store.serialize_cdr if cdr else store.serialize_ros1
+                        writer.write(topic, stamp, serialise(given, kind))
+            made.append(path)
+    return made
+
+
+def _writer(path: Path, cdr: bool, option: Any) -> Any:
+    if not cdr:
+        writer = rosbag1.Writer(path)
+        if option:
+            writer.set_compression(rosbag1.Writer.CompressionFormat[option])
+        return writer
+    storage, mode = option
+    plugin = rosbag2.StoragePlugin[storage]
+    folder = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+    if mode:
+        folder.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    return folder
+
+
+def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
+    """Read so many damaged bags, and count what became of them."""
+    rng = np.random.default_rng(seed)
+    sound = bags(folder)
+    counts: Counter[str] = Counter()
+    for i in range(number):
+        original = sound[i % len(sound)]
+        files = sorted(original.iterdir()) if original.is_dir() else [original]
+        hit = files[int(rng.integers(len(files)))]
+        whole = hit.read_bytes()
+        hit.write_bytes(damage(whole, rng))
+        # A file is read alone as well as in its folder.
+        bare = hit.suffix in (".mcap", ".db3") and rng.random() < 0.5
+        path = hit if bare else original
+        topic = str(rng.choice(["/points", "/livox"]))
+        try:
+            with case(f"bag {i} of seed {seed}, {path.name}"):
+                try:
+                    scans = list(
+                        open_sequence(SequenceConfig(bag=str(path), points=topic, cache=False))
+                    )
+                    for scan in scans:
+                        check(scan)
+                    assert (np.diff([scan.stamp for scan in scans]) > 0).all()
+                    counts["scans"] += 1
+                except AdaptuneError:
+                    counts["errors"] += 1
+        finally:
+            hit.write_bytes(whole)
+    return counts
+
+
+@contextlib.contextmanager
+def case(what: str) -> Iterator[None]:
+    """Tell what was damaged where something else happens than should, and stop what does not end.
+
+    Raises
+    ------
+    AssertionError
+        Naming the case.
+    """
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"took more than {SECONDS} s")
+
+    before = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    try:
+        yield
+    except Exception as error:
+        raise AssertionError(f"{what}: {error!r}") from error
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def main() -> None:
+    """Fuzz, and tell what became of all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--messages", type=int, default=8000)
+    parser.add_argument("--bags", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    faulthandler.enable()
+    print(f"messages: {dict(fuzz_messages(options.messages, options.seed))}", flush=True)  # noqa: T201
+    with tempfile.TemporaryDirectory() as folder:
+        print(f"bags: {dict(fuzz_bags(options.bags, options.seed, Path(folder)))}")  # noqa: T201
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"seed {options.seed}, peak memory {peak:.0f} MB")  # noqa: T201
+    assert peak < BYTES >> 20
+
+
+if __name__ == "__main__":
+    main()
