@@ -42,7 +42,7 @@ from adaptune.odometry import (
 )
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
-from adaptune.sequence.config import ViewConfig, expand
+from adaptune.sequence.config import ViewConfig, check_sequence, expand
 from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course, as_sequence
 from adaptune.space import ParameterSet, ParameterSpace, Value, nearest
@@ -673,7 +673,7 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list
             problems.append((("courses", name), "there is a sequence of the same name"))
         if found is not None:
             try:
-                open_sequence(found)
+                check_sequence(found)
             except AdaptuneError as error:
                 problems.append((("sequences", name), str(error)))
     _check_roles(data, {*sequences, *courses}, problems)

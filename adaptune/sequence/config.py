@@ -3,7 +3,6 @@
 import os
 import re
 from collections.abc import Callable
-from functools import cache as once
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -25,8 +24,6 @@ from adaptune.sequence import cache, views
 from adaptune.sequence.bag import IMU_TYPES, BagSource, bag_paths
 from adaptune.sequence.folder import kitti, scan_folder
 from adaptune.sequence.imu import USUAL, ImuNoise
-from adaptune.sequence.motion import compensate_rotation
-from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import (
     ImuSettings,
     RecordedSequence,
@@ -288,8 +285,12 @@ class SequenceConfig(_Part):
     max_gap : float
         Seconds; nothing is known between reference poses further apart.
     imu : ImuConfig, optional
-    compensate : {"gyro"}, optional
-        Take the rotation that the IMU measured out of every scan.
+    elevation : float, optional
+        Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
+        benchmark and the raw drives when left out.
+    compensate : {"constant_velocity", "gyro"}, optional
+        Take out of every scan the motion since the scan before, or the rotation that the IMU
+        measured.
     views : list of ViewConfig
     cache : bool
         Whether to keep decoded bags on disk.
@@ -310,7 +311,8 @@ class SequenceConfig(_Part):
     clock_offset: float = Field(0.0, allow_inf_nan=False)
     max_gap: float = Field(1.0, gt=0, allow_inf_nan=False)
     imu: ImuConfig | None = None
-    compensate: Literal["gyro"] | None = None
+    elevation: float | None = Field(None, ge=-5, le=5)
+    compensate: Literal["constant_velocity", "gyro"] | None = None
     views: tuple[ViewConfig, ...] = ()
     cache: bool = True
 
@@ -323,7 +325,9 @@ class SequenceConfig(_Part):
             )
         if self.points is not None and given[0] != "bag":
             raise ValueError(f"`points` names a topic of a bag; {given[0]} has none")
-        if self.compensate and self.imu is None:
+        if self.elevation is not None and given[0] != "kitti":
+            raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
+        if self.compensate == "gyro" and self.imu is None:
             raise ValueError("`compensate: gyro` needs `imu`")
         return self
 
@@ -336,6 +340,29 @@ def open_sequence(config: SequenceConfig) -> Sequence:
     SequenceError
         If it cannot be opened as described.
     """
+    sequence: views.Reversible = _recorded(config)
+    if config.compensate == "constant_velocity":
+        sequence = views.WithoutMotion(sequence)
+    elif config.compensate == "gyro":
+        sequence = views.without_rotation(sequence)
+    for view in config.views:
+        sequence = view.of(sequence)
+    return sequence
+
+
+def check_sequence(config: SequenceConfig) -> None:
+    """Find what would fail while it is read, without reading its scans.
+
+    Raises
+    ------
+    SequenceError
+        If it cannot be opened as described, ends before its `start`, or its reference is of
+        another time.
+    """
+    _recorded(config).check()
+
+
+def _recorded(config: SequenceConfig) -> RecordedSequence:
     reference: str | Path | None = config.reference
     if isinstance(reference, str) and reference.endswith(_REFERENCE_FILES):
         reference = Path(reference)
@@ -347,7 +374,7 @@ def open_sequence(config: SequenceConfig) -> Sequence:
         source.check(topic, None if config.imu is None else config.imu.topic)
         if config.imu is not None and config.bag is not None:
             source.topic(config.imu.topic, IMU_TYPES, "an IMU's measurements")
-    recorded = RecordedSequence(
+    return RecordedSequence(
         source,
         _section(config),
         ReferenceSettings(
@@ -360,19 +387,13 @@ def open_sequence(config: SequenceConfig) -> Sequence:
         _imu(config.imu),
         key,
     )
-    sequence: views.Reversible = recorded
-    if config.compensate:
-        sequence = _compensated(recorded)
-    for view in config.views:
-        sequence = view.of(sequence)
-    return sequence
 
 
 def _source(config: SequenceConfig) -> tuple[Source, str | None]:
     """What reads the recording, and under which key its decoded scans are kept."""
     timing = Timing(config.stamp, config.time_unit, config.period)
     if config.kitti is not None:
-        return kitti(Path(config.kitti)), None
+        return kitti(Path(config.kitti), config.elevation), None
     if config.folder is not None:
         return scan_folder(Path(config.folder), timing), None
     if config.evalio is not None:
@@ -402,14 +423,3 @@ def _imu(config: ImuConfig | None) -> ImuSettings | None:
     T = None if config.extrinsic is None else to_pose(config.extrinsic)
     scale = _STANDARD_GRAVITY if config.unit == "g" else 1.0
     return ImuSettings(config.topic, T, scale, ImuNoise(**config.noise.model_dump()))
-
-
-def _compensated(sequence: RecordedSequence) -> views.View:
-    """The sequence without the rotation that its gyroscope measured; the IMU is read once."""
-    imu = once(sequence.imu)
-
-    def change(scan: Scan) -> Scan:
-        measured = imu()
-        return scan if measured is None else compensate_rotation(scan, measured)
-
-    return views.View(sequence, change)

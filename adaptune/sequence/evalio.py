@@ -146,6 +146,11 @@ class _EvalioFiles:
             raise SequenceError(f"{self.name}: has no topics; leave `reference` out or name a file")
         return _poses(self._dataset)
 
+    def first_pose(self, name: str) -> int | None:
+        """There are no topics."""
+        self.poses(name, None)
+        return None
+
     def imu(self, name: str | None) -> Imu | None:
         """The data set's IMU."""
         if name is not None:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,8 @@ from adaptune.sequence.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+# Degrees by which the rays of KITTI's LiDAR are told too low.
+_ELEVATION = 0.205
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,8 @@ class FileSource:
         What the stamps mean.
     own_poses : callable, optional
         Reads the poses of the LiDAR that lie beside the files.
+    elevation : float
+        Degrees by which every ray is to be turned up.
     """
 
     name: str
@@ -45,6 +49,7 @@ class FileSource:
     stamps: NDArray[np.int64]
     timing: Timing = AUTO
     own_poses: Callable[[], Trajectory] | None = None
+    elevation: float = 0.0
 
     random_access: ClassVar[bool] = True
 
@@ -60,7 +65,13 @@ class FileSource:
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of the files' names."""
         for path, stamp in zip(self.files, self.stamps.tolist(), strict=True):
-            yield Frame(stamp, stamp, partial(read_scan, path, stamp, self.timing))
+            yield Frame(stamp, stamp, partial(self._load, path, stamp))
+
+    def _load(self, path: Path, stamp: int) -> Scan:
+        scan = read_scan(path, stamp, self.timing)
+        if not self.elevation:
+            return scan
+        return replace(scan, points=turn_up(scan.points, self.elevation))
 
     def span(self) -> tuple[int, int] | None:
         """First and last stamp."""
@@ -81,6 +92,11 @@ class FileSource:
                 f"{self.name}: has no topics; `reference` must be a file of poses, or be left out"
             )
         return None if self.own_poses is None else self.own_poses()
+
+    def first_pose(self, name: str) -> int | None:
+        """Folders have no topics."""
+        self.poses(name, None)
+        return None
 
     def imu(self, name: str | None) -> Imu | None:
         """Folders hold none."""
@@ -103,6 +119,28 @@ def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
         raise SequenceError(f"{path}: there is no such file") from error
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, PointCloudError) as error:
         raise SequenceError(f"{path}: cannot be read as a scan ({error})") from error
+
+
+def turn_up(points: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
+    """Turn every ray up by an angle, in the vertical plane in which it lies.
+
+    Parameters
+    ----------
+    points
+        Of shape (n, 3).
+    degrees
+        Those of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018; KISS-ICP
+        corrects it likewise).
+    """
+    sine, cosine = np.sin(np.deg2rad(degrees)), np.cos(np.deg2rad(degrees))
+    distance = np.hypot(points[:, 0], points[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = cosine - sine * points[:, 2] / distance
+    turned = np.empty_like(points)
+    # Straight up there is no plane to turn in.
+    turned[:, :2] = points[:, :2] * np.where(distance > 0, scale, 1.0)[:, None]
+    turned[:, 2] = np.where(distance > 0, sine * distance + cosine * points[:, 2], points[:, 2])
+    return turned
 
 
 def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
@@ -181,12 +219,19 @@ def _named_stamps(files: Sequence[Path]) -> NDArray[np.int64] | None:
     return None
 
 
-def kitti(folder: Path) -> FileSource:
+def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     """Scans of a KITTI odometry sequence, a KITTI raw drive or a KITTI-360 drive.
 
     The kind is told by what the folder holds: ``velodyne/`` with ``times.txt`` and ``calib.txt``
     (poses in ``poses.txt``, or ``poses/`` two folders up), or ``velodyne_points/data/`` (poses
     from ``oxts/``, or from ``data_poses/`` two folders up).
+
+    Parameters
+    ----------
+    folder
+        Of the sequence or the drive.
+    elevation
+        Degrees by which to turn up every ray; 0.205 when left out, and 0 for KITTI-360.
 
     Raises
     ------
@@ -194,9 +239,9 @@ def kitti(folder: Path) -> FileSource:
         If it holds neither, or files are missing.
     """
     if (folder / "velodyne").is_dir():
-        return _kitti_odometry(folder)
+        return _kitti_odometry(folder, _ELEVATION if elevation is None else elevation)
     if (folder / "velodyne_points" / "data").is_dir():
-        return _kitti_drive(folder)
+        return _kitti_drive(folder, elevation)
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
     raise SequenceError(
@@ -204,7 +249,7 @@ def kitti(folder: Path) -> FileSource:
     )
 
 
-def _kitti_odometry(folder: Path) -> FileSource:
+def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
     files = _scans(folder / "velodyne")
     stamps = _seconds(folder / "times.txt")
     if len(files) > len(stamps):
@@ -223,11 +268,15 @@ def _kitti_odometry(folder: Path) -> FileSource:
 
     # Files may be missing from the front or the middle: each is told by its number.
     return FileSource(
-        str(folder), files, _by_number(files, stamps), own_poses=poses if found else None
+        str(folder),
+        files,
+        _by_number(files, stamps),
+        own_poses=poses if found else None,
+        elevation=elevation,
     )
 
 
-def _kitti_drive(folder: Path) -> FileSource:
+def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
     points = folder / "velodyne_points"
     files = _scans(points / "data")
     started = points / "timestamps_start.txt"
@@ -238,7 +287,10 @@ def _kitti_drive(folder: Path) -> FileSource:
         poses = partial(_oxts_poses, folder)
     elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
         poses = partial(_kitti_360_poses, record, _dates(path))
-    return FileSource(str(folder), files, stamps, own_poses=poses)
+    if elevation is None:
+        # Only the raw drives tell when a turn started; KITTI-360 has another LiDAR.
+        elevation = _ELEVATION if started.exists() else 0.0
+    return FileSource(str(folder), files, stamps, own_poses=poses, elevation=elevation)
 
 
 def _oxts_poses(folder: Path) -> Trajectory:

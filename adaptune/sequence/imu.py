@@ -79,16 +79,23 @@ class Imu:
         )
 
 
-def clock_offset(trajectory: Trajectory, imu: Imu, rate: float = 50.0) -> float | None:
-    """Seconds to add to a trajectory's stamps so that it turns when the gyroscope does.
+def clock_offset(
+    trajectory: Trajectory,
+    stamps: NDArray[np.int64],
+    turning: NDArray[np.float64],
+    rate: float = 50.0,
+) -> float | None:
+    """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
 
     The rates of turning, which no choice of frames changes, are correlated at every offset at
     which the shorter recording lies at least half inside the other.
 
     Parameters
     ----------
-    trajectory, imu
-        Of the same motion, each on its own clock.
+    trajectory
+        On its own clock.
+    stamps, turning
+        Nanoseconds on the other clock and radians per second, of shape (n,).
     rate
         Samples per second to compare.
 
@@ -97,34 +104,32 @@ def clock_offset(trajectory: Trajectory, imu: Imu, rate: float = 50.0) -> float 
     float or None
         None where the two do not tell the same motion.
     """
-    if len(trajectory) < 3 or len(imu) < 3:
+    if len(trajectory) < 3 or len(stamps) < 3:
         return None
     turned = geometry.rotation_angle(geometry.steps(trajectory.T_world_sensor))
     seconds = np.diff(trajectory.stamps) * 1e-9
     middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
-    a = _sampled(middles, turned / seconds, rate)
-    # A gyroscope is faster than the poses: it is averaged over as long as they are apart.
-    window = max(round(np.median(seconds) * rate), 1)
-    gyro = np.linalg.norm(imu.angular_velocity, axis=1)
-    b = _sampled((imu.stamps - imu.stamps[0]) * 1e-9, gyro, rate)
-    b = np.convolve(b, np.ones(window) / window, mode="same")
+    other = (stamps - stamps[0]) * 1e-9
+    # Each is a mean over the time between its samples: it is averaged over the other's too.
+    a = _sampled(middles, turned / seconds, rate, float(np.median(np.diff(other))))
+    b = _sampled(other, turning, rate, float(np.median(seconds)))
     if min(len(a), len(b)) < 2 * rate:
         return None
     coefficients, lags = _correlation(a, b)
     best = int(np.argmax(coefficients))
     if coefficients[best] < _CORRELATION:
         return None
-    start = (imu.stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
+    start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
     return float(start + lags[best] / rate)
 
 
 def _sampled(
-    seconds: NDArray[np.float64], values: NDArray[np.float64], rate: float
+    seconds: NDArray[np.float64], values: NDArray[np.float64], rate: float, over: float
 ) -> NDArray[np.float64]:
     # Ten hours at 50 Hz; anything longer is a stamp gone wrong.
     grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / rate)
-    sampled: NDArray[np.float64] = np.interp(grid, seconds, values)
-    return sampled
+    window = min(max(round(over * rate), 1), max(len(grid), 1))
+    return np.convolve(np.interp(grid, seconds, values), np.ones(window) / window, mode="same")
 
 
 def _correlation(

@@ -1,17 +1,26 @@
 """Motion compensation: all points of a scan as seen from where the sensor was at its start."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from adaptune import geometry
 from adaptune.geometry import Poses
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 
 # Rotation changes slowly: between these many moments of a scan it is taken as constant.
 _MOMENTS = 64
+# Metres: cells and search radius for the registration of a scan with its neighbour.
+_CELL, _REACH = 0.5, 2.0
+# small_gicp crashes on an empty target.
+_FEWEST = 20
+# Seconds; the velocity between scans further apart says little about either.
+_FAR = 1.0
 
 
 def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
@@ -39,6 +48,72 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
     points = _rotate(scan, moments, Rotation.from_rotvec(moments[:, None] * twist))
     return replace(scan, points=points + scan.times[:, None] * velocity.astype(np.float32))
+
+
+def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | None, float]]:
+    """Register each scan with the one read before it (GICP).
+
+    Both were measured in the same motion, so that what it did to their points hardly matters.
+
+    Yields
+    ------
+    scan : Scan
+    T_before_scan : ndarray of shape (4, 4) or None
+        None where it is not known.
+    seconds : float
+        Between their stamps; negative where scans are read backwards.
+    """
+    import small_gicp
+
+    before: Any = None
+    last, guess = 0, np.eye(4)
+    for scan in scans:
+        now = None
+        if len(scan) >= _FEWEST:
+            now = small_gicp.preprocess_points(
+                scan.points.astype(np.float64), downsampling_resolution=_CELL, num_threads=1
+            )
+            now = now if now[0].size() >= _FEWEST else None
+        seconds = (scan.stamp - last) * 1e-9
+        T_before_scan = None
+        if before is not None and now is not None and 0 < abs(seconds) <= _FAR:
+            result = small_gicp.align(
+                before[0],
+                now[0],
+                before[1],
+                init_T_target_source=guess,
+                max_correspondence_distance=_REACH,
+                num_threads=1,
+            )
+            if result.converged and result.num_inliers > now[0].size() / 2:
+                T_before_scan = geometry.rectify(result.T_target_source)
+        yield scan, T_before_scan, seconds
+        guess = np.eye(4) if T_before_scan is None else T_before_scan
+        before, last = now, scan.stamp
+
+
+def compensate_neighbours(scans: Iterable[Scan]) -> Iterator[Scan]:
+    """Undo the motion within each scan, as fast as it was since the one read before.
+
+    A scan of which that is not known, such as the first, is given on as it is.
+    """
+    for scan, T_before_scan, seconds in neighbour_motions(scans):
+        if T_before_scan is None:
+            yield scan
+        elif seconds > 0:
+            yield compensate(scan, T_before_scan, seconds)
+        else:
+            yield compensate(scan, geometry.invert(T_before_scan), -seconds)
+
+
+def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """How fast the sensor turned: stamps between scans and radians per second, of shape (n,)."""
+    stamps, rates = [], []
+    for scan, T_before_scan, seconds in neighbour_motions(scans):
+        if T_before_scan is not None:
+            stamps.append(scan.stamp - round(seconds * 0.5e9))
+            rates.append(float(geometry.rotation_angle(T_before_scan)) / seconds)
+    return np.array(stamps, np.int64), np.array(rates, np.float64)
 
 
 def compensate_rotation(scan: Scan, imu: Imu) -> Scan:

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -14,10 +15,15 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.sequence import cache
 from adaptune.sequence.imu import USUAL, Imu, ImuNoise, clock_offset
+from adaptune.sequence.motion import turning_of
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
 _log = logging.getLogger(__name__)
+
+_OFFSET = " (the {} the same motion with clock_offset: {:.3f})"
+# So many scans are registered to find an offset.
+_MOST_SCANS = 600
 
 # No platform that carries a LiDAR is faster; only a jump of the reference is.
 _FASTEST = 100.0
@@ -110,6 +116,10 @@ class Source(Protocol):
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """Reference poses that the recording brings along, or those of one topic."""
+        ...
+
+    def first_pose(self, name: str) -> int | None:
+        """Stamp of the first pose on a topic."""
         ...
 
     def imu(self, name: str | None) -> Imu | None:
@@ -406,6 +416,42 @@ class RecordedSequence:
         self._check(trajectory)
         return trajectory
 
+    def check(self) -> None:
+        """Find early what would fail while the scans are read, without reading them.
+
+        Raises
+        ------
+        SequenceError
+            If the section begins after the end, or the reference cannot be read or is of another
+            time. Whether poses on a topic are of another time is told by the first of them.
+        """
+        span = self.source.span()
+        if span is None:
+            return
+        seconds = (span[1] - span[0]) * 1e-9
+        if self.section.start > seconds:
+            raise SequenceError(
+                f"{self.name}: start = {self.section.start:g} s is beyond its end, it lasts "
+                f"{seconds:.1f} s"
+            )
+        settings = self._reference
+        if isinstance(settings.source, str):
+            first = self.source.first_pose(settings.source)
+            offset = round(settings.clock_offset * 1e9)
+            if first is None or abs(first + offset - span[0]) <= span[1] - span[0]:
+                return
+        if isinstance(settings.source, Path) and is_kitti(settings.source):
+            self._check_count(settings.source, len(read_kitti(settings.source)))
+        else:
+            self.reference()
+
+    def _check_count(self, path: Path, n_poses: int) -> None:
+        if n_poses != self.source.n_messages:
+            raise SequenceError(
+                f"{path}: {n_poses} poses without stamps do not go with {self.source.n_messages} "
+                f"scans of {self.name}; give a file with stamps (TUM)"
+            )
+
     def _from_file(self, path: Path) -> Trajectory:
         try:
             if not is_kitti(path):
@@ -413,12 +459,8 @@ class RecordedSequence:
             poses = read_kitti(path)
         except TrajectoryError as error:
             raise SequenceError(str(error)) from error
+        self._check_count(path, len(poses))
         stamps = np.array([frame.stamp for frame in self.source.frames()], np.int64)
-        if len(stamps) != len(poses):
-            raise SequenceError(
-                f"{path}: {len(poses)} poses without stamps do not go with {len(stamps)} scans "
-                f"of {self.name}; give a file with stamps (TUM)"
-            )
         order = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1) > 0)
         return Trajectory(stamps[order], poses[order])
 
@@ -437,14 +479,22 @@ class RecordedSequence:
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:
-        """What the gyroscope says of the offset, where it says anything."""
+        """What the gyroscope says of the offset, or the scans themselves where there is none."""
         try:
             imu = self.source.imu(None if self._imu is None else self._imu.topic)
         except AdaptuneError:
             imu = None
-        if imu is not None and (found := clock_offset(trajectory, imu)) is not None:
-            return f" (the gyroscope tells the same motion with clock_offset: {found:.3f})"
-        return ""
+        if imu is not None:
+            turning = np.linalg.norm(imu.angular_velocity, axis=1)
+            found = clock_offset(trajectory, imu.stamps, turning)
+            return "" if found is None else _OFFSET.format("gyroscope tells", found)
+        _log.info("%s: comparing how its scans turn with the reference", self.name)
+        try:
+            stamps, turning = turning_of(islice(self._decode(Repairs()), _MOST_SCANS))
+        except AdaptuneError:
+            return ""
+        found = clock_offset(trajectory, stamps, turning)
+        return "" if found is None else _OFFSET.format("scans tell", found)
 
 
 def _seconds(begin: int, end: int) -> str:

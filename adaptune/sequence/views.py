@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from adaptune import geometry
 from adaptune.geometry import Poses
 from adaptune.sequence.imu import Imu
+from adaptune.sequence.motion import compensate_neighbours, compensate_rotation
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence, SequenceError
 from adaptune.trajectory import Trajectory
@@ -103,6 +104,39 @@ class View:
     def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
         """When what was measured at `stamps` arrives."""
         return self.of_clock(self.inner.played_at(stamps))
+
+
+@dataclass(frozen=True, eq=False)
+class WithoutMotion(View):
+    """Points as if the sensor had stood still since the scan's start, its velocity being constant.
+
+    The velocity is that since the scan read before, which is registered for it.
+    """
+
+    def _changed(self, scans: Iterable[Scan]) -> Iterator[Scan]:
+        return compensate_neighbours(_timed(self.name, scan) for scan in scans)
+
+
+def without_rotation(sequence: Reversible) -> View:
+    """Points as if the sensor had not turned since the scan's start, by its gyroscope."""
+    imu = once(sequence.imu)
+
+    def change(scan: Scan) -> Scan:
+        measured = imu()
+        return (
+            scan if measured is None else compensate_rotation(_timed(sequence.name, scan), measured)
+        )
+
+    return View(sequence, change)
+
+
+def _timed(name: str, scan: Scan) -> Scan:
+    if scan.times is None and len(scan):
+        raise SequenceError(
+            f"{name}: its points have no times, by which motion could be taken out; leave "
+            f"`compensate` out"
+        )
+    return scan
 
 
 class _First:

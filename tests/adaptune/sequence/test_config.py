@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from adaptune import yaml
 from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
-from adaptune.sequence.config import to_pose
+from adaptune.sequence.config import check_sequence, to_pose
 from adaptune.study import ConfigurationError, load_study
-from adaptune.trajectory import Trajectory, write_tum
+from adaptune.trajectory import Trajectory, write_kitti, write_tum
 
 
 def test_paths_are_of_the_studys_folder_and_know_variables(
@@ -128,3 +129,31 @@ def test_shipped_studies_lack_nothing_but_their_data(
     with pytest.raises(ConfigurationError) as caught:
         load_study(configs / f"{name}.yaml")
     assert all("there is no such" in line for line in str(caught.value).splitlines())
+
+
+def test_what_would_fail_later_is_found_at_once(rec: Any, tmp_path: Path) -> None:
+    bag = rec.drive(tmp_path / "a.bag")
+    write_tum(tmp_path / "late.tum", at(rec.START + 10**12, 3))
+    write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))
+    study = tmp_path / "study.yaml"
+    for entry, told in [
+        ({"start": 100.0}, r"start = 100 s is beyond its end, it lasts 2\.0 s"),
+        ({"reference": "/poses", "clock_offset": 1e4}, "set `clock_offset` to the seconds"),
+        ({"reference": str(tmp_path / "late.tum")}, "set `clock_offset` to the seconds"),
+        ({"reference": str(tmp_path / "short.txt")}, "3 poses without stamps do not go with 20"),
+    ]:
+        for _ in range(2):  # before it is in the cache, and after
+            data = {
+                "odometry": {"name": "gicp"},
+                "sequences": {"yard": {"bag": str(bag)} | entry},
+                "training": ["yard"],
+            }
+            study.write_text(yaml.dump(data))
+            with pytest.raises(ConfigurationError, match=rf"line \d+: sequences\.yard: .*{told}"):
+                load_study(study)
+            list(open_sequence(SequenceConfig(bag=str(bag))))
+    check_sequence(SequenceConfig(bag=str(bag), reference="/poses", start=1.5))
+
+
+def at(stamp: int, n: int) -> Trajectory:
+    return Trajectory(stamp + np.arange(n) * 10**8, np.tile(np.eye(4), (n, 1, 1)))

@@ -3,9 +3,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from adaptune import geometry, open3d
 from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence.folder import turn_up
 from adaptune.trajectory import write_kitti
 
 
@@ -32,7 +34,7 @@ def kitti_odometry(rec: Any, folder: Path, n: int = 4) -> np.ndarray:
 
 def test_a_kitti_sequence_is_what_the_bags_are(rec: Any, tmp_path: Path) -> None:
     expected = kitti_odometry(rec, tmp_path / "sequences" / "00")
-    sequence = open_sequence(SequenceConfig(kitti=str(tmp_path / "sequences" / "00")))
+    sequence = open_sequence(SequenceConfig(kitti=str(tmp_path / "sequences" / "00"), elevation=0))
     bags = [
         list(open_sequence(SequenceConfig(bag=str(rec.drive(tmp_path / f"a{suffix}", n=4)))))
         for suffix in (".bag", ".sqlite3", ".mcap")
@@ -47,6 +49,33 @@ def test_a_kitti_sequence_is_what_the_bags_are(rec: Any, tmp_path: Path) -> None
     assert reference is not None
     np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-6)
     assert reference.stamps.tolist() == [scan.stamp for scan in scans]
+
+
+def test_rays_are_turned_up_in_their_own_planes() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 10, (200, 3)).astype(np.float32)
+    axes = np.cross(points, [0, 0, 1])
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    expected = Rotation.from_rotvec(axes * np.deg2rad(2.0)).apply(points)
+    np.testing.assert_allclose(turn_up(points, 2.0), expected, atol=1e-5)
+    up = np.array([[0, 0, 1], [0, 0, -1], [0, 0, 0]], np.float32)
+    assert np.array_equal(turn_up(up, 2.0), up)
+
+
+def test_kittis_rays_are_corrected_unless_told_otherwise(rec: Any, tmp_path: Path) -> None:
+    kitti_odometry(rec, tmp_path / "sequences" / "00")
+    drive, _ = drive_360(rec, tmp_path)
+    write_drive(rec, tmp_path / "raw", "timestamps_start.txt")
+    points = rec.scans(1)[0]
+    for folder, elevation, degrees in [
+        (tmp_path / "sequences" / "00", None, 0.205),
+        (tmp_path / "sequences" / "00", 0.5, 0.5),
+        (tmp_path / "raw", None, 0.205),
+        (tmp_path / "raw", 0, 0.0),
+        (drive, None, 0.0),
+    ]:
+        sequence = open_sequence(SequenceConfig(kitti=str(folder), elevation=elevation))
+        np.testing.assert_allclose(next(iter(sequence)).points, turn_up(points, degrees), atol=1e-6)
 
 
 def drive_360(rec: Any, root: Path) -> tuple[Path, np.ndarray]:
