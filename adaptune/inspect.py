@@ -154,7 +154,7 @@ def inspect(path: Path) -> Inspection:
         problems += [f"{topic.name}: {oddity}" for oddity in topic.oddities]
     if reference is not None:
         problems += _reference_problems(reference)
-    missing = _missing(scan, reference, given)
+    missing = _missing(scan, reference)
     return Inspection(
         path,
         topics,
@@ -350,20 +350,17 @@ def _reference_problems(reference: Trajectory) -> Iterator[str]:
         )
 
 
-def _missing(
-    scan: ScanSummary | None, reference: Trajectory | None, given: dict[str, Any]
-) -> dict[str, tuple[str, ...]]:
+def _missing(scan: ScanSummary | None, reference: Trajectory | None) -> dict[str, tuple[str, ...]]:
     """What each stage needs and does not find."""
     clouds = () if scan is not None else ("point clouds that can be read",)
     truth = () if reference is not None else ("a reference trajectory",)
     timeless = scan is not None and scan.scan.times is None
     times = ("a time for each point",) if timeless else ()
-    imu = () if "imu" in given else ("an IMU",)
     return {
         "offline": (*clouds, *truth),
         "online": clouds,
         "comparison with the reference": (*clouds, *truth),
-        "motion compensation": (*clouds, *times, *imu),
+        "motion compensation": (*clouds, *times),
     }
 
 
@@ -466,13 +463,20 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
     points = inspection.scan.scan.points
     # Few far points would shrink all others to a dot.
     reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
+    low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
     figure = Figure(figsize=(9, 12), layout="constrained")
     FigureCanvasAgg(figure)
     above, side = figure.subplots(2, 1, height_ratios=(3, 1))
     for axes, (i, j), names in ((above, (0, 1), "xy"), (side, (0, 2), "xz")):
         order = np.argsort(points[:, 2])
         dots = axes.scatter(
-            points[order, i], points[order, j], c=points[order, 2], s=0.4, cmap="viridis"
+            points[order, i],
+            points[order, j],
+            c=points[order, 2],
+            s=0.4,
+            cmap="viridis",
+            vmin=low,
+            vmax=high,
         )
         axes.set_xlim(-reach, reach)
         axes.set_aspect("equal")
@@ -480,7 +484,7 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
         axes.set_ylabel(f"{names[1]} (m)")
     above.set_ylim(-reach, reach)
     above.plot(0, 0, "r+", markersize=10)
-    figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6)
+    figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6, extend="both")
     figure.suptitle(f"{inspection.path.name}: {_scan_text(inspection.scan)}", fontsize=9)
     with replacing(path) as beside:
         figure.savefig(beside, format="png", dpi=110)
