@@ -403,7 +403,7 @@ def inspection_text(inspection: Inspection, width: int = 100) -> str:
 
 def _topic_table(inspection: Inspection) -> Table:
     table = Table(box=None, pad_edge=False)
-    for column in ("topic", "type", "messages", "rate", "seconds", "longest gap"):
+    for column in ("topic", "type", "count", "rate", "seconds", "max gap"):
         numeric = column not in ("topic", "type")
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
     for topic in inspection.topics:
