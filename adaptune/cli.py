@@ -68,6 +68,9 @@ app = typer.Typer(
     ),
 )
 
+models = typer.Typer(no_args_is_help=True, cls=_Commands, help="Look at error models.")
+app.add_typer(models, name="model")
+
 LOG_EVERY = 5.0
 """Seconds between lines of progress where there is no terminal to draw a bar on."""
 
@@ -376,6 +379,19 @@ def compare(
         )
     )
     console.print(f"Tables and pictures: {loaded.folder / 'comparison'}/", highlight=False)
+
+
+@models.command()
+def show(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="An error model.", show_default=False)
+    ],
+) -> None:
+    """Explain an error model: its sets, sequences, provenance, and what validation found."""
+    from adaptune.model import ErrorModel
+    from adaptune.model.show import render
+
+    console.print(render(ErrorModel.load(file), file), highlight=False)
 
 
 def _short(parameters: dict[str, Any]) -> str:

@@ -1,0 +1,110 @@
+"""An error model explained to people."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.markup import escape
+
+from adaptune import report
+from adaptune.metrics import cap
+from adaptune.model.base import mean_errors
+from adaptune.model.file import ErrorModel
+from adaptune.space import Value, describe
+
+N_BEST = 5
+"""Sets to be shown beside the fixed one."""
+
+
+def render(model: ErrorModel, path: Path) -> RenderableType:
+    """What a model is of, what it learnt from, and what is known of its worth.
+
+    Parameters
+    ----------
+    model
+        The model.
+    path
+        Its file.
+    """
+    n_frames, n_sets = model.errors.shape
+    blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
+    window = f", mean of {model.window} selections" if model.window > 1 else ""
+    size = path.stat().st_size / 1e6
+    lines = [
+        f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets on "
+        f"{n_frames} frames of {len(model.sequences)} sequences, {size:.1f} MB",
+        f"Errors over {model.length:g} m. Scans are described by {blocks}{window}.",
+        *_pairs("Settings", model.odometry.get("settings", {})),
+    ]
+    return Group(
+        escape("\n".join(lines)),
+        report.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
+        report.table("Parameters", _parameters(model)),
+        report.table(f"The best sets of {n_sets}", _sets(model), "Mean error over all sequences."),
+        escape("\n".join(_pairs("From", model.provenance) + _validation(model))),
+    )
+
+
+def _pairs(title: str, data: Any) -> list[str]:
+    if not isinstance(data, dict) or not data:
+        return []
+    return [f"{title}: " + ", ".join(f"{key} {value}" for key, value in data.items())]
+
+
+def _validation(model: ErrorModel) -> list[str]:
+    if not model.validation:
+        return ["Not validated yet: `adaptune validate` tells whether adapting pays."]
+    lines = []
+    for rule, found in model.validation.items():
+        lines += _pairs(f"Validation, {rule}", found) or [f"Validation, {rule}: {found}"]
+    return lines
+
+
+def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
+    rows = []
+    for s, name in enumerate(model.sequences):
+        errors = model.errors[model.sequence == s]
+        run = ~np.isnan(errors).all(axis=0) if len(errors) else np.zeros(len(model.sets), bool)
+        row: dict[str, Any] = {"sequence": name, "frames": len(errors), "sets": int(run.sum())}
+        row |= {"fixed [%]": None, "best [%]": None, "best set": None, "lost, fixed [%]": None}
+        if run.any():
+            means = np.full(len(run), np.inf)
+            means[run] = np.nanmean(cap(errors[:, run]), axis=0)
+            best = int(np.argmin(means))
+            row |= {"best [%]": float(means[best]), "best set": best}
+        if run.any() and run[model.fixed]:
+            row["fixed [%]"] = float(means[model.fixed])
+            row["lost, fixed [%]"] = float(100.0 * np.isinf(errors[:, model.fixed]).mean())
+        rows.append(row)
+    return rows
+
+
+def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
+    fixed = model.sets[model.fixed]
+    return [
+        {
+            "parameter": name,
+            "range": describe(parameter) + (" log" if getattr(parameter, "log", False) else ""),
+            "baseline": _short(parameter.baseline),
+            "fixed": _short(fixed[name]),
+        }
+        for name, parameter in model.space.parameters.items()
+    ]
+
+
+def _sets(model: ErrorModel) -> list[dict[str, Any]]:
+    means = mean_errors(model.errors, model.sequence)
+    best = np.argsort(means, kind="stable")[:N_BEST].tolist()
+    if model.fixed not in best:
+        best.insert(0, model.fixed)
+    return [
+        {"set": f"{n}, fixed" if n == model.fixed else str(n), "mean [%]": float(means[n])}
+        | {name: _short(value) for name, value in model.sets[n].items()}
+        for n in best
+    ]
+
+
+def _short(value: Value) -> str:
+    # Brackets would be taken for markup.
+    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))

@@ -1,0 +1,81 @@
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from adaptune.cli import app
+from adaptune.model import ErrorModel
+from adaptune.space import Categorical, Float, ParameterSpace
+
+
+@pytest.fixture
+def model():
+    space = ParameterSpace(
+        {
+            "distance": Float(low=1.0, high=10.0, baseline=4.0, log=True),
+            "kernel": Categorical(choices=("none", "[huber]"), baseline="none"),
+        }
+    )
+    errors = np.array([[4, 1, 3], [4, 1, np.inf], [2, 5, 8], [2, np.nan, 6]], np.float32)
+    return ErrorModel(
+        odometry={"name": "gicp", "settings": {"downsampling": 0.5}},
+        space=space,
+        sets=[
+            {"distance": d, "kernel": k}
+            for d, k in ((4.0, "none"), (2.0, "[huber]"), (9.0, "none"))
+        ],
+        fixed=0,
+        length=25.0,
+        sequences=["cave", "street"],
+        blocks={"ndt": 90},
+        window=3,
+        descriptors=np.zeros((4, 90), np.float32),
+        sequence=np.array([0, 0, 1, 1]),
+        errors=errors,
+        provenance={"adaptune": "0.1.0", "seed": 7},
+    )
+
+
+def shown(model, folder):
+    model.save(folder / "model.npz")
+    result = CliRunner().invoke(app, ["model", "show", str(folder / "model.npz")])
+    assert result.exit_code == 0, result.output
+    return re.sub(r"\s+", " ", result.output)
+
+
+def test_a_model_is_explained(model, tmp_path):
+    text = shown(model, tmp_path)
+    for said in (
+        "gicp: 3 parameter sets on 4 frames of 2 sequences",
+        "ndt (90 numbers), mean of 3 selections",
+        "cave 2 3 4.000 1.000 1 0.000",
+        "street 2 3 2.000 2.000 0 0.000",
+        "distance [1, 10] log 4 4",
+        "0, fixed 3.000 4 none",
+        "1 3.000 2 [huber]",
+        "seed 7",
+        "Not validated yet",
+    ):
+        assert said in text, (said, text)
+
+
+def test_what_validation_found_is_told(model, tmp_path):
+    found = {"paired": {"geometric": 0.61, "verdict": "Adapt by `paired`."}}
+    text = shown(dataclasses.replace(model, validation=found), tmp_path)
+    assert "Validation, paired: geometric 0.61, verdict Adapt by `paired`." in text
+
+
+def test_sets_that_a_sequence_lacks_are_told(model, tmp_path):
+    model.errors[2:, 0] = np.nan
+    text = shown(model, tmp_path)
+    assert "street 2 2 - 5.000 1 -" in text
+    assert "0, fixed inf" in text
+
+
+def test_a_file_that_is_no_model_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "model.npz").write_bytes(b"no")
+    result = CliRunner().invoke(app, ["model", "show", str(tmp_path / "model.npz")])
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
