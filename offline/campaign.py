@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import __version__, report, yaml
+from adaptune import report, yaml
 from adaptune.archive import Archive, Summary
 from adaptune.cores import available
 from adaptune.descriptor import averaged
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
+from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
 from offline.objective import (
@@ -396,7 +397,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         descriptors=np.concatenate(descriptors),
         sequence=np.concatenate(sequence),
         errors=np.concatenate(errors),
-        provenance={"adaptune": __version__, "trials": numbers}
+        provenance={"versions": versions(study.box), "trials": numbers}
         | study.config.offline.model_dump(
             mode="json", exclude={"trials", "workers", "memory", "storage"}
         ),

@@ -10,7 +10,7 @@ from adaptune.odometry.base import (
 )
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.odometry.registry import BOXES, box_class
+from adaptune.odometry.registry import BOXES, box_class, versions
 from adaptune.odometry.switching import Bank, HandOver
 
 __all__ = [
@@ -27,4 +27,5 @@ __all__ = [
     "Registration",
     "WarmUp",
     "box_class",
+    "versions",
 ]

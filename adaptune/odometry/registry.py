@@ -1,5 +1,7 @@
 """The odometries by name, imported when they are asked for."""
 
+from importlib import metadata
+
 from adaptune import plugins
 from adaptune.odometry.base import Odometry, OdometryError
 
@@ -20,6 +22,27 @@ BOXES = {
     "ndt": "adaptune.odometry.ndt:KeyframeNdt",
     "vgicp": "adaptune.odometry.vgicp:KeyframeVgicp",
 }
+
+_PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgicp": "small_gicp"}
+"""Packages that odometries of ours run on, where their module is not named as those are."""
+
+
+def versions(box: type[Odometry]) -> dict[str, str]:
+    """Versions of what a trial's outcome may depend on: adaptune, numpy, the odometry's package."""
+    names = {"adaptune", "numpy"}
+    package, _, module = box.__module__.rpartition(".")
+    if package == __package__:
+        names.add(_PACKAGES.get(module, module))
+    else:
+        top = box.__module__.partition(".")[0]
+        names |= set(metadata.packages_distributions().get(top, ()))
+    found = {}
+    for name in sorted(names):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue  # written by the user, or built in
+    return found
 
 
 def box_class(name: str) -> type[Odometry]:

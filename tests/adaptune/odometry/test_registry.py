@@ -3,7 +3,7 @@ from importlib import metadata
 
 import pytest
 
-from adaptune.odometry import BOXES, OdometryError, box_class
+from adaptune.odometry import BOXES, OdometryError, box_class, versions
 from adaptune.odometry.gicp import KeyframeGicp
 
 MINE = """
@@ -70,3 +70,16 @@ def test_an_odometry_that_a_package_announces(monkeypatch):
     assert box_class("theirs") is KeyframeGicp
     with pytest.raises(OdometryError, match="did you mean 'theirs'"):
         box_class("thiers")
+
+
+@pytest.mark.usefixtures("mine")
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [("gicp", "small_gicp"), ("ndt", "open3d"), ("mad_icp", "evalio"), ("my_odometry:Mine", None)],
+)
+def test_versions_of_what_an_odometry_runs_on(name, package):
+    if package == "evalio":
+        pytest.importorskip("evalio")
+    found = versions(box_class(name))
+    assert set(found) == {"adaptune", "numpy", package} - {None}
+    assert found["numpy"] == metadata.version("numpy")
