@@ -120,6 +120,8 @@ class OfflineConfig(_Section):
         Processes; one a core when left out.
     memory : float
         Gigabytes that prepared scans may take, in all workers together.
+    max_frames : int, optional
+        Frames that the error model keeps, over all sequences; all when left out.
     storage : str, optional
         URL of a database to mirror the trials in; a journal file in the study's folder when left
         out.
@@ -149,6 +151,7 @@ class OfflineConfig(_Section):
     seed: int = Field(0, ge=0)
     workers: int | None = Field(None, ge=1)
     memory: float = Field(4.0, gt=0, allow_inf_nan=False)
+    max_frames: int | None = Field(None, ge=1)
     storage: Annotated[str, Field(pattern="://"), AfterValidator(expand)] | None = None
     objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
         {"rte": 1.0},

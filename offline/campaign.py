@@ -12,7 +12,7 @@ from adaptune.archive import Archive, Summary
 from adaptune.cores import available
 from adaptune.descriptor import averaged
 from adaptune.files import write_text
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, thin
 from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
@@ -382,7 +382,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         descriptors.append(described[labelled])
         sequence.append(np.full(labelled.sum(), s))
         errors.append(of_sequence[labelled])
-    return ErrorModel(
+    model = ErrorModel(
         odometry={
             "name": study.config.odometry.name,
             "settings": study.settings.model_dump(mode="json"),
@@ -402,3 +402,5 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
             mode="json", exclude={"trials", "workers", "memory", "storage"}
         ),
     )
+    max_frames = study.config.offline.max_frames
+    return model if max_frames is None else thin(model, max_frames)

@@ -7,6 +7,7 @@ from adaptune.model.file import ErrorModel, ModelError
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 from adaptune.model.paired import PairedExpectedRatio, Settings
 from adaptune.model.portfolio import portfolio, restrict
+from adaptune.model.thinning import thin
 
 RULES: dict[str, Callable[[Settings, float], Rule]] = {
     "paired": PairedExpectedRatio,
@@ -30,4 +31,5 @@ __all__ = [
     "TrainingData",
     "portfolio",
     "restrict",
+    "thin",
 ]
