@@ -21,7 +21,6 @@ from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitt
 
 _log = logging.getLogger(__name__)
 
-_OFFSET = " (the {} the same motion with clock_offset: {:.3f})"
 # So many scans are registered to find an offset.
 _MOST_SCANS = 600
 
@@ -487,14 +486,21 @@ class RecordedSequence:
         if imu is not None:
             turning = np.linalg.norm(imu.angular_velocity, axis=1)
             found = clock_offset(trajectory, imu.stamps, turning)
-            return "" if found is None else _OFFSET.format("gyroscope tells", found)
+            return self._offset("gyroscope tells", found)
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
             stamps, turning = turning_of(islice(self._decode(Repairs()), _MOST_SCANS))
         except AdaptuneError:
             return ""
         found = clock_offset(trajectory, stamps, turning)
-        return "" if found is None else _OFFSET.format("scans tell", found)
+        return self._offset("scans tell", found)
+
+    def _offset(self, what: str, found: float | None) -> str:
+        if found is None:
+            return ""
+        # It was found for stamps to which the offset that is set was added before.
+        offset = self._reference.clock_offset + found
+        return f" (the {what} the same motion with clock_offset: {offset:.3f})"
 
 
 def _seconds(begin: int, end: int) -> str:

@@ -177,10 +177,13 @@ def imu_bag(rec: Any, path: Path, offset: float) -> Path:
     return rec.write_bag(path, sorted(messages, key=lambda m: m[1]))
 
 
-def test_clocks_that_do_not_meet_are_an_error_with_a_proposal(rec: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("wrong", [0.0, 5000.0])
+def test_clocks_that_do_not_meet_are_an_error_with_a_proposal(
+    rec: Any, tmp_path: Path, wrong: float
+) -> None:
     bag = str(imu_bag(rec, tmp_path / "a.bag", 1e6))
     with pytest.raises(SequenceError, match=r"set `clock_offset`.*clock_offset: (\S+)\)") as caught:
-        open_sequence(SequenceConfig(bag=bag, reference="/poses")).reference()
+        open_sequence(SequenceConfig(bag=bag, reference="/poses", clock_offset=wrong)).reference()
     proposed = float(str(caught.value).split("clock_offset: ")[-1].rstrip(")"))
     assert proposed == pytest.approx(1e6, abs=0.03)
     sequence = open_sequence(SequenceConfig(bag=bag, reference="/poses", clock_offset=proposed))
