@@ -140,11 +140,15 @@ class Categorical(_Parameter):
         """Whether `value` is one of the choices, of the same type."""
         return any(type(value) is type(choice) and value == choice for choice in self.choices)
 
+    def index(self, value: object) -> int:
+        """Which of the choices it is."""
+        # Not by the tuple's own: True is equal to 1.
+        alike = [type(value) is type(choice) and value == choice for choice in self.choices]
+        return alike.index(True)
+
     def to_unit(self, value: Any) -> float:
         """Map a choice to the middle of its share of [0, 1]."""
-        # Not by index(): True is equal to 1.
-        alike = [type(value) is type(choice) and value == choice for choice in self.choices]
-        return (alike.index(True) + 0.5) / len(self.choices)
+        return (self.index(value) + 0.5) / len(self.choices)
 
     def from_unit(self, unit: float) -> Value:
         """Map from [0, 1] to the choice whose share it falls in."""

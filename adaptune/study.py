@@ -40,6 +40,7 @@ from adaptune.odometry import (
     WarmUp,
     box_class,
 )
+from adaptune.sampling import NAMES, SETTINGS, SINGLE, SamplerError, check_sampler, optuna_class
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
 from adaptune.sequence.config import ViewConfig, check_sequence, expand
@@ -111,9 +112,17 @@ class OfflineConfig(_Section):
     Attributes
     ----------
     sampler : str
-        `tpe` begins with `initial` points of a Sobol sequence.
-    trials : int
+        One of `adaptune.sampling.NAMES`, or a class of Optuna's kind as ``package.module:Class``.
+    sampler_settings : dict
+        What may be set of it.
+    trials : int, optional
         Parameter sets, each run on every training sequence; the first is the baseline.
+    hours, stagnation, target : optional
+        Other budgets: hours that batches have taken; trials in a row without a new best; a value
+        of the first objective that is good enough. The search stops at the border of the batch in
+        which the first of all budgets is used up.
+    initial : int
+        Of the trials, the points of a Sobol sequence with which samplers begin that learn.
     batch : int
         A trial is proposed from the results of the batches before its own.
     workers : int, optional
@@ -144,8 +153,12 @@ class OfflineConfig(_Section):
         `paper`: as Koide et al. (IROS 2021) did, see `PRESETS`.
     """
 
-    sampler: Literal["tpe", "sobol", "random"] = "tpe"
-    trials: int = Field(64, ge=1)
+    sampler: str = "tpe"
+    sampler_settings: dict[str, Any] = {}
+    trials: int | None = Field(None, ge=1)
+    hours: float | None = Field(None, gt=0, allow_inf_nan=False)
+    stagnation: int | None = Field(None, ge=1)
+    target: float | None = Field(None, gt=0, allow_inf_nan=False)
     initial: int = Field(32, ge=1)
     batch: int = Field(16, ge=1)
     seed: int = Field(0, ge=0)
@@ -183,6 +196,11 @@ class OfflineConfig(_Section):
     def metrics(self) -> set[str]:
         """All metrics that a trial is judged by."""
         return {*self.limits, *(metric for weights in self.objective for metric in weights)}
+
+    @property
+    def budgeted(self) -> bool:
+        """Whether anything says when to stop."""
+        return any((self.trials, self.hours, self.stagnation, self.target))
 
 
 def _known_descriptor(name: str) -> str:
@@ -558,6 +576,11 @@ class Study:
         resolved = self.config.model_dump(mode="json")
         resolved["odometry"]["settings"] = self.settings.model_dump(mode="json")
         resolved["odometry"]["parameters"] = self.space.dump()
+        if settings := SETTINGS.get(self.config.offline.sampler):
+            given = settings.model_validate(self.config.offline.sampler_settings)
+            resolved["offline"]["sampler_settings"] = given.model_dump(
+                mode="json", exclude_none=True
+            )
         resolved["recordings"] = {name: self.recording_size(name) for name in self.config.training}
         return resolved
 
@@ -577,8 +600,9 @@ def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
             entry.pop("cache", None)  # changes nothing but the time it takes
             lasting[f"{kind}.{name}"] = entry
     offline = config.get("offline", {})
-    searched = ("sampler", "initial", "batch", "seed", "objective", "limits", "runs", "repeats")
-    lasting["offline"] = {k: offline.get(k) for k in (*searched, "augment", "pruning")}
+    searched = ("sampler", "sampler_settings", "initial", "batch", "seed", "objective", "limits")
+    learned = ("runs", "repeats", "augment", "pruning")
+    lasting["offline"] = {k: value for k in (*searched, *learned) if (value := offline.get(k))}
     return lasting
 
 
@@ -666,6 +690,7 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list
         _check_odometry(odometry, problems)
     if config is not None:
         _check_box(config, problems)
+        _check_sampling(config, problems)
     sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
         return None, problems
@@ -759,6 +784,30 @@ def _check_switching(config: StudyConfig, box: type[Odometry], problems: list[_P
                 f"hand_over or bank",
             )
         )
+
+
+def _check_sampling(config: StudyConfig, problems: list[_Problem]) -> None:
+    offline = config.offline
+    name, given = offline.sampler, offline.sampler_settings
+    if len(offline.objective) > 1 and name in SINGLE:
+        others = ", ".join(sorted(set(NAMES) - set(SINGLE)))
+        problems.append(
+            (("offline", "sampler"), f"{name} knows one objective only; choose one of {others}")
+        )
+    key = ("offline", "sampler_settings")
+    if name in SETTINGS:
+        if _validated(SETTINGS[name], given, key, problems) is None:
+            return
+    else:
+        try:
+            optuna_class(name)
+        except SamplerError as error:
+            problems.append((("offline", "sampler"), str(error)))
+            return
+    if not any(path[0] == "odometry" for path, _ in problems):
+        space = Study(config, Path()).space
+        found = check_sampler(name, given, space, budgeted=offline.budgeted)
+        problems.extend((key + path, message) for path, message in found)
 
 
 def _complete(space: ParameterSpace, name: str, given: Mapping[str, Any]) -> dict[str, Any]:

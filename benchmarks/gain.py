@@ -22,7 +22,7 @@ from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
 from adaptune.simulation import Course, simulate
 from adaptune.study import Study, StudyConfig
-from offline.samplers import propose
+from offline.samplers import make_sampler
 from offline.trial import run_trials
 from offline.validation import LabelledSequence, leave_one_out
 
@@ -80,7 +80,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     offline = study.config.offline.model_copy(
         update={"sampler": "sobol", "batch": N_SETS, "seed": seed}
     )
-    sets = propose(study.space, offline, 0, [])
+    sets = make_sampler(study.space, offline).propose([])
     box = study.odometry()
     sequence: Any = Prepared([box.prepare(scan) for scan in scans], frames)
     errors = [trial.errors for trial in run_trials(study, sequence, sets)]

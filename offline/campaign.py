@@ -16,6 +16,7 @@ from adaptune.model import ErrorModel, thin
 from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
+from offline.budget import BUDGETS, Clock, max_trials, spent
 from offline.objective import (
     Verdict,
     choose_fixed,
@@ -26,7 +27,7 @@ from offline.objective import (
     weighted,
 )
 from offline.pruning import estimate, rungs, survivors
-from offline.samplers import propose
+from offline.samplers import make_sampler
 from offline.storage import Told, open_mirror
 from offline.validation import labelled_sequences, tune
 from offline.workers import Pool, Task, Workers, run
@@ -202,39 +203,41 @@ def run_batches(
     mirror = open_mirror(study, {n: s.parameters for n, s in finished[names[0]].items()})
     verdicts: list[Verdict] = []
 
-    def of(number: int) -> Told:
-        trials = {name: of[number] for name, of in finished.items() if number in of}
-        attributes = {name: trial.mean_error for name, trial in trials.items()}
-        attributes["lost"] = sum(trial.lost for trial in trials.values())
-        attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
-        if config.limits:
-            attributes["excess"] = verdicts[number].excess
-        return Told(verdicts[number].parameters, verdicts[number].values, attributes)
-
-    total = config.trials * len(names)
-    for batch in range(-(-config.trials // config.batch)):
+    sampler = make_sampler(study.space, config)
+    clock = Clock(study.folder / "elapsed.json")
+    limit = max_trials(config)
+    batch = best = 0
+    while (reason := spent(config, verdicts, best, clock.hours(batch))) is None:
         first = batch * config.batch
-        numbers = range(first, min(first + config.batch, config.trials))
-        progress("trials", first * len(names), total)
+        numbers = range(first, min(first + config.batch, limit or first + config.batch))
         order = _hardest_first(config, finished) if batch else names
-        alive = list(numbers)
         sets: list[ParameterSet] = []
+        if any(n not in finished[order[0]] for n in numbers):
+            sets = sampler.propose(told(verdicts))
+            numbers = numbers[: len(sets)]
+        if not numbers:
+            reason = "there is nothing else to try"
+            break
+        total = (limit or numbers.stop) * len(names)
+        progress("trials", first * len(names), total)
+        alive = list(numbers)
         unframed = [name for name in names if not archive.has_frames(name, described)]
         for m in rungs(config.pruning, batch, len(names)):
             missing = {name: [n for n in alive if n not in finished[name]] for name in order[:m]}
             done = first * len(names) + m * len(alive) - sum(map(len, missing.values()))
             if any(missing.values()) or unframed:
-                sets = sets or propose(study.space, config, batch, told(verdicts))
+                sets = sets or sampler.propose(told(verdicts))
                 tasks = _tasks(missing, unframed, sets, first, len(workers.workers()))
-                for task in _run(archive, workers, tasks):
-                    done += len(task.numbers)
-                    progress("trials", done, total)
+                with clock.running(batch):
+                    for task in _run(archive, workers, tasks):
+                        done += len(task.numbers)
+                        progress("trials", done, total)
                 unframed = []
             if m < len(names):
                 alive = _survivors(config, order, finished, m, alive, first)
-        verdicts += [_verdict(config, order, finished, n) for n in numbers]
-        mirror.tell(len(verdicts), of)
-        best = min(range(len(verdicts)), key=lambda n: _rank(verdicts[n]))
+        verdicts.extend(_verdict(config, order, finished, n) for n in numbers)
+        mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
+        best = min((best, *numbers), key=lambda n: _rank(verdicts[n]))
         _log.info(
             "trials %d to %d done; best so far: trial %d with %s %.3f%s",
             numbers[0],
@@ -244,7 +247,13 @@ def run_batches(
             verdicts[best].values[0],
             "" if verdicts[best].feasible else " (none keeps the limits)",
         )
-    progress("trials", total, total)
+        if len(numbers) < config.batch and limit != len(verdicts):
+            reason = "there is nothing else to try"
+            break
+        batch += 1
+    done = len(verdicts) * len(names)
+    progress("trials", done, done)
+    _log.info("the search ends: %s", reason)
     return verdicts
 
 
@@ -256,6 +265,17 @@ Finished = Mapping[str, Mapping[int, Summary]]
 """The finished trials on every sequence, by number."""
 
 
+def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> Told:
+    """What the mirror is told of a trial."""
+    trials = {name: of[n] for name, of in finished.items() if n in of}
+    attributes = {name: trial.mean_error for name, trial in trials.items()}
+    attributes["lost"] = sum(trial.lost for trial in trials.values())
+    attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
+    if config.limits:
+        attributes["excess"] = verdict.excess
+    return Told(verdict.parameters, verdict.values, attributes)
+
+
 def _values(config: OfflineConfig, order: Sequence[str], finished: Finished, n: int) -> list[float]:
     """A trial's first objective on the sequences that it was run on."""
     runs = [finished[name][n] for name in order if n in finished[name]]
@@ -264,7 +284,7 @@ def _values(config: OfflineConfig, order: Sequence[str], finished: Finished, n: 
 
 def _hardest_first(config: OfflineConfig, finished: Finished) -> list[str]:
     """The sequences by falling mean of the first objective over the first batch."""
-    first = range(min(config.batch, config.trials))
+    first = range(config.batch)
     means = {
         name: np.mean([weighted(config.objective[0], trials[n].metrics) for n in first])
         for name, trials in finished.items()
@@ -399,7 +419,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         errors=np.concatenate(errors),
         provenance={"versions": versions(study.box), "trials": numbers}
         | study.config.offline.model_dump(
-            mode="json", exclude={"trials", "workers", "memory", "storage"}
+            mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
         ),
     )
     max_frames = study.config.offline.max_frames

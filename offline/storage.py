@@ -79,7 +79,7 @@ class Mirror(ABC):
         self._directions = [optuna.study.StudyDirection.MINIMIZE] * len(
             study.config.offline.objective
         )
-        self._distributions = {n: _distribution(p) for n, p in study.space.parameters.items()}
+        self._distributions = {n: distribution(p) for n, p in study.space.parameters.items()}
 
     @abstractmethod
     def tell(self, n: int, trial: Callable[[int], Told]) -> None:
@@ -217,7 +217,8 @@ class DatabaseMirror(Mirror):
             self._complained = False
 
 
-def _distribution(parameter: Float | Integer | Categorical) -> Any:
+def distribution(parameter: Float | Integer | Categorical) -> Any:
+    """What Optuna calls a parameter."""
     if isinstance(parameter, Categorical):
         return optuna.distributions.CategoricalDistribution(parameter.choices)
     if isinstance(parameter, Integer):

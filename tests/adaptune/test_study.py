@@ -100,6 +100,19 @@ def test_reads_a_study(study_file, tmp_path):
         ("sub_trajectory=none", ["sub_trajectory", '"none"']),
         ("sub_trajectories=1", ["sub_trajectories: unknown key", "'sub_trajectory'"]),
         ("offline.sampler=tpee", ["offline.sampler", "'tpe'"]),
+        ("offline.sampler=math:sin", ["offline.sampler", "not a class derived from optuna"]),
+        ("offline.sampler=optuna.samplers:Best", ["optuna.samplers has no Best"]),
+        ("offline.sampler=no.such:Best", ["cannot import no.such", "PYTHONPATH"]),
+        (
+            "offline.sampler_settings.gama=1",
+            ["gama: tpe has no such setting; did you mean 'gamma'"],
+        ),
+        ("offline.sampler_settings.seed=1", ["sampler_settings.seed", "offline.seed"]),
+        ("offline.sampler_settings=7", ["offline.sampler_settings"]),
+        ("offline={sampler: annealing, objective: [rte, rpe]}", ["annealing knows one objective"]),
+        ("offline.hours=0", ["offline.hours", "not 0"]),
+        ("offline.stagnation=0", ["offline.stagnation", "not 0"]),
+        ("offline.target=-1", ["offline.target", "not -1"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("offline.trials=0", ["offline.trials", "not 0"]),
         ("online.rules=[best]", ["online.rules.0", "best"]),
@@ -141,6 +154,84 @@ def test_names_each_mistake(study_file, override, words):
     assert message.startswith("-o")
     for word in words:
         assert word in message
+
+
+ANNEALING = "offline: {sampler: annealing, sampler_settings: {"
+GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
+
+
+@pytest.mark.parametrize(
+    ("offline", "line", "words"),
+    [
+        (ANNEALING + "steps:\n  {keyframe: {mu: 1}}}}", 15, "did you mean 'keyframe_interval'?"),
+        (ANNEALING + "steps: {keyframe_interval:\n  {sigma: -1}}}}", 15, "sigma: Input should be"),
+        (
+            ANNEALING + "steps: {\n keyframe_interval: {mu: 0, sigma: 0}}}}",
+            15,
+            "never moves with mu",
+        ),
+        (ANNEALING + "steps: {\n keyframe_interval: {sigma: 0}}}}", 15, "never moves with sigma 0"),
+        (
+            ANNEALING + "steps: {keyframe_interval: {\n delta_max: 3}}}}",
+            15,
+            "delta_max: steps of a log float are told by mu and sigma",
+        ),
+        (ANNEALING + "\n alfa: 0.9}}", 15, "alfa: unknown key; did you mean 'alpha'?"),
+        (ANNEALING + "\n alpha: 1.1}}", 15, "not 1.1"),
+        (
+            GRID + "\n keyframe_interval: [1, 1, 3]}}}",
+            14,
+            "max_correspondence_distance: is missing",
+        ),
+        (GRID + "\n keyframe: [1, 1, 3]}}}", 15, "did you mean 'keyframe_interval'?"),
+        (
+            GRID + "max_correspondence_distance: [1, 1, 3],\n keyframe_interval: [1, 1, 30]}}}",
+            15,
+            "30 is outside [0.5, 15]",
+        ),
+        (
+            GRID + "max_correspondence_distance: [1, 1, 3],\n keyframe_interval: [1, 0, 3]}}}",
+            15,
+            "a step of 0",
+        ),
+        (
+            "offline: {sampler: grid, sampler_settings: {\n grid: {max_correspondence_distance:"
+            " [1, 0.0001, 31623], keyframe_interval: {low: 1, high: 9, count: 31623}}}}",
+            15,
+            "has 1,000,014,129 points, and nothing says when to stop; give offline.trials, hours,",
+        ),
+    ],
+)
+def test_names_mistakes_in_what_a_sampler_is_told_with_their_lines(
+    study_file, offline, line, words
+):
+    file = study_file.with_name("sampler.yaml")
+    lines = study_file.read_text().splitlines()
+    file.write_text("\n".join([*lines[:-1], offline, ""]))
+    message = failure(file)
+    assert f"line {line}: offline.sampler_settings" in message
+    assert words in message
+    assert len(message.splitlines()) == 1
+
+
+def test_a_large_grid_may_be_walked_with_a_budget(study_file):
+    load_study(
+        study_file,
+        [
+            "offline.sampler=grid",
+            "offline.sampler_settings={grid: {max_correspondence_distance: [1, 0.0001, 30000],"
+            " keyframe_interval: {low: 1, high: 9, count: 30000}}}",
+            "offline.trials=",
+            "offline.hours=1",
+        ],
+    )
+
+
+def test_tells_what_to_install(study_file, monkeypatch):
+    monkeypatch.setattr("adaptune.sampling.find_spec", lambda _: None)
+    for name, package in (("gp", "torch"), ("cmaes", "cmaes")):
+        text = failure(study_file, f"offline.sampler={name}")
+        assert f"{name} needs the package {package}: pip install 'adaptune[{name}]'" in text
 
 
 def test_tells_all_mistakes_at_once_with_their_lines(study_file):

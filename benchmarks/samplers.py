@@ -1,0 +1,269 @@
+"""Whether samplers search better than chance.
+
+    python benchmarks/samplers.py functions
+    python benchmarks/samplers.py table
+    python benchmarks/samplers.py thesis PICTURE.png [ODOMETRY ...]
+
+*functions*: annealing and TPE against random search at equal budget, 96 trials and 20 seeds, on
+Branin (2 parameters), Ackley (4) and Hartmann (6); the baseline is a random point. *table*: the
+same on trials of GICP, recorded beforehand on a dense grid over a simulated course; a set is worth
+what its nearest neighbour on the grid is worth. Both print the median of the best value, the
+number of seeds that are better than random, and the one-sided p of Wilcoxon's signed-rank test
+over the seeds. The samplers' defaults were chosen on other functions (Rosenbrock, Levy,
+Styblinski-Tang, Griewank).
+
+*thesis*: the experiment of Tavares (2026) in small. Grid, random, annealing and TPE tune GICP and
+evalio's KISS-ICP on a simulated garden by RTE, 17 trials (the defaults and a grid of 4 x 4) and
+five seeds; the table shows the best RTE and RPE among a search's trials, as the median over the
+seeds, and the curves are drawn. Both simulations are of 25 m, which is short.
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy.stats import wilcoxon
+
+from adaptune import cores, report
+from adaptune.simulation import record
+from adaptune.space import Float, ParameterSet, ParameterSpace
+from adaptune.study import OfflineConfig, Study, load_study
+from offline.samplers import make_sampler
+from offline.trial import PreparedSequence, run_trials
+
+TRIALS = 96
+SEEDS = range(20)
+TABLE_TRIALS = 32
+SIDE = 16
+"""Points of the recorded grid along each parameter."""
+THESIS = {
+    "gicp": [],
+    "evalio_kiss_icp": [
+        "odometry.settings={}",
+        "odometry.parameters={voxel_size: {}, initial_threshold: {}}",
+    ],
+}
+"""Odometries, and what is overridden for them."""
+THESIS_TRIALS = 17
+THESIS_SEEDS = range(5)
+
+Error = Callable[[ParameterSet], float]
+
+
+def branin(x: NDArray[np.float64]) -> float:
+    """Least value 0.398."""
+    a, b = 15 * x[0] - 5, 15 * x[1]
+    valley = b - 5.1 / (4 * np.pi**2) * a**2 + 5 / np.pi * a - 6
+    return float(valley**2 + 10 * (1 - 1 / (8 * np.pi)) * np.cos(a) + 10)
+
+
+def ackley(x: NDArray[np.float64]) -> float:
+    """Least value 0, away from the middle."""
+    z = 40 * (x - 0.63)
+    hills = np.exp(np.mean(np.cos(2 * np.pi * z)))
+    return float(20 - 20 * np.exp(-0.2 * np.sqrt(np.mean(z**2))) + np.e - hills)
+
+
+_A = np.array(
+    [
+        [10, 3, 17, 3.5, 1.7, 8],
+        [0.05, 10, 17, 0.1, 8, 14],
+        [3, 3.5, 1.7, 10, 17, 8],
+        [17, 8, 0.05, 10, 0.1, 14],
+    ]
+)
+_P = 1e-4 * np.array(
+    [
+        [1312, 1696, 5569, 124, 8283, 5886],
+        [2329, 4135, 8307, 3736, 1004, 9991],
+        [2348, 1451, 3522, 2883, 3047, 6650],
+        [4047, 8828, 8732, 5743, 1091, 381],
+    ]
+)
+
+
+def hartmann(x: NDArray[np.float64]) -> float:
+    """Least value 0.078, which is 3.4 added to that of the literature."""
+    wells = np.exp(-np.sum(_A * (x - _P) ** 2, axis=1))
+    return float(3.4 - np.array([1.0, 1.2, 3.0, 3.2]) @ wells)
+
+
+def best_so_far(
+    space: ParameterSpace, error: Error, sampler: str, seed: int, trials: int, **given: Any
+) -> NDArray[np.float64]:
+    """Best error after every trial of one search."""
+    config = OfflineConfig(sampler=sampler, seed=seed, **given)
+    search = make_sampler(space, config)
+    history: list[tuple[ParameterSet, float]] = []
+    while len(history) < trials:
+        history += [(s, error(s)) for s in search.propose(history)]  # type: ignore[arg-type]
+    return np.minimum.accumulate([value for _, value in history[:trials]])
+
+
+def against_random(
+    name: str,
+    spaces: Callable[[int], ParameterSpace],
+    error: Error,
+    trials: int,
+    **given: Any,
+) -> None:
+    """Print a row for each sampler."""
+    best = {
+        sampler: np.array(
+            [best_so_far(spaces(seed), error, sampler, seed, trials, **given)[-1] for seed in SEEDS]
+        )
+        for sampler in ("random", "sobol", "annealing", "tpe")
+    }
+    for sampler, found in best.items():
+        wins = ""
+        if sampler != "random":
+            p = wilcoxon(found, best["random"], alternative="less", zero_method="zsplit").pvalue
+            wins = f"{(found < best['random']).sum():6d} of {len(SEEDS)}   p {p:.1e}"
+        print(f"{name:12} {sampler:10} {np.median(found):9.4f} {wins}", flush=True)
+
+
+def functions() -> None:
+    """Compare on the test functions."""
+    for function, n in ((branin, 2), (ackley, 4), (hartmann, 6)):
+
+        def spaces(seed: int, n: int = n) -> ParameterSpace:
+            at = np.random.default_rng((seed, 99)).random(n)
+            return ParameterSpace(
+                {f"x{i}": Float(low=0.0, high=1.0, baseline=float(at[i])) for i in range(n)}
+            )
+
+        def error(s: ParameterSet, function: Any = function) -> float:
+            value: float = function(np.array(list(s.values())))
+            return value
+
+        against_random(function.__name__, spaces, error, TRIALS)
+
+
+STUDY = """\
+odometry: {name: gicp, settings: {downsampling: 0.5, min_range: 1.0, iterations: 20}}
+courses: {course: {scenes: [garden], length: 25, columns: 512, seed: 1}}
+training: [course]
+sub_trajectory: 10.0
+"""
+
+
+def prepare(folder: Path, *overrides: str) -> tuple[Study, PreparedSequence]:
+    """Simulate the course, if it is not there yet, and prepare it for an odometry."""
+    file = folder / "samplers.yaml"
+    file.write_text(STUDY)
+    study = load_study(file, overrides, folder / "run")
+    if not study.recording("course").exists():
+        record(study.config.courses["course"], study.recording("course"))
+    return study, PreparedSequence(study, "course", 8e9)
+
+
+def table(folder: Path) -> None:
+    """Compare on recorded trials of GICP."""
+    study, sequence = prepare(folder)
+    space = study.space
+    unit = (np.arange(SIDE) + 0.5) / SIDE
+    points = np.stack(np.meshgrid(*[unit] * len(space), indexing="ij"), -1).reshape(-1, len(space))
+    trials = run_trials(study, sequence, space.from_unit(points))
+    errors = np.array([trial.mean_error for trial in trials])
+    print(f"table: {len(errors)} trials, {errors.min():.3f} to {errors.max():.3f} %", flush=True)
+
+    def error(s: ParameterSet) -> float:
+        (at,) = space.to_unit([s])
+        return float(errors[np.argmin(((points - at) ** 2).sum(axis=1))])
+
+    against_random("table", lambda _: space, error, TABLE_TRIALS, initial=8, batch=4)
+
+
+def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows of the thesis's table for an odometry, and the curves of each sampler."""
+    study, sequence = prepare(folder, f"odometry.name={name}", *THESIS[name])
+    known: dict[str, tuple[float, float]] = {}
+
+    def measures(s: ParameterSet) -> tuple[float, float]:
+        if repr(s) not in known:
+            (trial,) = run_trials(study, sequence, [s])
+            known[repr(s)] = trial.mean_error, trial.metrics["rpe"]
+        return known[repr(s)]
+
+    base = measures(study.space.baseline)
+    rows: list[dict[str, Any]] = [{"": name, "sampler": "defaults", "RTE %": base[0]}]
+    rows[0] |= {"RTE change": "", "RPE m": base[1], "RPE change": ""}
+    curves: dict[str, Any] = {}
+    side = round((THESIS_TRIALS - 1) ** (1 / len(study.space)))
+    axes = {
+        n: {"low": p.low, "high": p.high, "count": side} for n, p in study.space.parameters.items()
+    }
+    for sampler in ("grid", "random", "annealing", "tpe"):
+        best = []
+        for seed in THESIS_SEEDS:
+            search = make_sampler(
+                study.space,
+                OfflineConfig(
+                    sampler=sampler,
+                    sampler_settings={"grid": axes} if sampler == "grid" else {},
+                    seed=seed,
+                    initial=6,
+                    batch=2,
+                ),
+            )
+            history: list[tuple[ParameterSet, float]] = []
+            while len(history) < THESIS_TRIALS and (sets := search.propose(history)):  # type: ignore[arg-type]
+                history += [(s, measures(s)[0]) for s in sets]
+            best.append([measures(s) for s, _ in history[:THESIS_TRIALS]])
+            print(f"{name}: {sampler}, seed {seed}", file=sys.stderr, flush=True)
+        curves[sampler] = np.minimum.accumulate(np.array(best), axis=1)
+        rte, rpe = np.median(curves[sampler][:, -1], axis=0)
+        rows.append(
+            {
+                "": name,
+                "sampler": sampler,
+                "RTE %": rte,
+                "RTE change": f"{rte / base[0] - 1:+.1%}",
+                "RPE m": rpe,
+                "RPE change": f"{rpe / base[1] - 1:+.1%}",
+            }
+        )
+    return rows, curves
+
+
+def thesis(folder: Path, picture: Path, names: list[str]) -> None:
+    """Print the table, and draw the curves."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.subplots(1, len(names), squeeze=False)[0]
+    console = Console(width=100)
+    for axis, name in zip(axes, names, strict=True):
+        rows, curves = searches(folder, name)
+        console.print(report.table(f"{name}, {THESIS_TRIALS} trials", rows))
+        for sampler, curve in curves.items():
+            n = np.arange(curve.shape[1])
+            (line,) = axis.plot(n, np.median(curve[..., 0], axis=0), label=sampler)
+            low, high = curve[..., 0].min(axis=0), curve[..., 0].max(axis=0)
+            axis.fill_between(n, low, high, color=line.get_color(), alpha=0.15, lw=0)
+        axis.set_title(f"{name}: median and range over {len(THESIS_SEEDS)} seeds", loc="left")
+        axis.set_xlabel("trial")
+        axis.set_ylabel("best RTE over 10 m [%]")
+        axis.set_yscale("log")
+        axis.legend(frameon=False)
+        axis.grid(alpha=0.3)
+    figure.savefig(picture, dpi=110)
+
+
+if __name__ == "__main__":
+    cores.pin(0)
+    what, *more = sys.argv[1:] or [""]
+    with tempfile.TemporaryDirectory() as made:
+        if what == "functions":
+            functions()
+        elif what == "table":
+            table(Path(made))
+        elif what == "thesis" and more:
+            thesis(Path(made), Path(more[0]), more[1:] or list(THESIS))
+        else:
+            sys.exit(__doc__)

@@ -1,0 +1,337 @@
+"""Simulated annealing, as a sampler that any Optuna study can use.
+
+After F. C. Tavares, *Automated Parameter Tuning for Evaluation of SLAM Methods*, University of
+Coimbra, 2026 (RUSTLE), and Kirkpatrick, Gelatt and Vecchi, *Optimization by Simulated Annealing*,
+Science, 1983. It differs in that steps beyond a bound are reflected instead of cut off, in that
+errors are divided by `energy_scale`, and in that log scales, categories and several chains are
+known.
+"""
+
+import contextlib
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
+from optuna.samplers import BaseSampler, RandomSampler
+from optuna.search_space import IntersectionSearchSpace
+from optuna.study import Study, StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from adaptune.sampling import AnnealingSettings, Step
+from adaptune.space import nearest
+
+SIGMA = 0.05
+"""Standard deviation of a step, as a share of the range."""
+DELTA_MAX = 0.5
+"""Longest step of a whole number at temperature 1, as a share of the range."""
+CHANGE = 0.3
+"""Probability that a category changes."""
+
+
+_Trial = tuple[int, Mapping[str, Any], float]
+"""Number, parameters and value of a finished trial."""
+
+
+class Chain:
+    """One chain's walk so far.
+
+    Parameters
+    ----------
+    settings
+        Temperatures, and when to return to the first.
+
+    Attributes
+    ----------
+    params : dict or None
+        Where it stands; none before its first trial.
+    energy, best : float
+        Error there, and the least it has seen.
+    temperature : float
+    unaccepted, no_best : int
+        Steps since one was accepted, and since the best one.
+    """
+
+    def __init__(self, settings: AnnealingSettings):
+        self.settings = settings
+        self.params: dict[str, Any] | None = None
+        self.energy = self.best = math.inf
+        self.temperature = settings.initial_temperature
+        self.unaccepted = self.no_best = 0
+        # Since the chain was last heated; in the order of the three triggers.
+        self._fixed = self._unaccepted = self._no_best = 0
+
+    def start(self, params: Mapping[str, Any], energy: float) -> None:
+        """Begin at a trial."""
+        self.params, self.energy, self.best = dict(params), energy, energy
+
+    def step(self, params: Mapping[str, Any], energy: float, scale: float, u: float) -> None:
+        """Accept a trial or not, and cool down or heat up.
+
+        Parameters
+        ----------
+        params, energy
+            The trial.
+        scale
+            What differences of energy are divided by.
+        u
+            Drawn uniformly from [0, 1).
+        """
+        if self.params is None:
+            self.start(params, energy)
+            return
+        accepted = energy <= self.energy or u < math.exp(
+            -(energy - self.energy) / scale / self.temperature
+        )
+        new_best = energy < self.best
+        if accepted:
+            self.params, self.energy = dict(params), energy
+        self.best = min(self.best, energy)
+        self.unaccepted = 0 if accepted else self.unaccepted + 1
+        self.no_best = 0 if new_best else self.no_best + 1
+        self._fixed += 1
+        self._unaccepted = 0 if accepted else self._unaccepted + 1
+        self._no_best = 0 if new_best else self._no_best + 1
+        s = self.settings
+        if (
+            _reached(self._fixed, s.reanneal_fixed)
+            or _reached(self._unaccepted, s.reanneal_accepted)
+            or _reached(self._no_best, s.reanneal_best)
+        ):
+            self.temperature = s.initial_temperature
+            self._fixed = self._unaccepted = self._no_best = 0
+        else:
+            self.temperature *= s.alpha
+
+    @property
+    def stalled(self) -> bool:
+        """Whether it has gone long enough without an acceptance or a new best."""
+        return _reached(self.unaccepted, self.settings.stall_accepted) or _reached(
+            self.no_best, self.settings.stall_best
+        )
+
+
+def _reached(count: int, limit: int | None) -> bool:
+    return limit is not None and count >= limit
+
+
+class AnnealingSampler(BaseSampler):
+    """Sampler using simulated annealing.
+
+    A trial is a step from where its chain stands; it is accepted if its error is no larger, or
+    else with probability exp(-dE / energy_scale / T). The first `n_startup_trials` are random
+    unless enqueued; the chains begin at the best of them. All is found again from the finished
+    trials, and every trial has random numbers of its own: a study that is loaded goes on exactly as
+    if it had never stopped. Trials that run at the same time step from where their chain stands
+    when they begin.
+
+    Parameters
+    ----------
+    settings
+        Temperatures, triggers and steps.
+    n_startup_trials
+        Trials before the chains begin.
+    seed
+        Of all random numbers.
+
+    Examples
+    --------
+    >>> import optuna
+    >>> study = optuna.create_study(sampler=AnnealingSampler(seed=1))
+    >>> study.optimize(lambda trial: trial.suggest_float("x", -10.0, 10.0) ** 2, n_trials=50)
+    >>> study.best_value < 0.1
+    True
+    """
+
+    def __init__(
+        self,
+        settings: AnnealingSettings | None = None,
+        *,
+        n_startup_trials: int = 1,
+        seed: int = 0,
+    ):
+        self.settings = settings or AnnealingSettings()
+        self.n_startup_trials = n_startup_trials
+        self.seed = seed
+        self._space = IntersectionSearchSpace()
+        # Name of a study, the finished trials that were walked through, and where they led.
+        self._walked: tuple[str, list[int], list[Chain]] | None = None
+
+    def infer_relative_search_space(
+        self,
+        study: Study,
+        trial: FrozenTrial,  # noqa: ARG002
+    ) -> dict[str, BaseDistribution]:
+        """Parameters that all finished trials have."""
+        space: dict[str, BaseDistribution] = self._space.calculate(study)
+        return space
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        """Step from where the trial's chain stands."""
+        self._raise_error_if_multi_objective(study)
+        if not search_space or trial.number < self.n_startup_trials:
+            return {}
+        for name in self.settings.steps:
+            if name not in search_space:
+                raise ValueError(
+                    f"steps of {name!r}: there is no such parameter; {nearest(name, search_space)}"
+                )
+        chain = self.chains(study)[trial.number % self.settings.chains]
+        if chain.params is None:
+            return {}
+        rng = self._rng(trial.number)
+        rng.random()  # is kept for the acceptance
+        return {
+            name: _stepped(
+                chain.params[name],
+                distribution,
+                self.settings.steps.get(name, Step()),
+                chain.temperature,
+                rng,
+            )
+            for name, distribution in search_space.items()
+        }
+
+    def sample_independent(
+        self,
+        study: Study,
+        trial: FrozenTrial,
+        param_name: str,
+        param_distribution: BaseDistribution,
+    ) -> Any:
+        """Draw uniformly."""
+        word = np.random.SeedSequence((self.seed, trial.number, *param_name.encode()))
+        sampler = RandomSampler(seed=int(word.generate_state(1)[0]))
+        return sampler.sample_independent(study, trial, param_name, param_distribution)
+
+    def after_trial(
+        self,
+        study: Study,
+        trial: FrozenTrial,
+        state: TrialState,
+        values: Sequence[float] | None,
+    ) -> None:
+        """Stop the study if all chains have stalled."""
+        stalls = (self.settings.stall_accepted, self.settings.stall_best)
+        if stalls == (None, None) or state != TrialState.COMPLETE or values is None:
+            return
+        # As far as the study knows, the trial is not finished yet.
+        finished = [*self._finished(study), (trial.number, trial.params, values[0])]
+        if all(chain.stalled for chain in self._walk(study, finished)):
+            with contextlib.suppress(RuntimeError):  # asked and told: there is no loop to leave
+                study.stop()
+
+    def chains(self, study: Study) -> list[Chain]:
+        """Where the chains stand after the study's finished trials.
+
+        Parameters
+        ----------
+        study
+            A study with one objective.
+        """
+        return self._walk(study, self._finished(study))
+
+    def stalled(self, study: Study) -> bool:
+        """Whether all chains have gone long enough without an acceptance or a new best."""
+        return all(chain.stalled for chain in self.chains(study))
+
+    @staticmethod
+    def _finished(study: Study) -> list[_Trial]:
+        trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return [(t.number, t.params, t.value or 0.0) for t in trials]
+
+    def _walk(self, study: Study, trials: list[_Trial]) -> list[Chain]:
+        trials.sort(key=lambda t: t[0])
+        walked, numbers = self._walked, [number for number, *_ in trials]
+        if walked is None or walked[0] != study.study_name or not _extends(numbers, walked[1]):
+            walked = study.study_name, [n for n in numbers if n < self.n_startup_trials], []
+            walked[2].extend(self._started(study, trials[: len(walked[1])]))
+        chains = [copy.copy(chain) for chain in walked[2]]
+        sign = _sign(study)
+        scale = self.settings.energy_scale or next(
+            (abs(value) for *_, value in trials if value and math.isfinite(value)), 1.0
+        )
+        for number, params, value in trials[len(walked[1]) :]:
+            chain = chains[number % len(chains)]
+            chain.step(params, sign * value, scale, self._rng(number).random())
+        self._walked = study.study_name, numbers, chains
+        return chains
+
+    def _started(self, study: Study, startup: list[_Trial]) -> list[Chain]:
+        chains = [Chain(self.settings) for _ in range(self.settings.chains)]
+        sign = _sign(study)
+        best = sorted(startup, key=lambda t: sign * t[2])[: len(chains)]
+        for k, chain in enumerate(chains):
+            if best:
+                _, params, value = best[k % len(best)]
+                chain.start(params, sign * value)
+        return chains
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.default_rng((self.seed, number))
+
+
+def _sign(study: Study) -> float:
+    return -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
+
+
+def _extends(numbers: list[int], before: list[int]) -> bool:
+    """Whether all trials that are new come after those that were there before."""
+    return numbers[: len(before)] == before
+
+
+def _stepped(
+    value: Any,
+    distribution: BaseDistribution,
+    step: Step,
+    temperature: float,
+    rng: np.random.Generator,
+) -> Any:
+    """A neighbour of `value`."""
+    if isinstance(distribution, CategoricalDistribution):
+        others = [c for c in distribution.choices if type(c) is not type(value) or c != value]
+        if not others or rng.random() >= (CHANGE if step.change is None else step.change):
+            return value
+        return others[rng.integers(len(others))]
+    assert isinstance(distribution, FloatDistribution | IntDistribution)
+    low, high = distribution.low, distribution.high
+    if low == high:
+        return value
+    if distribution.step is not None and not distribution.log:
+        # Counted in steps of the distribution.
+        n = round((high - low) / distribution.step)
+        delta_max = math.ceil(DELTA_MAX * n) if step.delta_max is None else step.delta_max
+        longest = math.ceil(temperature * delta_max)
+        i = round((value - low) / distribution.step) + int(rng.integers(-longest, longest + 1))
+        made = low + _reflected(i, n) * distribution.step
+        return int(made) if isinstance(distribution, IntDistribution) else min(made, high)
+    if distribution.log:
+        low, high, x = math.log(low), math.log(high), math.log(value)
+    else:
+        x = value
+    sigma = SIGMA * (high - low) if step.sigma is None else step.sigma
+    x += rng.normal(step.mu or 0.0, sigma)
+    x = low + _reflected(x - low, high - low)
+    made = math.exp(x) if distribution.log else x
+    if isinstance(distribution, IntDistribution):
+        made = round(made)
+        if made == value:  # a step of less than one whole number is one
+            up = value == distribution.low or (x > math.log(value) and value < distribution.high)
+            made += 1 if up else -1
+        return int(made)
+    return min(max(made, distribution.low), distribution.high)
+
+
+def _reflected(x: Any, length: Any) -> Any:
+    """Bring `x` into [0, length] as a billiard ball comes back from the cushions."""
+    x %= 2 * length
+    return 2 * length - x if x > length else x

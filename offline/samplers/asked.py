@@ -1,0 +1,173 @@
+"""Samplers of Optuna's kind, asked for sets and told what they are worth."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import optuna
+
+from adaptune.sampling import AnnealingSettings, SamplerError, optuna_sampler
+from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
+from adaptune.study import OfflineConfig
+from offline.samplers.annealing import AnnealingSampler
+from offline.samplers.base import Result, Sampler, Tried, key
+from offline.samplers.points import sobol_points
+from offline.storage import distribution
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+FORGETFUL = ("tpe", "gp")
+"""To these, a trial that they are told of is as good as one that they were asked for."""
+_ATTEMPTS = 32
+
+
+class AskedSampler(Sampler):
+    """Begins with points of a Sobol sequence, and then asks a sampler of Optuna's kind.
+
+    Many of them keep notes on the trials that they were asked for: a generation, a population, the
+    state of their random numbers. Therefore a search that is resumed asks anew for what was
+    proposed before, and answers from the history. Those that keep none are told the history
+    instead, and begin every batch with a seed of its own. Nothing is kept on disk.
+
+    A set that was tried before is answered at once with the value that is known, and the sampler
+    is asked again; in the end a random one is taken.
+
+    Parameters
+    ----------
+    space
+        The parameters.
+    config
+        Sampler, its settings, seed, and sizes.
+    """
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        self._distributions = {name: _distribution(p) for name, p in space.parameters.items()}
+        self._begin(0, ())
+
+    def _begin(self, seed: int, history: Sequence[Result]) -> None:
+        self._study = optuna.create_study(
+            sampler=self._sampler(seed), directions=["minimize"] * len(self.config.objective)
+        )
+        self._study.add_trials(
+            optuna.trial.create_trial(
+                params=self._encode(parameters),
+                distributions=self._distributions,
+                values=np.atleast_1d(value).tolist(),
+            )
+            for parameters, value in history
+        )
+        self._history = list(history)
+        self._values = {key(parameters): value for parameters, value in history}
+        self._waiting: dict[str, tuple[ParameterSet, list[Any]]] = {}
+
+    def _sampler(self, batch: int) -> Any:
+        config = self.config
+        if config.sampler == "annealing":
+            settings = AnnealingSettings.model_validate(config.sampler_settings)
+            return AnnealingSampler(settings, n_startup_trials=config.initial, seed=config.seed)
+        all_usual: dict[str, dict[str, Any]] = {
+            "cmaes": {"n_startup_trials": config.initial, "warn_independent_sampling": False},
+            "gp": {"n_startup_trials": 1, "warn_independent_sampling": False},
+            "nsga2": {"population_size": max(config.batch, 2)},
+            "qmc": {"scramble": True, "warn_independent_sampling": False},
+            # The initial points are the start-up: it needs no random ones of its own.
+            "tpe": {"n_startup_trials": 1},
+        }
+        usual = all_usual.get(config.sampler, {})
+        seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
+        return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
+
+    def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]:
+        if self.config.sampler in FORGETFUL:
+            self._begin(numbers.start // self.config.batch, history)
+            return self._ask(numbers)
+        if self._history != list(history[: len(self._history)]):
+            self._begin(0, ())
+        while len(self._history) < numbers.start:
+            first = len(self._history)
+            batch = range(first, first + self.config.batch)
+            self._ask(batch)
+            self._answer(history[batch.start : batch.stop])
+        return self._ask(numbers)
+
+    def _ask(self, numbers: range) -> list[ParameterSet]:
+        """Sets of the next batch, the same ones until they are answered."""
+        if not self._waiting:
+            tried = Tried(parameters for parameters, _ in self._history)
+            n_initial = self._n_initial(numbers)
+            given = [self.space.baseline] if numbers.start == 0 else []
+            given += sobol_points(
+                self.space, self.config.seed, range(numbers.start + len(given), n_initial)
+            )
+            for number in numbers:
+                first = given[number - numbers.start] if number < n_initial else None
+                if not self._ask_once(number, first, tried):
+                    break
+        return [parameters for parameters, _ in self._waiting.values()]
+
+    def _n_initial(self, numbers: range) -> int:
+        n = 1 if self.config.sampler == "qmc" else self.config.initial
+        return max(numbers.start, min(numbers.stop, n))
+
+    def _ask_once(self, number: int, given: ParameterSet | None, tried: Tried) -> bool:
+        for attempt in range(_ATTEMPTS):
+            if attempt == _ATTEMPTS - 1:
+                rng = np.random.default_rng((self.config.seed, number, 1))
+                given = tried.another(self.space, rng)
+                if given is None:
+                    return False
+            if given is not None:
+                self._study.enqueue_trial(self._encode(given))
+            trial = self._study.ask(self._distributions)
+            parameters, given = given or self._decode(trial.params), None
+            name = key(parameters)
+            if name in self._values:
+                self._study.tell(trial, self._values[name])
+            elif name in self._waiting:
+                self._waiting[name][1].append(trial)
+            else:
+                self._waiting[name] = (parameters, [trial])
+                tried.add(parameters)
+                return True
+        raise AssertionError
+
+    def _answer(self, results: Sequence[Result]) -> None:
+        if [parameters for parameters, _ in self._waiting.values()] != [p for p, _ in results]:
+            raise SamplerError(
+                f"{self.config.sampler} no longer proposes what it proposed for trials "
+                f"{len(self._history)} to {len(self._history) + len(results) - 1}: is another "
+                f"version of it installed? Go back to that one, or give the study another folder "
+                f"(--folder)"
+            )
+        for (_, trials), (parameters, value) in zip(self._waiting.values(), results, strict=True):
+            for trial in trials:
+                self._study.tell(trial, value)
+            self._values[key(parameters)] = value
+        self._history += results
+        self._waiting = {}
+
+    # Optuna takes choices for equal that Python does (1 and True), and so it is given their index.
+
+    def _encode(self, parameters: ParameterSet) -> dict[str, Any]:
+        return {
+            name: p.index(parameters[name]) if isinstance(p, Categorical) else parameters[name]
+            for name, p in self.space.parameters.items()
+        }
+
+    def _decode(self, params: dict[str, Any]) -> ParameterSet:
+        decoded: ParameterSet = {}
+        for name, p in self.space.parameters.items():
+            value = params[name]
+            if isinstance(p, Categorical):
+                decoded[name] = p.choices[value]
+            else:
+                value = min(max(value, p.low), p.high)
+                decoded[name] = float(value) if isinstance(p, Float) else int(value)
+        return decoded
+
+
+def _distribution(parameter: Float | Integer | Categorical) -> Any:
+    if isinstance(parameter, Categorical):
+        return optuna.distributions.CategoricalDistribution(range(len(parameter.choices)))
+    return distribution(parameter)

@@ -1,0 +1,296 @@
+import itertools
+import math
+import warnings
+
+import numpy as np
+import optuna
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from scipy import stats
+
+from adaptune.sampling import AnnealingSettings, Step
+from offline.samplers import AnnealingSampler
+from offline.samplers.annealing import Chain, _reflected, _stepped
+
+SPACE = {
+    "x": FloatDistribution(-5.0, 5.0),
+    "y": FloatDistribution(0.01, 100.0, log=True),
+    "n": IntDistribution(0, 20),
+    "m": IntDistribution(1, 1000, log=True),
+    "q": FloatDistribution(0.0, 1.0, step=0.25),
+    "c": CategoricalDistribution(("red", "green", "blue")),
+}
+
+
+def settings(**given):
+    return AnnealingSettings.model_validate(given)
+
+
+def objective(trial):
+    x = trial.suggest_float("x", -5.0, 5.0)
+    n = trial.suggest_int("n", 0, 20)
+    c = trial.suggest_categorical("c", ("red", "green", "blue"))
+    return x**2 + abs(n - 7) + (c != "blue")
+
+
+def optimize(n_trials, sampler, **given):
+    study = optuna.create_study(sampler=sampler, **given)
+    study.optimize(objective, n_trials=n_trials)
+    return study
+
+
+def history(study):
+    return [(trial.params, trial.value) for trial in study.trials]
+
+
+# As a sampler of Optuna's.
+
+
+def test_finds_the_least():
+    study = optimize(150, AnnealingSampler(seed=2))
+    assert study.best_value < 0.5
+    assert all(-5.0 <= t.params["x"] <= 5.0 for t in study.trials)
+
+
+def test_a_loaded_study_goes_on_as_if_it_had_never_stopped():
+    once = optimize(40, AnnealingSampler(seed=3))
+    storage = optuna.storages.InMemoryStorage()
+    optimize(17, AnnealingSampler(seed=3), storage=storage, study_name="s")
+    study = optuna.load_study(study_name="s", storage=storage, sampler=AnnealingSampler(seed=3))
+    study.optimize(objective, n_trials=23)
+    assert history(study) == history(once)
+
+
+def test_maximizes():
+    study = optuna.create_study(sampler=AnnealingSampler(seed=1), direction="maximize")
+    study.optimize(lambda t: -objective(t), n_trials=100)
+    assert study.best_value > -1.0
+
+
+def test_begins_at_an_enqueued_trial():
+    study = optuna.create_study(
+        sampler=AnnealingSampler(settings(steps={"x": {"sigma": 0.01}, "n": {"delta_max": 1}}))
+    )
+    study.enqueue_trial({"x": 4.0, "n": 20, "c": "blue"})
+    study.optimize(objective, n_trials=10)
+    assert all(abs(t.params["x"] - 4.0) < 0.5 for t in study.trials)
+
+
+def test_chains_begin_at_the_best_of_the_first_trials():
+    sampler = AnnealingSampler(settings(chains=2), n_startup_trials=10, seed=1)
+    study = optimize(10, sampler)
+    energies = sorted(t.value for t in study.trials)
+    assert [chain.energy for chain in sampler.chains(study)] == energies[:2]
+
+
+def test_trials_that_run_at_the_same_time_step_from_the_same_place():
+    sampler = AnnealingSampler(settings(chains=1, steps={"x": {"sigma": 0.02}}), seed=1)
+    study = optimize(20, sampler)
+    (chain,) = sampler.chains(study)
+    xs = [study.ask(SPACE).params["x"] for _ in range(8)]
+    assert len(set(xs)) == 8
+    assert all(abs(x - chain.params["x"]) < 0.2 for x in xs)
+
+
+def test_stops_when_all_chains_have_stalled():
+    sampler = AnnealingSampler(settings(chains=3, stall_best=5), seed=1)
+    study = optuna.create_study(sampler=sampler)
+    study.optimize(lambda t: 0.0 * objective(t), n_trials=1000)
+    # Each of three chains needs five steps after the first trial, and they take turns.
+    assert len(study.trials) == 1 + 3 * 5
+    assert sampler.stalled(study)
+
+
+def test_a_step_of_an_unknown_parameter_is_an_error():
+    with pytest.raises(ValueError, match=r"steps of 'xx': there is no such parameter; did you"):
+        optimize(5, AnnealingSampler(settings(steps={"xx": {"sigma": 1.0}})))
+
+
+def test_refuses_several_objectives():
+    study = optuna.create_study(directions=["minimize"] * 2, sampler=AnnealingSampler())
+    with pytest.raises(ValueError, match="multi-objective"):
+        study.optimize(lambda t: (objective(t), t.suggest_float("x", -5, 5)), n_trials=5)
+
+
+def test_failed_and_infinite_trials_do_no_harm():
+    def shaky(trial):
+        value = objective(trial)
+        if trial.number % 5 == 1:
+            raise ArithmeticError
+        return math.inf if trial.number % 5 == 2 or trial.number == 0 else value
+
+    study = optuna.create_study(sampler=AnnealingSampler(seed=4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        study.optimize(shaky, n_trials=100, catch=ArithmeticError)
+    assert study.best_value < 3.0
+
+
+# One chain.
+
+
+def walk(energies, **given):
+    """Temperatures after each step of a chain whose trials have these energies."""
+    chain = Chain(settings(initial_temperature=1.0, alpha=0.5, **given))
+    chain.start({}, 1.0)
+    temperatures = []
+    for energy in energies:
+        chain.step({}, energy, 1.0, 0.999)
+        temperatures.append(chain.temperature)
+    return chain, temperatures
+
+
+def test_cools_with_every_step():
+    assert walk([0.5, 2.0, 0.1])[1] == [0.5, 0.25, 0.125]
+
+
+def test_is_heated_after_a_number_of_steps():
+    assert walk([2.0] * 7, reanneal_fixed=3)[1] == [0.5, 0.25, 1.0, 0.5, 0.25, 1.0, 0.5]
+
+
+def test_is_heated_after_a_stretch_without_acceptance():
+    assert walk([9.0, 0.9, 9.0, 9.0, 9.0], reanneal_accepted=2)[1] == [0.5, 0.25, 0.125, 1.0, 0.5]
+
+
+def test_is_heated_after_a_stretch_without_a_new_best():
+    # The same energy is accepted, but it is no new best one.
+    assert walk([1.0, 0.9, 0.9, 0.9, 0.8], reanneal_best=2)[1] == [0.5, 0.25, 0.125, 1.0, 0.5]
+
+
+def test_stalls():
+    assert walk([9.0] * 3, stall_accepted=3)[0].stalled
+    assert not walk([9.0, 9.0, 1.0], stall_accepted=3)[0].stalled
+    assert walk([1.0] * 3, stall_best=3)[0].stalled
+    assert not walk([9.0, 9.0, 0.5], stall_best=3)[0].stalled
+    # Heating does not hide it.
+    assert walk([9.0] * 4, stall_accepted=4, reanneal_accepted=2)[0].stalled
+
+
+@pytest.mark.parametrize(("temperature", "scale"), [(1.0, 1.0), (0.1, 4.0), (0.5, 0.2)])
+def test_accepts_worse_ones_with_the_probability_of_metropolis(temperature, scale):
+    rng = np.random.default_rng(0)
+    accepted = 0
+    for _ in range(4000):
+        chain = Chain(settings(initial_temperature=temperature))
+        chain.start({"x": 0}, 1.0)
+        chain.step({"x": 1}, 1.2, scale, rng.random())
+        accepted += chain.params["x"]
+    expected = math.exp(-0.2 / scale / temperature)
+    assert stats.binomtest(accepted, 4000, expected).pvalue > 1e-4
+
+
+def test_visits_as_boltzmann_says():
+    """At a temperature that stays, places are visited as exp(-E / T)."""
+    energies = np.array([0.0, 1.0, 0.5, 2.0, 0.2])
+    chain = Chain(settings(initial_temperature=0.7, alpha=1.0))
+    chain.start({"n": 0}, energies[0])
+    rng = np.random.default_rng(1)
+    places = IntDistribution(0, 4)
+    visits = np.zeros(5)
+    for _ in range(20_000):
+        n = _stepped(chain.params["n"], places, Step(delta_max=1), 0.7, rng)
+        chain.step({"n": n}, energies[n], 1.0, rng.random())
+        visits[chain.params["n"]] += 1
+    # A step beyond a bound is reflected, so that from an end its neighbour is twice as likely:
+    # the ends are visited half as often as places in between.
+    weights = np.exp(-energies / 0.7) * [0.5, 1, 1, 1, 0.5]
+    np.testing.assert_allclose(visits / visits.sum(), weights / weights.sum(), atol=0.04)
+
+
+def test_energies_are_divided_by_that_of_the_first_trial():
+    def spread(scale):
+        study = optuna.create_study(
+            sampler=AnnealingSampler(settings(energy_scale=scale, initial_temperature=1.0), seed=1)
+        )
+        study.optimize(lambda t: 1e3 * (1.0 + objective(t)), n_trials=60)
+        return history(study)
+
+    first = spread(None)
+    assert first == spread(first[0][1])
+    assert first != spread(1.0)
+
+
+# One step.
+
+
+def steps_from(value, distribution, step, temperature=1.0, n=4000):
+    rng = np.random.default_rng(0)
+    return [_stepped(value, distribution, step, temperature, rng) for _ in range(n)]
+
+
+@pytest.mark.parametrize(("mu", "sigma"), [(0.0, 0.5), (0.3, 0.2), (-0.5, 0.4)])
+def test_real_numbers_step_by_a_normal_distribution(mu, sigma):
+    xs = np.array(steps_from(0.0, FloatDistribution(-50.0, 50.0), Step(mu=mu, sigma=sigma)))
+    assert stats.kstest(xs, "norm", (mu, sigma)).pvalue > 1e-4
+    ys = steps_from(1.0, FloatDistribution(1e-9, 1e9, log=True), Step(mu=mu, sigma=sigma))
+    assert stats.kstest(np.log(ys), "norm", (mu, sigma)).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.5, 0.26, 0.01])
+def test_whole_numbers_step_as_far_as_the_temperature_lets_them(temperature):
+    counts = np.bincount(
+        steps_from(50, IntDistribution(0, 100), Step(delta_max=6), temperature), minlength=101
+    )
+    longest = math.ceil(6 * temperature)
+    reached = np.flatnonzero(counts)
+    assert (reached[0], reached[-1]) == (50 - longest, 50 + longest)
+    assert stats.chisquare(counts[reached]).pvalue > 1e-4
+
+
+def test_categories_change_as_often_as_they_are_told():
+    cs = steps_from("red", SPACE["c"], Step(change=0.4))
+    share = {c: cs.count(c) / len(cs) for c in ("red", "green", "blue")}
+    assert share == pytest.approx({"red": 0.6, "green": 0.2, "blue": 0.2}, abs=0.04)
+
+
+def test_whole_numbers_in_log_scale_always_move():
+    ms = steps_from(3, SPACE["m"], Step(sigma=0.001))
+    assert set(ms) == {2, 4}
+    assert set(steps_from(1, SPACE["m"], Step(sigma=0.001))) == {2}
+    assert set(steps_from(1000, SPACE["m"], Step(sigma=0.0001))) == {999}
+
+
+@given(
+    st.sampled_from(sorted(SPACE)),
+    st.integers(0, 1000),
+    st.floats(-100.0, 100.0),
+    st.floats(0.0, 100.0),
+    st.floats(1e-6, 10.0),
+)
+def test_steps_stay_in_range(name, seed, mu, sigma, temperature):
+    distribution, rng = SPACE[name], np.random.default_rng(seed)
+    value = optuna.samplers.RandomSampler(seed).sample_independent(
+        optuna.create_study(), None, name, distribution
+    )
+    step = Step() if seed % 2 else Step(mu=mu, sigma=sigma, delta_max=int(sigma), change=0.5)
+    made = _stepped(value, distribution, step, temperature, rng)
+    assert type(made) is type(value)
+    assert distribution._contains(distribution.to_internal_repr(made))
+
+
+@pytest.mark.parametrize(
+    ("x", "inside"), [(3.0, 3.0), (11.0, 9.0), (-2.0, 2.0), (25.0, 5.0), (-13.0, 7.0), (20, 0)]
+)
+def test_reflects_at_both_bounds(x, inside):
+    assert _reflected(x, 10) == inside
+
+
+def test_mean_of_many_steps_is_that_of_the_middle():
+    """Reflection keeps a walk without errors uniform: no bound attracts it."""
+    x, xs, rng = 0.3, [], np.random.default_rng(5)
+    for _ in range(20_000):
+        x = _stepped(x, FloatDistribution(0.0, 1.0), Step(sigma=0.4), 1.0, rng)
+        xs.append(x)
+    counts, _ = np.histogram(xs, bins=5, range=(0, 1))
+    np.testing.assert_allclose(counts / len(xs), 0.2, atol=0.02)
+
+
+def test_every_combination_of_a_small_space_is_reached():
+    space = {"n": IntDistribution(0, 3), "c": SPACE["c"]}
+    study = optuna.create_study(sampler=AnnealingSampler(seed=0))
+    for _ in range(300):
+        study.tell(study.ask(space), 1.0)
+    seen = {(t.params["n"], t.params["c"]) for t in study.trials}
+    assert seen == set(itertools.product(range(4), ("red", "green", "blue")))

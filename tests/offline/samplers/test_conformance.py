@@ -1,0 +1,208 @@
+"""What every sampler must do."""
+
+import collections
+import math
+
+import numpy as np
+import pytest
+
+from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from adaptune.study import OfflineConfig
+from offline.samplers import make_sampler
+
+SPACE = ParameterSpace(
+    {
+        "distance": Float(low=0.01, high=100.0, baseline=3.0, log=True),
+        "gain": Float(low=-1.0, high=1.0, baseline=0.25),
+        "rings": Integer(low=1, high=64, baseline=16, log=True),
+        "passes": Integer(low=0, high=9, baseline=2),
+        # Python takes 1 and True for equal.
+        "kernel": Categorical(choices=("huber", "none", 1, True), baseline="huber"),
+    }
+)
+GRID = {
+    "distance": {"low": 0.1, "high": 10.0, "count": 5},
+    "gain": [-1.0, 0.5, 5],
+    "rings": {"low": 1, "high": 64, "count": 7},
+    "passes": [0, 3, 4],
+}
+FINITE = ParameterSpace(
+    {
+        "passes": Integer(low=1, high=6, baseline=2),
+        "kernel": Categorical(choices=("huber", "none", True), baseline="none"),
+    }
+)
+SETTINGS = {
+    "grid": {"grid": GRID},
+    "annealing": {"chains": 4},
+    "annealing, one chain": {"reanneal_best": 5, "steps": {"gain": {"mu": 0.1, "sigma": 0.3}}},
+    "random, of a grid": {"grid": GRID},
+    "qmc": {"qmc_type": "halton"},
+}
+SAMPLERS = [
+    "random",
+    "random, of a grid",
+    "grid",
+    "sobol",
+    "tpe",
+    "annealing",
+    "annealing, one chain",
+    "cmaes",
+    "nsga2",
+    "qmc",
+    "optuna.samplers:RandomSampler",
+]
+
+
+def bowl(parameters):
+    return (
+        abs(math.log10(parameters["distance"]))
+        + abs(parameters["gain"])
+        + parameters["rings"] / 64
+        + abs(parameters["passes"] - 5) / 9
+        + (parameters["kernel"] is not True)
+    )
+
+
+@pytest.fixture(params=SAMPLERS)
+def config(request):
+    settings = SETTINGS.get(request.param, {})
+    name = request.param.partition(",")[0]
+    return OfflineConfig(sampler=name, sampler_settings=settings, batch=8, initial=12, seed=5)
+
+
+but_for_the_grid = pytest.mark.parametrize(
+    "config", [name for name in SAMPLERS if name != "grid"], indirect=True
+)
+
+
+def run(config, n_batches, space=SPACE, error=bowl):
+    sampler = make_sampler(space, config)
+    history = []
+    for _ in range(n_batches):
+        history += [(s, error(s)) for s in sampler.propose(history)]
+    return history
+
+
+def test_sets_are_of_the_space(config):
+    history = run(config, 6)
+    assert len(history) == 48
+    for parameters, _ in history:
+        SPACE.check(parameters)
+        types = [type(value) for value in parameters.values()]
+        assert types[:4] == [float, float, int, int]
+        assert list(parameters) == list(SPACE.names)
+
+
+def test_trial_0_is_the_baseline(config):
+    assert run(config, 1)[0][0] == SPACE.baseline
+
+
+def test_sets_differ(config):
+    sets = [repr(s) for s, _ in run(config, 8)]
+    assert len(set(sets)) == len(sets) == 64
+
+
+def test_same_seed_and_results_give_the_same_sets(config):
+    assert repr(run(config, 4)) == repr(run(config, 4))
+
+
+@but_for_the_grid
+def test_another_seed_gives_other_sets(config):
+    other = config.model_copy(update={"seed": 6})
+    assert run(config, 2)[1:] != run(other, 2)[1:]
+
+
+@pytest.mark.parametrize("known", [0, 1, 3, 4])
+def test_resumes_exactly(config, known):
+    history = run(config, 6)
+    resumed = make_sampler(SPACE, config)
+    for batch in range(known, 6):
+        assert resumed.propose(history[: 8 * batch]) == [
+            s for s, _ in history[8 * batch : 8 * batch + 8]
+        ]
+
+
+def test_says_the_same_when_asked_again(config):
+    sampler = make_sampler(SPACE, config)
+    history = run(config, 4)
+    assert sampler.propose(history[:24]) == sampler.propose(history[:24])
+    # Also of what lies behind it.
+    assert sampler.propose(history[:16]) == [s for s, _ in history[16:24]]
+
+
+def test_refuses_a_history_that_is_not_all_before(config):
+    with pytest.raises(ValueError, match="batches have 8 trials; 15 are no whole ones"):
+        make_sampler(SPACE, config).propose(run(config, 2)[:15])
+
+
+@but_for_the_grid
+def test_heeds_the_log_scale(config):
+    """In linear scale, 1 % of the distances would be below 1, and 11 % of the rings below 8."""
+    config = config.model_copy(update={"initial": 48})
+    sets = [s for s, _ in run(config, 12, error=lambda _: 1.0)]
+    assert 0.2 < np.mean([s["distance"] < 1.0 for s in sets]) < 0.8
+    assert 0.2 < np.mean([s["rings"] < 8 for s in sets]) < 0.8
+
+
+def test_tries_all_there_is_and_ends(config):
+    if "grid" in config.sampler_settings:
+        settings = {"grid": {"passes": [1, 1, 6]}}
+        config = config.model_copy(update={"sampler_settings": settings})
+    if "steps" in config.sampler_settings:
+        config = config.model_copy(update={"sampler_settings": {}})
+    sampler = make_sampler(FINITE, config)
+    history = []
+    while sets := sampler.propose(history):
+        history += [(s, s["passes"] / 6 + (s["kernel"] == "none")) for s in sets]
+        if len(sets) < config.batch:
+            break
+    assert len(history) == 18
+    assert max(collections.Counter(repr(s) for s, _ in history).values()) == 1
+
+
+LEARNING = ["tpe", "annealing", "cmaes", "nsga2"]
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_learns(name):
+    """Later trials are better than the points it began with."""
+    config = OfflineConfig(sampler=name, batch=8, initial=16, seed=5)
+    errors = [error for _, error in run(config, 14)]
+    assert np.mean(errors[64:]) < 0.7 * np.mean(errors[1:16])
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_heeds_the_results(name):
+    config = OfflineConfig(sampler=name, batch=8, initial=8, seed=5)
+    up, down = (
+        [s["gain"] for s, _ in run(config, 10, error=lambda s, k=k: k * s["gain"] + 2.0)][40:]
+        for k in (1, -1)
+    )
+    assert np.mean(up) < np.mean(down)
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_begins_with_the_sobol_points(name):
+    of = [OfflineConfig(sampler=s, batch=8, initial=12, seed=5) for s in (name, "sobol")]
+    a, b = (run(config, 2) for config in of)
+    assert a[:12] == b[:12]
+    assert a[12:] != b[12:]
+
+
+def test_sobol_spreads_evenly_in_ratio():
+    config = OfflineConfig(sampler="sobol", batch=64, seed=1)
+    distances = [s["distance"] for s, _ in run(config, 1)[1:]]
+    counts, _ = np.histogram(np.log10(distances), bins=4, range=(-2, 2))
+    assert counts.min() >= 14
+
+
+@pytest.mark.parametrize("name", ["tpe", "nsga2", "random", "sobol", "qmc"])
+def test_searches_for_several_objectives(name):
+    config = OfflineConfig(sampler=name, objective=["rte", "rpe"], batch=8, initial=16, seed=5)
+    history = run(config, 8, error=lambda s: (bowl(s), s["gain"] + 1.0))
+    assert len({repr(s) for s, _ in history}) == 64
+    assert make_sampler(SPACE, config).propose(history[:40]) == [s for s, _ in history[40:48]]
+    if name in LEARNING:
+        sums = [sum(values) for _, values in history]
+        assert np.mean(sums[40:]) < np.mean(sums[1:16])

@@ -1,0 +1,110 @@
+import json
+import re
+
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.study import OfflineConfig, load_study
+from offline.budget import Clock, max_trials, spent
+from offline.campaign import train
+from offline.objective import Verdict
+
+
+def verdicts(*values):
+    return [Verdict({"x": float(i)}, (value,), 0.0) for i, value in enumerate(values)]
+
+
+@pytest.mark.parametrize(
+    ("budget", "errors", "hours", "reason"),
+    [
+        ({"trials": 3}, [1.0, 2.0], 9.0, None),
+        ({"trials": 3}, [1.0, 2.0, 3.0], 0.0, "3 trials are done"),
+        ({}, [1.0] * 63, 9.0, None),
+        ({}, [1.0] * 64, 9.0, "64 trials"),
+        ({"hours": 2.0}, [1.0] * 100, 1.9, None),
+        ({"hours": 2.0}, [1.0], 2.0, "2.00 hours have passed"),
+        ({"stagnation": 3}, [5.0, 2.0, 3.0, 3.0], 0.0, None),
+        ({"stagnation": 3}, [5.0, 2.0, 3.0, 3.0, 2.0], 0.0, "none of 3 trials .* than trial 1"),
+        ({"stagnation": 3}, [5.0, 2.0, 3.0, 3.0, 1.9], 0.0, None),
+        ({"target": 0.5}, [5.0, 0.6], 0.0, None),
+        ({"target": 0.5}, [5.0, 0.5, 0.7], 0.0, r"trial 1 has reached the target of 0\.5"),
+        ({"target": 0.5, "trials": 3}, [1.0, 1.0, 1.0], 0.0, "3 trials"),
+        ({"target": 0.5, "hours": 1.0}, [], 0.0, None),
+        ({"sampler": "grid"}, [1.0] * 1000, 0.0, None),
+    ],
+)
+def test_stops_when_the_first_budget_is_used_up(budget, errors, hours, reason):
+    best = errors.index(min(errors)) if errors else 0
+    found = spent(OfflineConfig(**budget), verdicts(*errors), best, hours)
+    assert (found is None) == (reason is None)
+    assert reason is None or re.search(reason, found)
+
+
+def test_a_set_that_breaks_a_limit_reaches_no_target():
+    broken = Verdict({"x": 1.0}, (0.1,), 0.5)
+    assert spent(OfflineConfig(target=0.5), [broken], 0, 0.0) is None
+
+
+def test_64_trials_where_nothing_else_says_when():
+    assert max_trials(OfflineConfig()) == 64
+    assert max_trials(OfflineConfig(hours=1.0)) is None
+    assert max_trials(OfflineConfig(hours=1.0, trials=7)) == 7
+    assert max_trials(OfflineConfig(sampler="grid")) is None
+
+
+def test_the_clock_goes_on_counting(tmp_path):
+    path = tmp_path / "elapsed.json"
+    clock = Clock(path)
+    assert clock.hours(5) == 0.0
+    with pytest.raises(KeyboardInterrupt), clock.running(0):
+        raise KeyboardInterrupt
+    with clock.running(1):
+        pass
+    seconds = json.loads(path.read_text())
+    assert set(seconds) == {"0", "1"}
+    path.write_text('{"0": 3600, "1": 1800.0, "2": 9}')
+    assert Clock(path).hours(2) == 1.5
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"a": 1}', '{"0": "x"}'])
+def test_a_damaged_clock_is_named(tmp_path, text):
+    (tmp_path / "elapsed.json").write_text(text)
+    with pytest.raises(AdaptuneError, match=r"elapsed\.json: is damaged .* remove it"):
+        Clock(tmp_path / "elapsed.json")
+
+
+def trials(folder):
+    files = folder.glob("trials/*/*.npz")
+    return {f: f.stat().st_mtime_ns for f in files if f.stem.isdigit()}
+
+
+GRID = (
+    "offline.sampler_settings={grid: {max_correspondence_distance: [1.0, 2.0, 2],"
+    " keyframe_interval: [1.0, 4.0, 3]}}"
+)
+
+
+def test_a_search_ends_where_its_budget_does_and_again_when_resumed(study_file, tmp_path, caplog):
+    caplog.set_level("INFO")
+    folder = tmp_path / "run"
+    train(load_study(study_file, ["offline.trials=8"], folder))
+    before = trials(folder)
+    assert len(before) == 2 * 8
+    # The trials are there: a budget that ends the search before finds them, and runs none.
+    for budget in ("offline.target=29", "offline.stagnation=1", "offline.hours=1e-9"):
+        training = train(load_study(study_file, ["offline.trials=", budget], folder))
+        assert len(training.model.sets) in (4, 8)
+    assert trials(folder) == before
+    assert "the search ends: trial 2 has reached the target of 29" in caplog.text
+
+
+def test_a_grid_is_walked_to_its_end(study_file, tmp_path, caplog):
+    caplog.set_level("INFO")
+    given = ["offline.sampler=grid", GRID, "offline.trials="]
+    training = train(load_study(study_file, given, tmp_path / "run"))
+    pairs = [tuple(s.values()) for s in training.model.sets]
+    assert pairs[0] == (2.0, 1.0)
+    assert pairs[1:] == [(d, k) for d in (1.0, 3.0) for k in (1.0, 5.0, 9.0)]
+    assert "the search ends: there is nothing else to try" in caplog.text
+    again = train(load_study(study_file, given, tmp_path / "run"))
+    assert again.model.sets == training.model.sets
