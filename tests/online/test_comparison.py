@@ -4,9 +4,8 @@ import json
 import numpy as np
 import pytest
 
-from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, portfolio
-from adaptune.study import load_study
+from adaptune.study import ConfigurationError, load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.campaign import train
 from online.comparison import ComparisonError, bank_sets, bootstrap, compare, run_replays
@@ -162,11 +161,9 @@ def test_names_a_missing_replay(study_file, tmp_path):
 def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
     truth = read_tum_of(trained, study_file)
     write_tum(tmp_path / "late.tum", Trajectory(truth.stamps + 10**12, truth.T_world_sensor))
-    study = load_study(
-        study_file, [f"sequences.three.reference={tmp_path / 'late.tum'}"], trained.folder
-    )
-    with pytest.raises(AdaptuneError, match=r"the reference tells of .* set `clock_offset`"):
-        run_replays(study, trained.folder / "model.npz")
+    late = f"sequences.three.reference={tmp_path / 'late.tum'}"
+    with pytest.raises(ConfigurationError, match=r"the reference tells of .* set `clock_offset`"):
+        load_study(study_file, [late], trained.folder)
 
 
 def read_tum_of(study, study_file):
