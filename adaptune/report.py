@@ -1,6 +1,7 @@
 """What people look at: tables on the terminal, CSV and JSON beside them, and pictures."""
 
 import csv
+import io
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -81,16 +82,19 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of equal keys as CSV, with a header."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
 def write_rows(folder: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows of equal keys as ``<name>.csv`` and ``<name>.json``."""
     plain = [{key.lstrip("_"): value for key, value in row.items()} for row in rows]
-    with (
-        replacing(folder / f"{name}.csv") as beside,
-        beside.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.DictWriter(file, list(plain[0]) if plain else [])
-        writer.writeheader()
-        writer.writerows(plain)
+    write_text(folder / f"{name}.csv", csv_text(plain))
     # JSON knows no NaN.
     finite = [
         {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}

@@ -1,0 +1,164 @@
+"""A table of the trials in a study's archive: sorted, filtered, and exported."""
+
+import operator
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptune import yaml
+from adaptune.archive import Archive, Summary
+from adaptune.errors import AdaptuneError
+from adaptune.space import nearest
+from adaptune.trajectory import Trajectory, write_tum
+
+Row = dict[str, Any]
+
+_OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
+    "<=": operator.le,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+_CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
+
+
+class TrialsError(AdaptuneError):
+    """A condition or a column that makes no sense."""
+
+
+def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
+    """A row for every trial that is finished on any of the sequences.
+
+    Parameters
+    ----------
+    archive
+        The trials.
+    names
+        The sequences.
+
+    Returns
+    -------
+    list of dict
+        Number, parameters, mean error in percent (None before the trial is finished on all
+        sequences), the mean on each sequence, how often it lost track and how often its process
+        ended on all of them, and its other metrics.
+    """
+    finished = {name: archive.finished(name) for name in names}
+    return [
+        _row(number, {name: finished[name].get(number) for name in names})
+        for number in sorted(set().union(*finished.values()))
+    ]
+
+
+def _row(number: int, trials: Mapping[str, Summary | None]) -> Row:
+    there = [trial for trial in trials.values() if trial is not None]
+    whole = len(there) == len(trials)
+    row: Row = {"trial": number, **there[0].parameters}
+    row["mean"] = float(np.mean([trial.mean_error for trial in there])) if whole else None
+    row |= {name: trial and trial.mean_error for name, trial in trials.items()}
+    row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
+    metrics = [m for m in there[0].metrics if m != "rte"]
+    return row | {m: float(np.mean([t.metrics[m] for t in there])) for m in metrics}
+
+
+def select(
+    table: Sequence[Row],
+    where: Sequence[str] = (),
+    sort: str | None = None,
+    top: int | None = None,
+) -> list[Row]:
+    """The rows that meet all conditions, in order.
+
+    Parameters
+    ----------
+    table
+        Rows.
+    where
+        Conditions, as ``mean < 1``: a column, one of ``< <= > >= == !=``, and a value in YAML.
+    sort
+        A column; with ``-`` before it, the largest first. What is not known comes last.
+    top
+        How many rows at most.
+
+    Raises
+    ------
+    TrialsError
+    """
+    chosen = list(table)
+    for condition in where:
+        match = _CONDITION.fullmatch(condition)
+        if match is None:
+            raise TrialsError(
+                f"--where {condition!r}: give a column, one of < <= > >= == !=, and a value, as in "
+                f"'mean < 1'"
+            )
+        column, sign, text = match.groups()
+        try:
+            value = yaml.scalar(text)
+        except yaml.YamlError as error:
+            raise TrialsError(f"--where {condition!r}: {error}") from error
+        _check_column(chosen, column, f"--where {condition!r}")
+        chosen = [row for row in chosen if _meets(row[column], sign, value, condition)]
+    if sort is not None:
+        column = sort.removeprefix("-")
+        _check_column(chosen, column, f"--sort {sort}")
+        known = [row for row in chosen if row[column] is not None]
+        unknown = [row for row in chosen if row[column] is None]
+        known.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
+        chosen = known + unknown
+    return chosen[:top]
+
+
+def _check_column(table: Sequence[Row], column: str, where: str) -> None:
+    if table and column not in table[0]:
+        raise TrialsError(f"{where}: there is no column {column!r}: {nearest(column, table[0])}")
+
+
+def _meets(given: Any, sign: str, value: Any, condition: str) -> bool:
+    if given is None:
+        return False
+    try:
+        return _OPERATORS[sign](given, value)
+    except TypeError as error:
+        raise TrialsError(
+            f"--where {condition!r}: {given!r} and {value!r} cannot be compared"
+        ) from error
+
+
+def export(archive: Archive, names: Sequence[str], numbers: Sequence[int], folder: Path) -> int:
+    """Write trajectories as TUM: ``<sequence>/<number>.tum``, and ``<sequence>/reference.tum``.
+
+    Parameters
+    ----------
+    archive
+        The trials.
+    names, numbers
+        Which of them; those that are not finished are left out.
+    folder
+        Where to.
+
+    Returns
+    -------
+    int
+        How many trajectories of trials were written.
+    """
+    written = 0
+    for name in names:
+        present = [n for n in numbers if n in archive.finished(name)]
+        if not present:
+            continue
+        frames = archive.read_frames(name)
+        known = ~np.isnan(frames.T_ref_sensor[:, 0, 0])
+        reference = Trajectory(frames.stamps[known], frames.T_ref_sensor[known])
+        write_tum(folder / name / "reference.tum", reference)
+        for number in present:
+            T_odom_sensor = archive.read(name, number).T_odom_sensor
+            path = folder / name / f"{number:05d}.tum"
+            write_tum(path, Trajectory(frames.stamps, T_odom_sensor))
+        written += len(present)
+    return written

@@ -1,0 +1,120 @@
+"""The table of trials."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from adaptune.archive import Archive, Frames, Trial
+from adaptune.report import csv_text
+from adaptune.trajectory import read_tum
+from adaptune.trials import TrialsError, export, rows, select
+
+STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000
+
+
+def drive(seed):
+    """Poses without rotation."""
+    T = np.tile(np.eye(4), (len(STAMPS), 1, 1))
+    T[:, :3, 3] = np.random.default_rng(seed).normal(size=(len(STAMPS), 3)).cumsum(axis=0)
+    return T
+
+
+@pytest.fixture
+def archive(tmp_path):
+    """Trials 0 to 3 on one sequence, 0 on the other."""
+    archive = Archive(tmp_path / "trials")
+    for seed, (name, number) in enumerate([*(("cave", n) for n in range(4)), ("street", 0)]):
+        rng = np.random.default_rng(seed)
+        few = rng.random(len(STAMPS)) < 0.2
+        parameters = {"distance": rng.random(), "kernel": "Huber"}
+        errors, seconds = rng.gamma(1.0, size=(2, len(STAMPS)))
+        archive.write(name, number, Trial(parameters, drive(seed), errors, few, ~few, seconds))
+    archive.write("cave", 1, archive.read("cave", 0), whole=True)
+    return archive
+
+
+def test_there_is_a_row_for_every_trial(archive):
+    table = rows(archive, ["cave", "street"])
+    assert [row["trial"] for row in table] == [0, 1, 2, 3]
+    first = archive.read("cave", 0), archive.read("street", 0)
+    assert table[0]["mean"] == pytest.approx(np.mean([trial.mean_error for trial in first]))
+    assert table[0]["lost"] == sum(trial.restarted.sum() for trial in first)
+    assert table[1]["street"] is None
+    assert table[1]["mean"] is None
+    assert table[3]["kernel"] == "Huber"
+    assert rows(Archive(archive.folder / "none"), ["cave"]) == []
+
+
+TABLE = [
+    {"trial": 0, "mean": 2.0, "kernel": "Huber", "deskew": True},
+    {"trial": 1, "mean": None, "kernel": "Tukey", "deskew": False},
+    {"trial": 2, "mean": 0.5, "kernel": "Huber", "deskew": False},
+    {"trial": 3, "mean": 1.0, "kernel": "Tukey", "deskew": True},
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "numbers"),
+    [
+        ({}, [0, 1, 2, 3]),
+        ({"sort": "mean"}, [2, 3, 0, 1]),
+        ({"sort": "-mean"}, [0, 3, 2, 1]),
+        ({"sort": "mean", "top": 2}, [2, 3]),
+        ({"where": ["mean < 1"]}, [2]),
+        ({"where": ["mean<=1e0"]}, [2, 3]),
+        ({"where": ["mean != 1"]}, [0, 2]),
+        ({"where": ["kernel == Tukey"]}, [1, 3]),
+        ({"where": ["deskew==true", "trial >= 1"]}, [3]),
+        ({"where": ["trial > 9"], "sort": "mean"}, []),
+    ],
+)
+def test_selecting(arguments, numbers):
+    assert [row["trial"] for row in select(TABLE, **arguments)] == numbers
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"where": ["mean"]}, "give a column, one of"),
+        ({"where": ["mean = 1"]}, "give a column, one of"),
+        ({"where": ["maen < 1"]}, "no column 'maen': did you mean 'mean'"),
+        ({"where": ["mean < Huber"]}, "cannot be compared"),
+        ({"where": ["mean < ["]}, "--where"),
+        ({"sort": "means"}, "--sort means: .* did you mean 'mean'"),
+    ],
+)
+def test_mistakes_are_told(arguments, words):
+    with pytest.raises(TrialsError, match=words):
+        select(TABLE, **arguments)
+
+
+def test_csv_opens_in_pandas(tmp_path):
+    (tmp_path / "trials.csv").write_text(csv_text(TABLE))
+    trials = pd.read_csv(tmp_path / "trials.csv")
+    assert trials.sort_values("mean")["trial"].tolist() == [2, 3, 0, 1]
+    assert trials["mean"].isna().tolist() == [False, True, False, False]
+
+
+def test_the_index_opens_in_pandas(archive):
+    """As docs/study.md says."""
+    index = pd.read_json(archive.folder / "index.jsonl", lines=True)
+    trials = index.join(pd.json_normalize(index.pop("summary")))
+    assert len(trials) == 5
+    means = [archive.finished("cave")[n].mean_error for n in range(4)]
+    assert trials["mean_error"].tolist()[:4] == pytest.approx(means)
+    assert set(trials["parameters.kernel"]) == {"Huber"}
+
+
+def test_trajectories_are_exported(archive, tmp_path):
+    frames = Frames(STAMPS, drive(9), np.zeros((len(STAMPS), 90), np.float32), {"ndt": 90})
+    archive.write_frames("cave", frames)
+    assert export(archive, ["cave", "street"], [1, 3, 8], tmp_path / "out") == 2
+    assert sorted(p.name for p in (tmp_path / "out/cave").iterdir()) == [
+        "00001.tum",
+        "00003.tum",
+        "reference.tum",
+    ]
+    written = read_tum(tmp_path / "out/cave/00003.tum")
+    np.testing.assert_array_equal(written.stamps, STAMPS)
+    T = archive.read("cave", 3).T_odom_sensor
+    np.testing.assert_allclose(written.T_world_sensor[:, :3, 3], T[:, :3, 3], atol=1e-8)
