@@ -9,6 +9,22 @@ from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 FIRST_STAMP = 1_700_000_000_123_456_789
+STUDY = """\
+odometry:
+  name: gicp
+  settings: {downsampling: 0.5, min_range: 0.5}
+  parameters:
+    max_correspondence_distance: {low: 0.1, high: 5.0, baseline: 2.0, log: true}
+    keyframe_interval: {low: 0.5, high: 15.0, baseline: 1.0, log: true}
+sequences:
+  one: {bag: one.bag, points: /points, reference: /truth}
+  two: {bag: two.bag, points: /points, reference: /truth}
+  three: {bag: three.bag, points: /points, reference: /truth}
+training: [one, two]
+test: [three]
+sub_trajectory: 3.0
+offline: {trials: 10, initial: 4, batch: 4, seed: 3, workers: 2}
+"""
 
 
 def world(seed: int = 0, length: float = 40.0, n: int = 6000) -> NDArray[np.float64]:
@@ -94,3 +110,11 @@ def write_bag(
             message = pose(stamp + reference_delay, T)
             bag.write(truth, stamp, STORE.serialize_ros1(message, "geometry_msgs/msg/PoseStamped"))
     return path
+
+
+def write_study(folder: Path) -> Path:
+    """Write a study of three short drives, with its bags, and tell its file."""
+    for seed, name in enumerate(("one", "two", "three")):
+        write_bag(folder / f"{name}.bag", scans(seed, 40))
+    (folder / "small.yaml").write_text(STUDY)
+    return folder / "small.yaml"
