@@ -1,0 +1,235 @@
+"""What a campaign adds to the odometry's own work, and what it takes with many trials.
+
+    python benchmarks/campaign.py speed [TRIALS] [SCANS]
+    python benchmarks/campaign.py size [TRIALS]
+
+*speed* records a simulated cave and runs TRIALS (64) sets of GICP over its SCANS (600): once in a
+bare loop that reads and prepares the clouds and registers them, once as a campaign with one worker,
+once with two. Limits: 1.10 times the bare loop's time with one worker, 1.8 times faster with two.
+Beside wall time it tells processor time, which says more on a machine that others use.
+
+*size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are drawn, not run, and tells
+the driver's memory on the way; then what it takes to resume it: until the next trial is proposed
+(limit 5 s), and until a campaign that lacks nothing is through, model and all.
+"""
+
+import multiprocessing as mp
+import os
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import small_gicp
+from stages import bare_gicp
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
+
+import drives
+
+from adaptune.archive import Archive, Frames, Trial
+from adaptune.odometry.gicp import crop
+from adaptune.simulation import record
+from adaptune.study import Study, load_study
+from offline import campaign
+from offline.workers import Result, Task
+
+STUDY = """\
+odometry: {{name: gicp, settings: {{downsampling: 0.5}}}}
+courses: {{cave: {{scenes: [{{cave: {{length: {length:.0f}}}}}], sensor: hdl32e, seed: 1}}}}
+training: [cave]
+offline: {{sampler: sobol, trials: {trials}}}
+"""
+N_FRAMES = 600
+
+
+def clocked(function: Callable[[], Any]) -> tuple[float, float, Any]:
+    """Wall time and processor time, of children too, that a call takes, and what it returns."""
+    begin, before = time.monotonic(), _processor()
+    returned = function()
+    return time.monotonic() - begin, _processor() - before, returned
+
+
+def _processor() -> float:
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+def bare(study: Study, sets: Sequence[dict[str, Any]]) -> None:
+    """What any program would have to do."""
+    settings: Any = study.settings
+    prepared = [
+        small_gicp.preprocess_points(
+            crop(scan, settings.min_range), downsampling_resolution=settings.downsampling
+        )
+        for scan in study.sequence("cave")
+    ]
+    for parameters in sets:
+        bare_gicp(
+            prepared,
+            parameters["max_correspondence_distance"],
+            parameters["keyframe_interval"],
+            settings.iterations,
+        )
+
+
+def in_child(function: Callable[..., Any], *arguments: Any) -> tuple[float, float, Any]:
+    """Clock a call in a fresh process, whose children are all gone when it ends."""
+    queue = mp.get_context("spawn").SimpleQueue()
+    child = mp.get_context("spawn").Process(target=_answer, args=(queue, function, arguments))
+    child.start()
+    answer: tuple[float, float, Any] = queue.get()
+    child.join()
+    return answer
+
+
+def _answer(queue: Any, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    queue.put(clocked(lambda: function(*arguments)))
+
+
+def train(study: Study) -> list[dict[str, Any]]:
+    """Run a campaign, and tell its parameter sets."""
+    return campaign.train(study).model.sets
+
+
+def speed(trials: int, scans: int) -> None:
+    """Compare campaigns with the bare loop."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        file = folder / "cave.yaml"
+        file.write_text(STUDY.format(trials=trials, length=0.1 * scans * 3.0))
+        for n in (1, 2):
+            study = load_study(file, [f"offline.workers={n}"], folder / f"{n}")
+            study.recording("cave").parent.mkdir(parents=True)
+            if n == 1:
+                record(study.config.courses["cave"], study.recording("cave"))
+            else:
+                os.link(folder / "1/recordings/cave.bag", study.recording("cave"))
+        one, two = (load_study(file, [f"offline.workers={n}"], folder / f"{n}") for n in (1, 2))
+        for _ in one.sequence("cave"):
+            pass  # into the cache
+        wall_1, processor_1, sets = in_child(train, one)
+        wall, processor, _ = in_child(bare, one, sets)
+        wall_2, processor_2, _ = in_child(train, two)
+        n_frames = len(Archive(one.folder / "trials").read_frames("cave").stamps)
+        print(f"{len(sets)} trials of {n_frames} scans")
+        print(f"bare loop    {wall:8.1f} s, processor {processor:8.1f} s")
+        for n, w, p in ((1, wall_1, processor_1), (2, wall_2, processor_2)):
+            print(
+                f"{n} worker{'s' * (n > 1)}    {w:8.1f} s, processor {p:8.1f} s: "
+                f"{w / wall:.3f} and {p / processor:.3f} times the bare loop's"
+            )
+        print(f"two workers are {wall_1 / wall_2:.2f} times faster than one")
+
+
+class Drawn:
+    """A pool that draws what trials give."""
+
+    def __init__(self, *_: object):
+        self.asked = 0.0
+        self._task: Task | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def workers(self) -> list[int]:
+        """One."""
+        return [0]
+
+    def start(self, _worker: int, task: Task) -> None:
+        """Remember the task, and when it came."""
+        self.asked = self.asked or time.monotonic()
+        self._task = task
+
+    def wait(self) -> list[tuple[int, Result]]:
+        """Draw its trials."""
+        assert self._task is not None
+        pairs = zip(self._task.numbers, self._task.sets, strict=True)
+        frames = Frames(
+            np.arange(N_FRAMES) * 10**8,
+            np.tile(np.eye(4), (N_FRAMES, 1, 1)),
+            np.random.default_rng(0).integers(0, 99, (N_FRAMES, 90)).astype(np.float32),
+            {"ndt": 90},
+        )
+        return [(0, Result([_drawn(*p) for p in pairs], frames if self._task.frames else None))]
+
+
+def _drawn(number: int, parameters: dict[str, Any]) -> Trial:
+    rng = np.random.default_rng(number)
+    nothing = np.zeros(N_FRAMES, bool)
+    return Trial(
+        parameters,
+        rng.normal(size=(N_FRAMES, 4, 4)),
+        rng.gamma(1.0, size=N_FRAMES),
+        nothing,
+        ~nothing,
+        rng.gamma(1.0, size=N_FRAMES),
+    )
+
+
+def _memory() -> float:
+    """Resident megabytes of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def fill(study: Study) -> None:
+    """Run a drawn campaign, and tell the memory on the way."""
+    campaign.Workers = Drawn  # type: ignore[assignment,misc]
+    at = [100, 300, 1000, 3000, 10_000, 30_000]
+
+    def tell(what: str, done: int, _total: int) -> None:
+        if what == "trials" and at and done >= at[0]:
+            at.pop(0)
+            print(f"{done:6d} trials: driver {_memory():6.1f} MB", flush=True)
+
+    campaign.train(study, tell)
+    print(f"with the model of all: at most {_peak():.1f} MB")
+
+
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+def resume(study: Study) -> float:
+    """Run a drawn campaign again, and tell when the first trial was asked for."""
+    pool = Drawn()
+    campaign.Workers = lambda *_: pool  # type: ignore[assignment,misc]
+    begin = time.monotonic()
+    campaign.train(study)
+    return pool.asked - begin
+
+
+def size(trials: int) -> None:
+    """Fill an archive, and resume."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        file = drives.write_study(folder)
+        given = ["training=[one]", "offline.sampler=random", "offline.batch=100"]
+
+        def study(n: int) -> Study:
+            return load_study(file, [*given, f"offline.trials={n}"], folder / "run")
+
+        wall, processor, _ = in_child(fill, study(trials))
+        print(f"filled in {wall:.1f} s, processor {processor:.1f} s")
+        wall, processor, _ = in_child(resume, study(trials))
+        print(f"resumed with nothing to do: {wall:.2f} s, processor {processor:.2f} s")
+        _, _, asked = in_child(resume, study(trials + 100))
+        print(f"resumed with more to do: next trial asked for after {asked:.2f} s")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in ("speed", "size"):
+        sys.exit(__doc__)
+    numbers = [int(word) for word in sys.argv[2:]]
+    if sys.argv[1] == "speed":
+        speed(*(numbers + [64, 600][len(numbers) :]))
+    else:
+        size(*(numbers or [10_000]))
