@@ -62,6 +62,7 @@ app = typer.Typer(
         "    adaptune inspect  my.bag               # what is in a recording\n\n"
         "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
         "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
+        "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
         "    adaptune validate configs/demo.yaml    # would adapting pay elsewhere?\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive"
@@ -213,6 +214,14 @@ def offline(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Run the trials on a Dask cluster, as tcp://scheduler:8786.",
+            show_default="processes of this machine",
+        ),
+    ] = None,
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
@@ -226,7 +235,7 @@ def offline(
     loaded = load_study(study, override, folder)
     console.print(f"Seed {loaded.config.offline.seed}.", highlight=False)
     with _progress() as progress:
-        training = train(loaded, progress)
+        training = train(loaded, progress, cluster)
     model = training.model
     console.print(
         report.table(
@@ -252,6 +261,53 @@ def offline(
             highlight=False,
         )
     console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)
+
+
+@app.command()
+def trials(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    where: Annotated[
+        list[str],
+        typer.Option(metavar="CONDITION", help="As in `--where 'mean < 1'`. May be repeated."),
+    ] = [],  # noqa: B006
+    sort: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
+    ] = None,
+    top: Annotated[int | None, typer.Option(help="How many to show.", min=1)] = None,
+    csv: Annotated[bool, typer.Option("--csv", help="Write CSV to standard output.")] = False,
+    export: Annotated[
+        Path | None,
+        typer.Option(help="Write their trajectories there, as TUM.", file_okay=False),
+    ] = None,
+) -> None:
+    """List the study's finished trials, also while it runs.
+
+    Columns are the trial's number, its parameters, its mean RTE in percent over all training
+    sequences and on each of them, how often it lost track, how often its process ended, and its
+    other metrics.
+    """
+    from adaptune import report
+    from adaptune import trials as table
+    from adaptune.archive import Archive
+
+    loaded = load_study(study, override, folder)
+    names = loaded.training
+    archive = Archive(loaded.folder / "trials")
+    finished = table.rows(archive, names)
+    if not finished:
+        raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
+    chosen = table.select(finished, where, sort, top)
+    if csv:
+        sys.stdout.write(report.csv_text(chosen))
+    else:
+        title = f"{len(chosen)} of {len(finished)} trials, RTE [%]"
+        console.print(report.table(title, chosen))
+    if export is not None:
+        n = table.export(archive, names, [row["trial"] for row in chosen], export)
+        errors.print(f"{n} trajectories: {export}/", highlight=False)
 
 
 @app.command()
@@ -402,17 +458,17 @@ def _short(parameters: dict[str, Any]) -> str:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
+def _progress() -> Iterator[Callable[..., None]]:
     """A bar for each thing that is done; where there is no terminal, a line now and then."""
     if not errors.is_terminal:
         log = logging.getLogger("adaptune")
         last = time.monotonic()
 
-        def say(what: str, done: int, total: int) -> None:
+        def say(what: str, done: int, total: int, remark: str = "") -> None:
             nonlocal last
             if done >= total or time.monotonic() - last > LOG_EVERY:
                 last = time.monotonic()
-                log.info("%s: %d of %d", what, done, total)
+                log.info("%s: %d of %d%s", what, done, total, remark and f", {remark}")
 
         yield say
         return
@@ -422,15 +478,16 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
+        TextColumn("{task.fields[remark]}"),
         console=errors,
     )
     tasks: dict[str, TaskID] = {}
     with bars:
 
-        def show(what: str, done: int, total: int) -> None:
+        def show(what: str, done: int, total: int, remark: str = "") -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total)
-            bars.update(tasks[what], completed=done, total=total)
+                tasks[what] = bars.add_task(what, total=total, remark="")
+            bars.update(tasks[what], completed=done, total=total, remark=remark)
 
         yield show
 

@@ -17,6 +17,7 @@ from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
 from offline.budget import BUDGETS, Clock, max_trials, spent
+from offline.cluster import Cluster
 from offline.objective import (
     Verdict,
     choose_fixed,
@@ -32,8 +33,8 @@ from offline.storage import Told, open_mirror
 from offline.validation import labelled_sequences, tune
 from offline.workers import Pool, Task, Workers, run
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is."""
+Progress = Callable[[str, int, int, str], None]
+"""Called with what is being done, how much of it is done, how much there is, and a remark."""
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +60,9 @@ class Training(NamedTuple):
     rows: list[dict[str, Any]]
 
 
-def train(study: Study, progress: Progress = lambda *_: None) -> Training:
+def train(
+    study: Study, progress: Progress = lambda *_: None, cluster: str | None = None
+) -> Training:
     """Run all trials that are not in the archive yet, and fit the model.
 
     Parameters
@@ -71,6 +74,9 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
         objectives their Pareto front (``pareto.csv``, ``pareto.json``, ``pareto.png``).
     progress
         Told about every finished trial.
+    cluster
+        Address of a Dask scheduler, whose workers run the trials; processes of this machine when
+        left out.
 
     Raises
     ------
@@ -86,7 +92,8 @@ def train(study: Study, progress: Progress = lambda *_: None) -> Training:
         )
     archive = Archive(study.folder / "trials")
     archive.tidy()
-    with Workers(study, config.workers or available()) as workers:
+    n_workers = config.workers or available()
+    with Cluster(study, cluster) if cluster else Workers(study, n_workers) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
         whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
@@ -206,6 +213,7 @@ def run_batches(
     sampler = make_sampler(study.space, config)
     clock = Clock(study.folder / "elapsed.json")
     limit = max_trials(config)
+    tally = _Tally(progress, finished)
     batch = best = 0
     while (reason := spent(config, verdicts, best, clock.hours(batch))) is None:
         first = batch * config.batch
@@ -218,41 +226,40 @@ def run_batches(
         if not numbers:
             reason = "there is nothing else to try"
             break
-        total = (limit or numbers.stop) * len(names)
-        progress("trials", first * len(names), total)
+        tally.total = (limit or numbers.stop) * len(names)
+        for name in names:
+            tally.add(name, [n for n in numbers if n in finished[name]])
         alive = list(numbers)
         unframed = [name for name in names if not archive.has_frames(name, described)]
+        begun = False
         for m in rungs(config.pruning, batch, len(names)):
             missing = {name: [n for n in alive if n not in finished[name]] for name in order[:m]}
-            done = first * len(names) + m * len(alive) - sum(map(len, missing.values()))
             if any(missing.values()) or unframed:
+                begun = True
                 sets = sets or sampler.propose(told(verdicts))
                 tasks = _tasks(missing, unframed, sets, first, len(workers.workers()))
+                tally.show()
                 with clock.running(batch):
-                    for task in _run(archive, workers, tasks):
-                        done += len(task.numbers)
-                        progress("trials", done, total)
+                    for task, running in _run(archive, workers, tasks):
+                        tally.add(task.sequence, task.numbers)
+                        tally.show(running)
                 unframed = []
             if m < len(names):
                 alive = _survivors(config, order, finished, m, alive, first)
         verdicts.extend(_verdict(config, order, finished, n) for n in numbers)
-        mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
         best = min((best, *numbers), key=lambda n: _rank(verdicts[n]))
-        _log.info(
-            "trials %d to %d done; best so far: trial %d with %s %.3f%s",
-            numbers[0],
-            numbers[-1],
-            best,
-            label(config.objective[0]),
-            verdicts[best].values[0],
-            "" if verdicts[best].feasible else " (none keeps the limits)",
-        )
+        tally.best = _best(config, best, verdicts[best])
+        if begun:
+            mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
+            tally.catch_up(len(verdicts) * len(names))
+            _log.info("trials %d to %d done; %s", numbers[0], numbers[-1], tally.best)
         if len(numbers) < config.batch and limit != len(verdicts):
             reason = "there is nothing else to try"
             break
         batch += 1
-    done = len(verdicts) * len(names)
-    progress("trials", done, done)
+    mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
+    tally.total = len(verdicts) * len(names)
+    tally.catch_up(tally.total)
     _log.info("the search ends: %s", reason)
     return verdicts
 
@@ -321,6 +328,41 @@ def _verdict(config: OfflineConfig, order: Sequence[str], finished: Finished, n:
     return verdict._replace(values=(value,), complete=False)
 
 
+class _Tally:
+    """What the progress tells of trials."""
+
+    def __init__(self, progress: Progress, finished: Finished):
+        self.best = ""
+        self.total = 0
+        self._progress, self._finished = progress, finished
+        self._done = self._failed = 0
+
+    def add(self, name: str, numbers: Iterable[int]) -> None:
+        """Count trials that are finished on a sequence."""
+        runs = [self._finished[name][n] for n in numbers]
+        self._done += len(runs)
+        self._failed += sum(run.lost > 0 or run.faults > 0 for run in runs)
+
+    def catch_up(self, done: int) -> None:
+        """Count as done what will not be run, too."""
+        self._done = done
+        self.show()
+
+    def show(self, running: int = 0) -> None:
+        """Tell how far it is."""
+        remarks = [f"{running} running"] if running else []
+        remarks += [self.best] if self.best else []
+        remarks += [f"{self._failed} lost track or failed"] if self._failed else []
+        self._progress("trials", self._done, self.total, ", ".join(remarks))
+
+
+def _best(config: OfflineConfig, number: int, verdict: Verdict) -> str:
+    what = f"{label(config.objective[0])} {verdict.values[0]:.3f}"
+    return f"best {what} (trial {number})" + (
+        "" if verdict.feasible else ", which does not keep the limits"
+    )
+
+
 def _tasks(
     missing: dict[str, list[int]],
     unframed: list[str],
@@ -337,20 +379,20 @@ def _tasks(
     ]
 
 
-def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[Task]:
-    """Run tasks, and yield each when its results are in the archive."""
-    for task, result in run(workers, tasks):
+def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[tuple[Task, int]]:
+    """Run tasks; yield each when its results are in the archive, and how many trials run now."""
+    for task, result, running in run(workers, tasks):
         if result.frames is not None:
             archive.write_frames(task.sequence, result.frames)
         for number, trial in zip(task.numbers, result.trials, strict=True):
             archive.write(task.sequence, number, trial, task.whole)
-        yield task
+        yield task, running
 
 
 def _run_whole(
     study: Study,
     archive: Archive,
-    workers: Workers,
+    workers: Pool[Any],
     verdicts: Sequence[Verdict],
     fixed: int,
     progress: Progress,
@@ -364,7 +406,7 @@ def _run_whole(
         if not archive.trial_path(name, n, whole=True).exists()
     ]
     for done, _ in enumerate(_run(archive, workers, tasks), start=1):
-        progress("whole runs", done, len(tasks))
+        progress("whole runs", done, len(tasks), "")
     means = {
         (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))
         for name in names

@@ -94,8 +94,8 @@ class Pool(Protocol[W]):
         ...
 
 
-def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result]]:
-    """Run tasks, and yield each with its result as it comes.
+def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result, int]]:
+    """Run tasks, and yield each as it comes, with its result and the number of trials running.
 
     Tasks go to workers that have their sequence prepared, where there are such. What a worker
     died at is run again by another.
@@ -109,31 +109,40 @@ def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result]]:
     """
     waiting = list(tasks)
     running: dict[W, Task] = {}
+    finished: list[tuple[Task, Result]] = []
+    failure: AdaptuneError | None = None
     deaths: dict[int, int] = {}
     near: dict[W, set[str]] = {}
-    while waiting or running:
-        for worker in pool.workers():
+    while waiting or running or finished:
+        for worker in pool.workers() if waiting and failure is None else ():
             if waiting and worker not in running:
                 task = _pick(waiting, near, worker)
                 waiting.remove(task)
                 near.setdefault(worker, set()).add(task.sequence)
                 running[worker] = task
                 pool.start(worker, task)
-        for worker, outcome in pool.wait():
+        # The workers are at work again while what they gave is written.
+        n_running = sum(len(task.numbers) for task in running.values())
+        for task, result in finished:
+            yield task, result, n_running
+        finished = []
+        if failure is not None:
+            raise failure
+        for worker, outcome in pool.wait() if waiting or running else ():
             task = running.pop(worker)
-            if isinstance(outcome, AdaptuneError):
-                raise outcome
             if isinstance(outcome, Result):
-                yield task, outcome
-                continue
-            del near[worker]
-            deaths[id(task)] = deaths.get(id(task), 0) + 1
-            if deaths[id(task)] == MOST_DEATHS:
-                raise WorkerError(
-                    f"{MOST_DEATHS} workers died ({outcome.cause}) on {task}; if they were out of "
-                    f"memory, lower offline.memory or offline.workers"
-                )
-            waiting.insert(0, task)
+                finished.append((task, outcome))
+            elif isinstance(outcome, AdaptuneError):
+                failure = outcome
+            else:
+                near.pop(worker, None)
+                waiting.insert(0, task)
+                deaths[id(task)] = deaths.get(id(task), 0) + 1
+                if deaths[id(task)] == MOST_DEATHS:
+                    failure = WorkerError(
+                        f"{MOST_DEATHS} workers died ({outcome.cause}) on {task}; if they were "
+                        f"out of memory, lower offline.memory or offline.workers"
+                    )
 
 
 def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:

@@ -229,8 +229,9 @@ class Writer:
             )
         )
 
-    def done(self) -> None:
-        """Say that the last scan was added."""
+    def done(self, **about: Any) -> None:
+        """Say that the last scan was added, and note more of the sequence."""
+        self._about |= about
         self._done = True
 
     def __exit__(

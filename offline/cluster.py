@@ -1,0 +1,393 @@
+"""A Dask cluster whose workers run trials.
+
+Recordings are read where they lie if a worker has them under the same path; else they are sent to
+it once, decoded, and kept in its cache of decoded sequences under a digest of their contents.
+Results always return to the driver.
+"""
+
+import base64
+import contextlib
+import dataclasses
+import hashlib
+import io
+import logging
+import threading
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import __version__
+from adaptune.cores import pin
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses
+from adaptune.sequence import Scan, cache
+from adaptune.sequence.imu import Imu, ImuNoise
+from adaptune.sequence.views import WithImu
+from adaptune.study import Study
+from offline.workers import Death, Outcome, Sequences, Task, attempt
+
+CHUNK = 1 << 26
+"""Bytes of scans that are sent at once."""
+
+_TIMEOUT = 10.0
+_PERIOD = 1.0
+_SAMPLE = 1 << 16
+
+_log = logging.getLogger(__name__)
+
+
+class ClusterError(AdaptuneError):
+    """A cluster that cannot be used."""
+
+
+class LackingError(AdaptuneError):
+    """Raised on a worker that has no such sequence."""
+
+
+class _Place(NamedTuple):
+    """Where a worker is: its host, and which of the workers there it is."""
+
+    host: str
+    rank: int
+
+
+class Cluster:
+    """The workers of a Dask cluster, as a `Pool`.
+
+    Use it as a context: leaving it takes back what is still to be done.
+
+    Parameters
+    ----------
+    study
+        The study.
+    address
+        Of the scheduler, as ``tcp://scheduler:8786``.
+
+    Raises
+    ------
+    ClusterError
+        If it cannot be reached, has no workers, or workers of another version.
+    """
+
+    def __init__(self, study: Study, address: str):
+        try:
+            import distributed
+        except ImportError as error:
+            raise ClusterError("--cluster needs Dask: pip install 'adaptune[dask]'") from error
+        self._killed = distributed.KilledWorker
+        self._study = study
+        self._address = address
+        digests = tuple((name, fingerprint(study, name)) for name in study.training)
+        self._away = AwayStudy(study.config, study.folder.absolute(), digests)
+        self._places: dict[str, _Place] = {}
+        self._tasks: dict[str, Task] = {}
+        self._futures: dict[str, Any] = {}
+        self._done = threading.Event()
+        self._waits = False
+        try:
+            self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise ClusterError(f"--cluster {address}: cannot be reached ({error})") from error
+        try:
+            found = self.workers()
+        except ClusterError:
+            self._client.close()
+            raise
+        if not found:
+            self._client.close()
+            raise ClusterError(
+                f"--cluster {address}: has no workers; start some with `dask worker {address}`"
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Exception):
+            self._client.cancel(list(self._futures.values()), force=True)
+        self._client.close()
+
+    def workers(self) -> Collection[str]:
+        """See `Pool`."""
+        hosts = self._hosts()
+        for gone in self._places.keys() - hosts.keys():
+            del self._places[gone]
+        if new := [worker for worker in hosts if worker not in self._places]:
+            self._check(new)
+            for worker in new:
+                taken = {p.rank for p in self._places.values() if p.host == hosts[worker]}
+                rank = next(r for r in range(len(taken) + 1) if r not in taken)
+                self._places[worker] = _Place(hosts[worker], rank)
+        if not hosts and not self._waits:
+            _log.warning("%s: no worker is left; waiting for others", self._address)
+        self._waits = not hosts
+        return list(self._places)
+
+    def start(self, worker: str, task: Task) -> None:
+        """See `Pool`."""
+        memory = self._study.config.offline.memory * 1e9 / max(len(self._places), 1)
+        self._tasks[worker] = task
+        future = self._client.submit(
+            perform,
+            self._away,
+            task,
+            self._places[worker].rank,
+            memory,
+            workers=[worker],
+            allow_other_workers=False,
+            pure=False,
+        )
+        future.add_done_callback(lambda _: self._done.set())
+        self._futures[worker] = future
+
+    def wait(self) -> list[tuple[str, Outcome]]:
+        """See `Pool`."""
+        # Nothing tells when a worker dies: have a look now and then.
+        self._done.wait(_PERIOD)
+        self._done.clear()
+        hosts = self._hosts()
+        outcomes = []
+        for worker, future in list(self._futures.items()):
+            if not future.done() and worker in hosts:
+                continue
+            task = self._tasks.pop(worker)
+            del self._futures[worker]
+            outcome = self._outcome(worker, future)
+            if isinstance(outcome, LackingError):
+                self._send(worker, task.sequence)
+                self.start(worker, task)
+            else:
+                outcomes.append((worker, outcome))
+        return outcomes
+
+    def _outcome(self, worker: str, future: Any) -> Outcome:
+        if future.status == "finished":
+            outcome: Outcome = future.result()
+            return outcome
+        if future.status == "error":
+            error = future.exception()
+            if not isinstance(error, self._killed):
+                return ClusterError(f"worker {worker}: {type(error).__name__}: {error}")
+        self._client.cancel([future], force=True)
+        return Death(f"worker {worker} has gone")
+
+    def _hosts(self) -> dict[str, str]:
+        """The host of every worker that the scheduler knows of."""
+        if self._client.status == "running":
+            with contextlib.suppress(OSError):
+                known = self._client.scheduler_info(n_workers=-1)["workers"]
+                return {worker: about["host"] for worker, about in known.items()}
+        raise ClusterError(
+            f"--cluster {self._address}: the scheduler has gone; run the same command again to "
+            f"resume"
+        )
+
+    def _check(self, workers: list[str]) -> None:
+        """Refuse workers of another version."""
+
+        def version() -> str:
+            # A function within a function is sent as code, and runs where there is no adaptune.
+            from importlib.metadata import version
+
+            return version("adaptune")
+
+        versions = self._client.run(version, workers=workers, on_error="return")
+        for worker, found in versions.items():
+            if isinstance(found, OSError):
+                continue  # gone again
+            if found != __version__:
+                what = "no adaptune" if isinstance(found, Exception) else f"adaptune {found}"
+                raise ClusterError(
+                    f"--cluster {self._address}: worker {worker} has {what}, and this is "
+                    f"{__version__}; install the same version there"
+                )
+
+    def _send(self, worker: str, name: str) -> None:
+        """Send a sequence to a worker, unless one on the same host got it before."""
+        digest = dict(self._away.digests)[name]
+        try:
+            if self._client.run(_has, digest, workers=[worker])[worker]:
+                return
+            sequence = self._study.sequence(name)
+            _log.info("%s: sending it to %s", name, worker)
+            self._client.run(_begin, digest, sequence.name, workers=[worker])
+            stamps = []
+            for scans in _chunks(sequence):
+                stamps += [scan.stamp for scan in scans]
+                self._client.run(_append, digest, scans, workers=[worker])
+            motion = _pack(sequence, np.array(stamps, np.int64), imu=self._study.box.needs_imu)
+            if self._client.run(_end, digest, motion, workers=[worker])[worker]:
+                return
+            problem = "its log tells why"
+        except OSError as error:
+            problem = str(error)
+        # One that has gone is noticed by and by.
+        if worker in self._hosts():
+            raise ClusterError(
+                f"worker {worker} cannot keep the sequence {name} in its cache ({problem})"
+            )
+
+
+def _chunks(scans: Iterator[Scan]) -> Iterator[list[Scan]]:
+    chunk: list[Scan] = []
+    size = 0
+    for scan in scans:
+        chunk.append(scan)
+        size += scan.points.nbytes
+        if size > CHUNK:
+            yield chunk
+            chunk, size = [], 0
+    if chunk:
+        yield chunk
+
+
+def _pack(sequence: Any, stamps: NDArray[np.int64], *, imu: bool) -> str:
+    """What is known of the motion beside the scans."""
+    arrays = {}
+    if (reference := sequence.reference()) is not None:
+        arrays["T_ref_sensor"] = reference.at(stamps)
+    if imu and (measured := sequence.imu()) is not None:
+        arrays |= {f.name: np.asarray(getattr(measured, f.name)) for f in dataclasses.fields(Imu)}
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)
+    return base64.b64encode(packed.getvalue()).decode()
+
+
+def fingerprint(study: Study, name: str) -> str:
+    """Digest of what a sequence is read from, and how; paths and times of change do not count.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
+    config = study.sequence_config(name)
+    settings = config.model_dump_json(exclude={"bag", "kitti", "folder", "reference", "cache"})
+    digest = hashlib.blake2b(f"{__version__} {settings}".encode(), digest_size=16)
+    paths = config.paths()
+    if Path(config.reference or "") not in paths:
+        digest.update(f"{config.reference}".encode())
+    for path in paths:
+        inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else []
+        for file in inside:
+            digest.update(f"{file.relative_to(path)} {file.stat().st_size}".encode())
+        if not inside:
+            with path.open("rb") as stream:
+                size = path.stat().st_size
+                digest.update(f"{size} ".encode() + stream.read(_SAMPLE))
+                stream.seek(max(size - _SAMPLE, 0))
+                digest.update(stream.read(_SAMPLE))
+    return digest.hexdigest()
+
+
+# What follows runs on the workers.
+
+
+@dataclasses.dataclass(frozen=True)
+class AwayStudy(Study):
+    """A study on a worker, which may not have its recordings.
+
+    Attributes
+    ----------
+    digests : tuple
+        Pairs of a sequence's name and its `fingerprint` at the driver's.
+    """
+
+    digests: tuple[tuple[str, str], ...]
+
+    def sequence(self, name: str) -> Any:
+        """See `Study.sequence`.
+
+        Raises
+        ------
+        LackingError
+            If the sequence is neither here nor was it sent.
+        """
+        digest = dict(self.digests)[name]
+        with contextlib.suppress(AdaptuneError, OSError):
+            if fingerprint(self, name) == digest:
+                return super().sequence(name)
+        entry = cache.find(digest)
+        if entry is None:
+            raise LackingError(name)
+        sent: Any = _Sent(entry)
+        return WithImu(sent) if self.box.needs_imu else sent
+
+
+class _Sent:
+    """A sequence that was sent."""
+
+    def __init__(self, entry: cache.CachedScans):
+        self._entry = entry
+        self._motion = np.load(io.BytesIO(base64.b64decode(entry.about["motion"])))
+        self.name: str = entry.about["name"]
+        self.n_messages = len(entry)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return iter(self._entry)
+
+    def reference(self) -> "_Known | None":
+        """Poses at the scans' stamps."""
+        if "T_ref_sensor" not in self._motion:
+            return None
+        return _Known(self._entry.stamps, self._motion["T_ref_sensor"])
+
+    def imu(self) -> Imu | None:
+        """Measurements of the IMU, if the odometry wants them."""
+        if "stamps" not in self._motion:
+            return None
+        of_imu = {f.name: self._motion[f.name] for f in dataclasses.fields(Imu)}
+        return Imu(**of_imu | {"noise": ImuNoise(*of_imu["noise"].tolist())})
+
+    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """See `Sequence`."""
+        return stamps
+
+
+class _Known(NamedTuple):
+    """A trajectory of which the poses at some stamps are known."""
+
+    stamps: NDArray[np.int64]
+    T_world_sensor: Poses
+
+    def at(self, stamps: NDArray[np.int64]) -> Poses:
+        """Poses at stamps that are among those known, of shape (n, 4, 4)."""
+        return self.T_world_sensor[np.searchsorted(self.stamps, stamps)]
+
+
+_lock = threading.Lock()
+_held: tuple[str, Sequences] | None = None
+_writers: dict[str, cache.Writer] = {}
+
+
+def perform(study: AwayStudy, task: Task, core: int, memory: float) -> Outcome:
+    """Do a task, with the sequences that earlier tasks of the same study have prepared."""
+    global _held  # noqa: PLW0603 (a Dask worker keeps nothing else from task to task)
+    with _lock:
+        pin(core)
+        token = f"{study.config.model_dump_json()} {study.digests}"
+        if _held is None or _held[0] != token:
+            _held = token, Sequences(study, memory)
+        return attempt(_held[1], task)
+
+
+def _has(digest: str) -> bool:
+    return cache.find(digest) is not None
+
+
+def _begin(digest: str, name: str) -> None:
+    _writers[digest] = cache.Writer(digest, {"name": name, "left_out": {}})
+
+
+def _append(digest: str, scans: list[Scan]) -> None:
+    for scan in scans:
+        _writers[digest].append(scan)
+
+
+def _end(digest: str, motion: str) -> bool:
+    with _writers.pop(digest) as writer:
+        writer.done(motion=motion)
+    return _has(digest)

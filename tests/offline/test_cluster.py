@@ -1,0 +1,158 @@
+"""Campaigns on a Dask cluster of real worker processes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import kills
+import optuna
+import postgres
+import pytest
+
+from adaptune.study import load_study
+from offline import cluster
+from offline.campaign import train
+from offline.cluster import Cluster, ClusterError
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """Address of a scheduler, a function that starts a worker, and the workers."""
+    cwd = tmp_path_factory.mktemp("dask")
+    file = cwd / "scheduler.json"
+    silent = {
+        "cwd": cwd,
+        "stderr": subprocess.DEVNULL,
+        "env": os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    }
+    code = (
+        "import asyncio, sys; from distributed import Scheduler\n"
+        "async def main():\n"
+        "    async with Scheduler(host='127.0.0.1', port=0, dashboard=False) as s:\n"
+        "        open(sys.argv[1], 'w').write(s.address)\n"
+        "        await s.finished()\n"
+        "asyncio.run(main())"
+    )
+    processes = [subprocess.Popen([sys.executable, "-c", code, str(file)], **silent)]
+    while not (file.exists() and file.read_text()):
+        time.sleep(0.05)
+    address = file.read_text()
+
+    def worker(version=None):
+        code = (
+            "import asyncio, sys; from distributed import Worker\n"
+            "if len(sys.argv) > 2:\n"
+            "    import importlib.metadata\n"
+            "    importlib.metadata.version = lambda name: sys.argv[2]\n"
+            "async def main():\n"
+            "    async with Worker(sys.argv[1], nthreads=1, dashboard=False) as w:\n"
+            "        await w.finished()\n"
+            "asyncio.run(main())"
+        )
+        made = subprocess.Popen(
+            [sys.executable, "-c", code, address, *([version] if version else [])],
+            **silent,
+        )
+        processes.append(made)
+        return made
+
+    yield address, worker
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def workers(scheduler):
+    address, worker = scheduler
+    made = [worker() for _ in range(3)]
+    with distributed.Client(address, set_as_default=False) as client:
+        client.wait_for_workers(3)
+    return made
+
+
+@pytest.fixture(scope="module")
+def local(study_file, tmp_path_factory):
+    study = load_study(study_file, ["offline.workers=1"], tmp_path_factory.mktemp("run") / "study")
+    train(study)
+    return kills.contents(study.folder)
+
+
+def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler):
+    study = load_study(study_file, [], tmp_path / "study")
+    with pytest.raises(ClusterError, match="has no workers; start some with `dask worker tcp"):
+        Cluster(study, scheduler[0])
+    with pytest.raises(ClusterError, match="cannot be reached"):
+        Cluster(study, "tcp://127.0.0.1:1")
+    with pytest.raises(ClusterError, match="cannot be reached"):
+        Cluster(study, "nonsense://x")
+
+
+def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, workers, local):
+    """On three worker processes, with a real PostgreSQL."""
+    assert len(workers) == 3
+    with postgres.running() as (_, template):
+        url = template.format("postgres")
+        study = load_study(study_file, [f"offline.storage={url}"], tmp_path / "study")
+        train(study, cluster=scheduler[0])
+        storage = url.replace("://", "+pg8000://")
+        told = optuna.load_study(study_name="study", storage=storage)
+        assert [t.user_attrs["adaptune trial"] for t in told.trials] == list(range(10))
+    assert kills.contents(study.folder) == local
+
+
+@pytest.mark.usefixtures("workers")
+def test_recordings_that_workers_lack_are_sent_once(
+    study_file, tmp_path, scheduler, local, monkeypatch
+):
+    own, digests = cluster.fingerprint, []
+
+    def elsewhere(study, name):
+        digests.append(f"{own(study, name)}-sent")
+        return digests[-1]
+
+    # The workers, which are not patched, find that theirs are other recordings.
+    monkeypatch.setattr(cluster, "fingerprint", elsewhere)
+    monkeypatch.setattr(cluster, "CHUNK", 1 << 18)
+    sent = []
+    run = distributed.Client.run
+
+    def count(self, function, *args, **kwargs):
+        if function.__name__ == "_end":
+            sent.append(args[0])
+        return run(self, function, *args, **kwargs)
+
+    monkeypatch.setattr(distributed.Client, "run", count)
+    study = load_study(study_file, [], tmp_path / "study")
+    train(study, cluster=scheduler[0])
+    assert kills.contents(study.folder) == local
+    # The workers share a cache.
+    assert sorted(sent) == sorted(set(digests))
+
+
+def test_a_killed_worker_s_trials_run_elsewhere(study_file, tmp_path, scheduler, workers, local):
+    study = load_study(study_file, [], tmp_path / "study")
+
+    def kill(_what, done, *_):
+        if done:
+            os.kill(workers[0].pid, signal.SIGKILL)
+
+    train(study, kill, cluster=scheduler[0])
+    assert kills.contents(study.folder) == local
+
+
+def test_workers_of_another_version_are_refused(study_file, tmp_path, scheduler):
+    address, worker = scheduler
+    other = worker("0.0.7")
+    with distributed.Client(address, set_as_default=False) as client:
+        n = len(client.scheduler_info(n_workers=-1)["workers"])
+        client.wait_for_workers(n + 1)
+    study = load_study(study_file, [], tmp_path / "study")
+    with pytest.raises(ClusterError, match=r"has adaptune 0\.0\.7, and this is"):
+        train(study, cluster=address)
+    assert not list((study.folder / "trials").glob("*/*"))
+    other.kill()
