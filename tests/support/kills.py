@@ -19,7 +19,7 @@ def contents(folder: Path) -> dict[Path, object]:
     for path in sorted((folder / "trials").rglob("*.npz")):
         with np.load(path) as data:
             found[path.relative_to(folder)] = {
-                key: data[key].tobytes() for key in data if key != "seconds"
+                key: data[key].tobytes() for key in data if key not in ("seconds", "usage")
             }
     for name in ("model.npz", "fixed.yaml"):
         found[Path(name)] = (folder / name).read_bytes()
