@@ -226,9 +226,7 @@ def run_batches(
         if not numbers:
             reason = "there is nothing else to try"
             break
-        tally.total = (limit or numbers.stop) * len(names)
-        for name in names:
-            tally.add(name, [n for n in numbers if n in finished[name]])
+        tally.begin((limit or numbers.stop) * len(names), numbers)
         alive = list(numbers)
         unframed = [name for name in names if not archive.has_frames(name, described)]
         begun = False
@@ -238,11 +236,8 @@ def run_batches(
                 begun = True
                 sets = sets or sampler.propose(told(verdicts))
                 tasks = _tasks(missing, unframed, sets, first, len(workers.workers()))
-                tally.show()
                 with clock.running(batch):
-                    for task, running in _run(archive, workers, tasks):
-                        tally.add(task.sequence, task.numbers)
-                        tally.show(running)
+                    tally.watch(_run(archive, workers, tasks))
                 unframed = []
             if m < len(names):
                 alive = _survivors(config, order, finished, m, alive, first)
@@ -258,8 +253,7 @@ def run_batches(
             break
         batch += 1
     mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
-    tally.total = len(verdicts) * len(names)
-    tally.catch_up(tally.total)
+    tally.catch_up(len(verdicts) * len(names), end=True)
     _log.info("the search ends: %s", reason)
     return verdicts
 
@@ -333,27 +327,39 @@ class _Tally:
 
     def __init__(self, progress: Progress, finished: Finished):
         self.best = ""
-        self.total = 0
         self._progress, self._finished = progress, finished
-        self._done = self._failed = 0
+        self._done = self._failed = self._total = 0
 
-    def add(self, name: str, numbers: Iterable[int]) -> None:
-        """Count trials that are finished on a sequence."""
+    def begin(self, total: int, numbers: Iterable[int]) -> None:
+        """Begin a batch, some of whose trials may be finished."""
+        self._total = total
+        numbers = list(numbers)
+        for name, finished in self._finished.items():
+            self._add(name, [n for n in numbers if n in finished])
+        self._show()
+
+    def watch(self, tasks: Iterable[tuple[Task, int]]) -> None:
+        """Count trials as they are finished."""
+        for task, running in tasks:
+            self._add(task.sequence, task.numbers)
+            self._show(running)
+
+    def catch_up(self, done: int, end: bool = False) -> None:
+        """Count as done what will not be run, too."""
+        self._done = done
+        self._total = done if end else self._total
+        self._show()
+
+    def _add(self, name: str, numbers: Iterable[int]) -> None:
         runs = [self._finished[name][n] for n in numbers]
         self._done += len(runs)
         self._failed += sum(run.lost > 0 or run.faults > 0 for run in runs)
 
-    def catch_up(self, done: int) -> None:
-        """Count as done what will not be run, too."""
-        self._done = done
-        self.show()
-
-    def show(self, running: int = 0) -> None:
-        """Tell how far it is."""
+    def _show(self, running: int = 0) -> None:
         remarks = [f"{running} running"] if running else []
         remarks += [self.best] if self.best else []
         remarks += [f"{self._failed} lost track or failed"] if self._failed else []
-        self._progress("trials", self._done, self.total, ", ".join(remarks))
+        self._progress("trials", self._done, self._total, ", ".join(remarks))
 
 
 def _best(config: OfflineConfig, number: int, verdict: Verdict) -> str:
