@@ -1,6 +1,7 @@
 """A study: what to tune, on what, and the folder in which everything about it is kept."""
 
 import fcntl
+import hashlib
 import json
 import math
 import re
@@ -8,7 +9,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal, Self, TypeVar
 
@@ -30,8 +31,9 @@ from adaptune.descriptor import DescriptorError, descriptor
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.odometry import (
-    BaseSettings,
     Box,
+    Command,
+    Description,
     HealthCheck,
     Isolated,
     Limits,
@@ -40,13 +42,22 @@ from adaptune.odometry import (
     WarmUp,
     box_class,
 )
+from adaptune.odometry.command import Material, material
 from adaptune.sampling import NAMES, SETTINGS, SINGLE, SamplerError, check_sampler, optuna_class
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
 from adaptune.sequence.config import ViewConfig, check_sequence, expand
 from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course, as_sequence
-from adaptune.space import ParameterSet, ParameterSpace, Value, nearest
+from adaptune.space import (
+    Categorical,
+    Float,
+    Integer,
+    ParameterSet,
+    ParameterSpace,
+    Value,
+    nearest,
+)
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 """Becomes a file's name."""
@@ -73,7 +84,7 @@ class OdometryConfig(_Section):
     """Which odometry, what is set once, and what is tuned in which range.
 
     Without `parameters`, all of them are tuned in their usual ranges; those not named in it keep
-    their baseline.
+    their baseline. Those of a `command` are defined here, with their `type`.
     """
 
     name: str
@@ -365,34 +376,82 @@ class Study:
         return self.folder.name
 
     @cached_property
-    def box(self) -> type[Odometry]:
+    def box(self) -> type[Odometry] | type[Command]:
         """Class of the odometry."""
-        return box_class(self.config.odometry.name)
+        return _box(self.config.odometry.name)
 
     @cached_property
-    def settings(self) -> BaseSettings:
+    def settings(self) -> Any:
         """Settings of the odometry."""
         return self.box.settings_type.model_validate(self.config.odometry.settings)
 
     @cached_property
+    def described(self) -> Description:
+        """What the odometry says of itself."""
+        return self.box.describe(self.settings)
+
+    @cached_property
     def space(self) -> ParameterSpace:
         """The parameters that are tuned."""
-        tuned = self.config.odometry.parameters
+        tuned, space = self.config.odometry.parameters, self.described.space
         if tuned is None:
-            return self.box.space
+            return space or ParameterSpace({})
         return ParameterSpace.load(
-            {name: _complete(self.box.space, name, given) for name, given in tuned.items()}
+            {name: _complete(space, name, given) for name, given in tuned.items()}
         )
 
-    def odometry(self, parameters: ParameterSet | None = None, isolated: bool = False) -> Box:
-        """A new instance with these parameters; those not given keep their baseline.
+    def odometry(
+        self,
+        parameters: ParameterSet | None = None,
+        sequence: str | None = None,
+        isolated: bool = False,
+    ) -> Box:
+        """A new instance.
 
         It runs in a process of its own if it is not known to be clean, or if `isolated` asks.
+
+        Parameters
+        ----------
+        parameters
+            Those not given keep their baseline.
+        sequence
+            The sequence that it will be driven along; a program that reads whole recordings only
+            wants to know.
+        isolated
+            Whether its memory is to be told.
         """
         given = self.space.baseline | (parameters or {})
+        limits = self.config.isolation
+        if issubclass(self.box, Command):
+            # What fails in training with the baseline's parameters fails for want of something.
+            strict = sequence in self.config.training and given == self.space.baseline
+            material = None if sequence is None else partial(self._material, sequence)
+            return Command(given, self.settings, limits, material, strict)
         if self.box.clean and not isolated:
             return self.box(given, self.settings)
-        return Isolated(self.config.odometry.name, given, self.settings, self.config.isolation)
+        return Isolated(self.config.odometry.name, given, self.settings, limits)
+
+    def _material(self, name: str) -> Material:
+        """A sequence as a program reads it."""
+        folder = self.folder / "inputs" / name
+        course = self.config.courses.get(name)
+        config = self.sequence_config(name)
+        about = {
+            "input": self.settings.input,
+            "sequence": config.model_dump(mode="json"),
+            "course": None if course is None else course.model_dump(mode="json"),
+            "recording": self.recording_size(name),
+        }
+        key = str(folder), json.dumps(about)
+        if key not in _materials:
+            sequence = self.sequence(name)
+            _materials[key] = material(sequence, config, about, folder, self.settings.input)
+        return _materials[key]
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """How to select; not at all where the odometry runs whole recordings only."""
+        return () if self.described.whole else self.config.online.rules
 
     @property
     def window(self) -> int:
@@ -405,7 +464,7 @@ class Study:
         asked = self.config.online.switching.mechanism
         if asked != "auto":
             return asked
-        if self.box.live:
+        if self.described.live:
             return "live"
         switching = self.config.online.switching
         instances = switching.size if switching.sets is None else len(switching.sets)
@@ -417,7 +476,7 @@ class Study:
     def warm_up(self) -> WarmUp:
         """Which of the last scans a new instance sees."""
         switching = self.config.online.switching
-        usual = self.box.warm_up
+        usual = self.described.warm_up
         return WarmUp(
             usual.seconds if switching.warm_up is None else switching.warm_up,
             usual.full_rate if switching.full_rate is None else switching.full_rate,
@@ -503,7 +562,7 @@ class Study:
                 f"`adaptune simulate` with this study first"
             )
         sequence = open_sequence(self.sequence_config(name))
-        return WithImu(sequence) if self.box.needs_imu else sequence
+        return WithImu(sequence) if self.described.needs_imu else sequence
 
     def recording_size(self, name: str) -> list[int] | None:
         """Bytes of a recording's files, by which another recording in its place is noticed.
@@ -581,9 +640,15 @@ class Study:
             resolved["offline"]["sampler_settings"] = given.model_dump(
                 mode="json", exclude_none=True
             )
+        if template := getattr(self.settings, "template", None):
+            text = Path(template).read_bytes()
+            resolved["odometry"]["template"] = hashlib.sha256(text).hexdigest()[:16]
         resolved["recordings"] = {name: self.recording_size(name) for name in self.config.training}
         return resolved
 
+
+_materials: dict[tuple[str, str], Material] = {}
+"""What programs are given of sequences, by folder and all that it depends on."""
 
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
@@ -647,7 +712,7 @@ def load_study(
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
     data = document.data
     overridden = [_override(data, text) for text in overrides]
-    config, problems = _check(data, path.parent)
+    config, problems = _check(data, path.parent.resolve())
     if problems or config is None:
         lines = []
         for key, message in sorted(problems, key=lambda p: document.line(p[0]) or 0):
@@ -685,9 +750,9 @@ _Problem = tuple[tuple[str | int, ...], str]
 def _check(data: dict[str, Any], folder: Path) -> tuple[StudyConfig | None, list[_Problem]]:
     """Validate what pydantic can, and beside it what only the odometry and the files can tell."""
     problems: list[_Problem] = []
-    config = _validated(StudyConfig, data, (), problems, {"folder": folder})
     if isinstance(odometry := data.get("odometry"), dict):
-        _check_odometry(odometry, problems)
+        _check_odometry(odometry, problems, folder)
+    config = _validated(StudyConfig, data, (), problems, {"folder": folder})
     if config is not None:
         _check_box(config, problems)
         _check_sampling(config, problems)
@@ -727,38 +792,68 @@ def _check_roles(data: dict[str, Any], known: set[Any], problems: list[_Problem]
                 problems.append(((role, i), f"{name!r} is trained on, and proves nothing here"))
 
 
-def _check_odometry(data: dict[str, Any], problems: list[_Problem]) -> None:
+def _box(name: str) -> type[Odometry] | type[Command]:
+    return Command if name == "command" else box_class(name)
+
+
+def _check_odometry(data: dict[str, Any], problems: list[_Problem], folder: Path) -> None:
+    """Check all that depends on the odometry; paths in its settings are made absolute."""
     name = data.get("name")
     if not isinstance(name, str):
         return
     try:
-        box = box_class(name)
+        box = _box(name)
     except OdometryError as error:
         problems.append((("odometry", "name"), str(error)))
         return
-    settings = data.get("settings")
-    if isinstance(settings, dict):
-        _validated(box.settings_type, settings, ("odometry", "settings"), problems)
-    parameters = data.get("parameters")
+    key: tuple[str, ...] = ("odometry", "settings")
+    settings = data.get("settings") or {}
+    if not isinstance(settings, dict):
+        return
+    found: Any = _validated(box.settings_type, settings, key, problems, {"folder": folder})
+    if found is not None:
+        data["settings"] = found.model_dump(mode="json", exclude_unset=True)
+    elif not issubclass(box, Odometry):
+        return
+    try:
+        space = box.describe(found).space
+        _check_parameters(name, space, data.get("parameters"), problems)
+        if issubclass(box, Command) and isinstance(parameters := data.get("parameters"), dict):
+            box.check(found, dict.fromkeys(parameters, 0))
+    except OdometryError as error:
+        problems.append((key, str(error)))
+
+
+def _check_parameters(
+    name: str, space: ParameterSpace | None, parameters: Any, problems: list[_Problem]
+) -> None:
+    if space is None and not parameters:
+        what = f"define what is tuned: a {name} does not tell what its parameters are"
+        problems.append((("odometry", "parameters"), what))
     if not isinstance(parameters, dict):
         return
     for parameter, given in parameters.items():
         key = ("odometry", "parameters", parameter)
-        if parameter not in box.space.names:
-            help_ = nearest(str(parameter), box.space.names)
+        if space is not None and parameter not in space.names:
+            help_ = nearest(str(parameter), space.names)
             problems.append((key, f"{name} has no parameter {parameter!r}: {help_}"))
         elif isinstance(given, dict):
-            default = box.space.parameters[parameter]
-            _validated(type(default), _complete(box.space, parameter, given), key, problems)
+            complete = _complete(space, parameter, given)
+            kinds: Any = {"float": Float, "integer": Integer, "categorical": Categorical}
+            if complete.get("type") not in kinds:
+                problems.append((key, f"give its type, one of {', '.join(kinds)}"))
+            else:
+                _validated(kinds[complete["type"]], complete, key, problems)
 
 
 def _check_box(config: StudyConfig, problems: list[_Problem]) -> None:
     """Find what is asked of the odometry that it cannot do, and what it lacks."""
     try:
-        box = box_class(config.odometry.name)
-    except OdometryError:
+        box: Any = _box(config.odometry.name)
+        found = box.describe(box.settings_type.model_validate(config.odometry.settings))
+    except (OdometryError, ValidationError):
         return
-    if box.needs_imu:
+    if found.needs_imu:
         needs = f"{config.odometry.name} needs an IMU"
         for name, sequence in config.sequences.items():
             if sequence.imu is None:
@@ -767,16 +862,21 @@ def _check_box(config: StudyConfig, problems: list[_Problem]) -> None:
         for name, course in config.courses.items():
             if course.imu is None:
                 problems.append((("courses", name), f"{needs}; simulate one, imu: 200"))
-    _check_switching(config, box, problems)
+    _check_switching(config, found, problems)
 
 
-def _check_switching(config: StudyConfig, box: type[Odometry], problems: list[_Problem]) -> None:
-    for i, given in enumerate(config.online.switching.sets or ()):
+def _check_switching(config: StudyConfig, found: Description, problems: list[_Problem]) -> None:
+    online = config.online
+    names = (config.odometry.parameters or {}) if found.space is None else found.space.names
+    for i, given in enumerate(online.switching.sets or ()):
         for name in given if isinstance(given, dict) else ():
-            if name not in box.space.names:
+            if name not in names:
                 key = ("online", "switching", "sets", i, name)
-                problems.append((key, f"no such parameter; {nearest(name, box.space.names)}"))
-    if config.online.switching.mechanism == "live" and not box.live:
+                problems.append((key, f"no such parameter; {nearest(name, names)}"))
+    if found.whole and "rules" in online.model_fields_set and online.rules:
+        what = "a command runs whole recordings: it cannot adapt on the way; leave this out"
+        problems.append((("online", "rules"), what))
+    if online.switching.mechanism == "live" and not found.live:
         problems.append(
             (
                 ("online", "switching", "mechanism"),
@@ -810,9 +910,9 @@ def _check_sampling(config: StudyConfig, problems: list[_Problem]) -> None:
         problems.extend((key + path, message) for path, message in found)
 
 
-def _complete(space: ParameterSpace, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+def _complete(space: ParameterSpace | None, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """What is given of a parameter, and for the rest what the odometry says of it."""
-    return space.parameters[name].model_dump() | dict(given)
+    return ({} if space is None else space.parameters[name].model_dump()) | dict(given)
 
 
 def _validated(

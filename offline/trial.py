@@ -37,6 +37,7 @@ class PreparedSequence:
 
     Attributes
     ----------
+    name : str
     frames : Frames
     nbytes : int
         What the prepared scans take.
@@ -48,6 +49,7 @@ class PreparedSequence:
     """
 
     def __init__(self, study: Study, name: str, memory: float):
+        self.name = name
         self._sequence = study.sequence(name)
         self._box = _odometry(study)
         self._kept: list[Any] = []
@@ -125,11 +127,13 @@ def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
         )
 
 
-def _odometry(study: Study, parameters: ParameterSet | None = None) -> Box:
+def _odometry(
+    study: Study, parameters: ParameterSet | None = None, sequence: str | None = None
+) -> Box:
     """An odometry, in a process of its own where its memory is to be told apart."""
     if "memory" in study.config.offline.metrics:
-        return study.odometry(parameters, isolated=True)
-    return study.odometry(parameters)
+        return study.odometry(parameters, sequence, isolated=True)
+    return study.odometry(parameters, sequence)
 
 
 class _Run:
@@ -246,7 +250,10 @@ def run_trials(
     # Of every set every repeat, and of that every piece.
     runs = [
         [
-            [_Run(_odometry(study, s), frames, lost_track, *piece) for piece in pieces]
+            [
+                _Run(_odometry(study, s, sequence.name), frames, lost_track, *piece)
+                for piece in pieces
+            ]
             for _ in range(repeats)
         ]
         for s in sets
@@ -299,7 +306,7 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         restarted,
         registered,
         seconds,
-        tuple(fault for box in isolated for fault in box.faults),
+        tuple(fault for run in pieces for fault in getattr(run.odometry, "faults", ())),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
         usage,
     )

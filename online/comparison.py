@@ -36,7 +36,7 @@ class ComparisonError(AdaptuneError):
 
 def modes(study: Study) -> tuple[str, ...]:
     """What is compared: baseline, fixed, and each selection rule."""
-    return ("baseline", "fixed", *study.config.online.rules)
+    return ("baseline", "fixed", *study.rules)
 
 
 def run_replays(
@@ -89,7 +89,7 @@ def run_replays(
                 done += 1
                 progress(what, done, n)
 
-            box, policy = driven(study, model, mode)
+            box, policy = driven(study, model, mode, name)
             result = replay(
                 sequence,
                 box,
@@ -108,7 +108,7 @@ def run_replays(
     return made
 
 
-def driven(study: Study, model: ErrorModel, mode: str) -> tuple[Box, Policy | None]:
+def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, Policy | None]:
     """What a mode drives through a recording, and what chooses its parameters.
 
     Parameters
@@ -119,10 +119,12 @@ def driven(study: Study, model: ErrorModel, mode: str) -> tuple[Box, Policy | No
         The error model.
     mode
         One of `modes`.
+    name
+        The sequence that it will be driven along.
     """
     fixed = model.sets[model.fixed]
-    if mode not in study.config.online.rules:
-        return study.odometry(fixed if mode == "fixed" else None), None
+    if mode not in study.rules:
+        return study.odometry(fixed if mode == "fixed" else None, name), None
     switching = study.config.online.switching
     if study.mechanism == "live":
         return study.odometry(fixed), adaptive(model, mode)

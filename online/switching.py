@@ -113,7 +113,7 @@ def _mechanisms(study: Study) -> dict[str, Callable[[], Driven]]:
     beside = study.config.online.switching.beside
     warm_ups = dict.fromkeys([*(WarmUp(s, s, 1) for s in WARM_UPS), study.warm_up])
     made: dict[str, Callable[[], Driven]] = {"none": lambda: (study.odometry(), None)}
-    if study.box.live:
+    if study.described.live:
         made["live"] = lambda: (study.odometry(), _alike(study.space.baseline))
     made |= {_say(warm_up): hand_over(warm_up) for warm_up in warm_ups}
     made["bank"] = lambda: (Bank(same, names, study.warm_up), names)

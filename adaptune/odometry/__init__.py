@@ -3,11 +3,13 @@
 from adaptune.odometry.base import (
     BaseSettings,
     Box,
+    Description,
     Odometry,
     OdometryError,
     Registration,
     WarmUp,
 )
+from adaptune.odometry.command import Command
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import BOXES, box_class, versions
@@ -18,6 +20,8 @@ __all__ = [
     "Bank",
     "BaseSettings",
     "Box",
+    "Command",
+    "Description",
     "HandOver",
     "HealthCheck",
     "Isolated",

@@ -54,6 +54,30 @@ class Registration(NamedTuple):
     registered: bool = True
 
 
+class Description(NamedTuple):
+    """What a study must know of an odometry before it runs it.
+
+    Attributes
+    ----------
+    space : ParameterSpace or None
+        What can be tuned; None where that is the study's to define.
+    live : bool
+        See `Odometry`.
+    needs_imu : bool
+        See `Odometry`.
+    warm_up : WarmUp
+        See `Odometry`.
+    whole : bool
+        Whether it runs whole recordings only, and so with one parameter set from end to end.
+    """
+
+    space: ParameterSpace | None
+    live: bool
+    needs_imu: bool = False
+    warm_up: WarmUp = WarmUp()
+    whole: bool = False
+
+
 class Box(Protocol):
     """What can be driven through a recording, see `Odometry` for what each method does."""
 
@@ -123,6 +147,11 @@ class Odometry(ABC):
     ):
         self.settings: Any = self.settings_type() if settings is None else settings
         self.parameters = self.space.baseline | self._known(parameters or {})
+
+    @classmethod
+    def describe(cls, settings: Any) -> Description:  # noqa: ARG003
+        """What a study must know of it, with these settings."""
+        return Description(cls.space, cls.live, cls.needs_imu, cls.warm_up)
 
     @abstractmethod
     def prepare(self, scan: Scan) -> Any:

@@ -17,10 +17,8 @@ from typing import BinaryIO, NoReturn
 from adaptune.cores import pin
 from adaptune.odometry import wire
 from adaptune.odometry.base import OdometryError
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.isolation import Limits, last_lines, verdict
 from adaptune.odometry.registry import box_class
-
-_LINES = 5
 
 
 def main(control: socket.socket, name: str) -> None:
@@ -52,20 +50,17 @@ def _watch(connection: socket.socket, limits: Limits) -> None:
             _run(connection, output.fileno(), limits)
         _, status = os.waitpid(child, 0)
         if status:
-            output.seek(0)
-            last = output.read().decode(errors="replace").strip().splitlines()[-_LINES:]
-            what = _verdict(status, limits) + (": " + " | ".join(last) if last else "")
+            what = _verdict(os.waitstatus_to_exitcode(status), limits)
+            if last := last_lines(output):
+                what = f"{what}: {last}"
             with contextlib.suppress(OSError), connection.makefile("wb") as writer:
                 wire.send(writer, {"type": "fault", "message": what})
 
 
-def _verdict(status: int, limits: Limits) -> str:
-    if not os.WIFSIGNALED(status):
-        return f"its process ended with code {os.waitstatus_to_exitcode(status)}"
-    number = os.WTERMSIG(status)
-    if number == signal.SIGALRM:
+def _verdict(code: int, limits: Limits) -> str:
+    if code == -signal.SIGALRM:
         return f"a scan took longer than isolation.seconds = {limits.seconds:g}"
-    return f"its process was ended by {signal.Signals(number).name}"
+    return verdict(code)
 
 
 def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:

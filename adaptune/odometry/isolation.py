@@ -7,6 +7,7 @@ milliseconds, and what an odometry keeps beside its instances is gone with its p
 import contextlib
 import logging
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -28,6 +29,12 @@ MOST_FAULTS = 10
 
 _SHAKE = 1e-3
 """By which a rotation times its transpose may depart from the identity."""
+
+_TAIL, _LINES = 1 << 14, 5
+"""Of what it has written, the last lines of the last bytes are told."""
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Environment of programs that must not start threads of their own."""
 
 _log = logging.getLogger(__name__)
 
@@ -133,8 +140,8 @@ class Isolated:
         if answer is None:
             return Registration(np.full((4, 4), np.nan), registered=False)
         T_odom_sensor = answer.arrays["pose"]
-        if nonsense := _nonsense(T_odom_sensor):
-            self._fault(nonsense)
+        if what := nonsense(T_odom_sensor):
+            self._fault(f"it gave a pose {what}")
             return Registration(np.full((4, 4), np.nan), registered=False)
         self.cpu = self._cpu_before + answer.header.get("cpu", 0.0)
         self.memory = max(self.memory, answer.header.get("memory", 0.0))
@@ -189,16 +196,31 @@ class Isolated:
             _log.warning("%s: that was fault number %d, giving up", self.name, MOST_FAULTS)
 
 
-def _nonsense(T_odom_sensor: Poses) -> str | None:
+def nonsense(T_odom_sensor: Poses) -> str | None:
     """What is wrong with a pose, if anything."""
     if T_odom_sensor.shape != (4, 4):
-        return f"it gave a pose of shape {T_odom_sensor.shape}"
+        return f"of shape {T_odom_sensor.shape}"
     if not np.isfinite(T_odom_sensor).all():
-        return "it gave a pose that is not finite"
+        return "that is not finite"
     R = T_odom_sensor[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > _SHAKE or np.linalg.det(R) < 0:
-        return "it gave a pose that is not rigid"
+        return "that is not rigid"
     return None
+
+
+def verdict(code: int) -> str:
+    """How a process ended, by its exit code, or minus the signal's number."""
+    if code >= 0:
+        return f"its process ended with code {code}"
+    return f"its process was ended by {signal.Signals(-code).name}"
+
+
+def last_lines(output: BinaryIO) -> str:
+    """The last lines that a process wrote to a file."""
+    size = output.seek(0, os.SEEK_END)
+    output.seek(max(size - _TAIL, 0))
+    lines = output.read().decode(errors="replace").strip().splitlines()
+    return " | ".join(lines[-_LINES:])
 
 
 class _Server(NamedTuple):
@@ -210,15 +232,13 @@ class _Server(NamedTuple):
 def _server(name: str) -> _Server:
     """What forks instances of an odometry, begun when the first one is wanted."""
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
-    # The odometries must not start threads of their own.
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     path = os.pathsep.join(filter(None, sys.path))
     with there:
         process = subprocess.Popen(
             [sys.executable, "-m", "adaptune.odometry.forkserver", str(there.fileno()), name],
             pass_fds=[there.fileno()],
             stdin=subprocess.DEVNULL,
-            env=os.environ | threads | {"PYTHONPATH": path},
+            env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
             # Ctrl-C is for the process that drives.
             start_new_session=True,
         )

@@ -45,6 +45,10 @@ def versions(box: type[Odometry]) -> dict[str, str]:
     return found
 
 
+PROGRAMS = {"command": "adaptune.odometry.command:Command"}
+"""Programs of the user's, which are no Python classes."""
+
+
 def box_class(name: str) -> type[Odometry]:
     """Class of an odometry.
 
@@ -60,7 +64,7 @@ def box_class(name: str) -> type[Odometry]:
         Naming the nearest odometry there is, or telling why the class cannot be used.
     """
     try:
-        found = plugins.load(name, "odometry", BOXES, ENTRY_POINTS, "Class")
+        found = plugins.load(name, "odometry", BOXES | PROGRAMS, ENTRY_POINTS, "Class")
     except plugins.PluginError as error:
         raise OdometryError(str(error)) from error
     if not (isinstance(found, type) and issubclass(found, Odometry)):

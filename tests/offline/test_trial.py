@@ -78,7 +78,7 @@ class Slipping(KeyframeGicp):
 def test_a_lost_track_starts_anew_at_the_reference(study, monkeypatch):
     boxes = []
 
-    def odometry(self, parameters=None):
+    def odometry(self, parameters=None, _=None):
         boxes.append(Slipping(parameters, self.settings))
         return boxes[-1]
 
@@ -107,7 +107,7 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monk
                 T[1, 3] += 5.0
             return Registration(T, ok)
 
-    monkeypatch.setattr(Study, "odometry", lambda self, p=None: Lost(p, self.settings))
+    monkeypatch.setattr(Study, "odometry", lambda self, p=None, _=None: Lost(p, self.settings))
     sequence = PreparedSequence(study, "one", 1e9)
     (trial,) = run_trials(study, sequence, [GOOD])
     assert np.flatnonzero(trial.restarted).tolist() == [10]

@@ -1,0 +1,154 @@
+"""Parameter files made from a template: YAML, JSON, TOML, and the layouts of ROS 1 and ROS 2."""
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from adaptune import yaml
+from adaptune.odometry.base import OdometryError
+from adaptune.space import ParameterSet, nearest
+
+SUFFIXES = (".yaml", ".yml", ".json", ".toml")
+
+_ROS2 = "ros__parameters"
+
+_Place = tuple[tuple[str, ...], Any, Any]
+"""Path of a value, what holds it, and under which key."""
+
+
+class Template:
+    """A parameter file with values to be replaced.
+
+    A parameter goes by its keys from the outermost on, with points or slashes between them;
+    leading ones may be left out where what remains names one value only. Keys that hold points or
+    slashes themselves, as those of ROS do, are several; ROS 2's ``ros__parameters`` is none.
+
+    Parameters
+    ----------
+    path
+        Its suffix tells the format.
+
+    Raises
+    ------
+    OdometryError
+        If it cannot be read.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        if path.suffix not in SUFFIXES:
+            raise OdometryError(f"{path}: a template is a file of {', '.join(SUFFIXES)}")
+        try:
+            text = path.read_text(encoding="utf-8")
+            if path.suffix == ".toml":
+                self._data: Any = tomllib.loads(text)
+            elif path.suffix == ".json":
+                self._data = json.loads(text)
+            else:
+                self._data = yaml.Document(text).data
+        except FileNotFoundError as error:
+            raise OdometryError(f"{path}: there is no such file") from error
+        except (OSError, ValueError, yaml.YamlError) as error:
+            raise OdometryError(f"{path}: {error}") from error
+        self._places = list(_places(self._data))
+
+    def holds(self, name: str) -> bool:
+        """Whether there is such a value.
+
+        Raises
+        ------
+        OdometryError
+            If there are several.
+        """
+        return self._find(name) is not None
+
+    @property
+    def names(self) -> list[str]:
+        """Paths of all values."""
+        return [".".join(path) for path, *_ in self._places]
+
+    def fill(self, parameters: Mapping[str, Any]) -> str:
+        """The file's text with other values; those that are not in it are left aside."""
+        for name, value in parameters.items():
+            if (place := self._find(name)) is not None:
+                _, holder, key = place
+                holder[key] = value
+        if self.path.suffix == ".toml":
+            return tomli_w.dumps(self._data)
+        if self.path.suffix == ".json":
+            return json.dumps(self._data, indent=2) + "\n"
+        return yaml.dump(self._data)
+
+    def _find(self, name: str) -> _Place | None:
+        wanted = _parts(name)
+        found = [place for place in self._places if place[0][-len(wanted) :] == wanted]
+        if len(found) > 1:
+            found = [place for place in found if place[0] == wanted] or found
+        if len(found) > 1:
+            paths = ", ".join(".".join(path) for path, *_ in found)
+            raise OdometryError(f"{self.path}: {name!r} may be any of {paths}; name one of them")
+        return found[0] if found else None
+
+
+def _parts(name: Any) -> tuple[str, ...]:
+    return tuple(part for part in re.split(r"[./]", str(name)) if part)
+
+
+def _places(data: Any, path: tuple[str, ...] = ()) -> Iterator[_Place]:
+    """Every value that is neither a mapping nor a list of them."""
+    if isinstance(data, dict):
+        items: Any = data.items()
+    elif isinstance(data, list):
+        items = enumerate(data)
+    else:
+        return
+    for key, value in items:
+        below = path if key == _ROS2 else path + _parts(key)
+        if isinstance(value, dict | list) and value:
+            yield from _places(value, below)
+        else:
+            yield below, data, key
+
+
+_PLACEHOLDER = re.compile(r"\{([\w./-]+)\}")
+
+
+def placeholders(argument: str) -> list[str]:
+    """Names in braces."""
+    return _PLACEHOLDER.findall(argument)
+
+
+def replace(argument: str, values: Mapping[str, Any]) -> str:
+    """Put values in the place of names in braces; those without a value stay."""
+    return _PLACEHOLDER.sub(
+        lambda match: _text(values[match[1]]) if match[1] in values else match[0], argument
+    )
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def check_names(parameters: ParameterSet, template: Template | None, command: list[str]) -> None:
+    """Make sure that every parameter reaches the program.
+
+    Raises
+    ------
+    OdometryError
+        Naming the parameter that is neither in the template nor in the arguments.
+    """
+    inside = {name for argument in command for name in placeholders(argument)}
+    for name in parameters:
+        if name in inside or (template is not None and template.holds(name)):
+            continue
+        if template is None:
+            raise OdometryError(f"{name}: no argument holds {{{name}}}, and there is no template")
+        raise OdometryError(
+            f"{name}: no argument holds {{{name}}}, and {template.path.name} has no such value; "
+            f"{nearest(name, template.names)}"
+        )

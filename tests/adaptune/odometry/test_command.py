@@ -1,0 +1,281 @@
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import program
+import pytest
+import yaml
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.template import Template
+from adaptune.study import ConfigurationError, load_study
+from offline.campaign import train
+from offline.trial import PreparedSequence, run_trials
+from online.comparison import compare, run_replays
+
+STUDY = """\
+odometry:
+  name: command
+  settings:
+    command: [{python}, "{{study}}/program.py", "{{input}}", "{{points}}", "{{output}}",
+              "{{parameters}}", "{fault}"]
+    template: {template}
+  parameters:
+    registration.voxel: {{type: float, low: 0.2, high: 2.0, baseline: 0.5, log: true}}
+    distance: {{type: float, low: 0.05, high: 4.0, baseline: 2.0, log: true}}
+sequences:
+  one: {{bag: "{bags}/one.bag", points: /points, reference: /truth}}
+  two: {{bag: "{bags}/two.bag", points: /points, reference: /truth}}
+training: [one]
+test: [two]
+sub_trajectory: 3.0
+isolation: {{seconds: 2, memory: 4}}
+offline: {{trials: 3, initial: 3, seed: 3, workers: 1}}
+"""
+
+TEMPLATES = {
+    "ros1.yaml": "# of ROS 1\nodometry/registration: {voxel: 1, distance: 3.0}\nframe: on\n",
+    "ros2.yaml": "/**:\n  ros__parameters:\n    registration.voxel: 1.0\n"
+    "    registration.distance: 3.0\n",
+    "nested.yaml": "/**:\n  ros__parameters:\n    registration: {voxel: 1.0, distance: 3.0}\n",
+    "file.json": '{"registration": {"voxel": 1.0, "distance": 3.0}, "names": ["a", "b"]}',
+    "file.toml": "[registration]\nvoxel = 1.0\ndistance = 3.0\n",
+}
+
+
+@pytest.fixture
+def make(tmp_path, study_file):
+    (tmp_path / "program.py").write_text(Path(program.__file__).read_text())
+
+    def study(fault="none", *overrides, template="file.json"):
+        (tmp_path / template).write_text(TEMPLATES[template])
+        text = STUDY.format(
+            python=sys.executable, fault=fault, template=template, bags=study_file.parent
+        )
+        (tmp_path / "study.yaml").write_text(text)
+        return load_study(tmp_path / "study.yaml", overrides, tmp_path / "runs")
+
+    return study
+
+
+OTHER = {"registration.voxel": 0.6, "distance": 2.0}
+
+
+def run(study, parameters=OTHER, whole=False):
+    sequence = PreparedSequence(study, "one", 1e9)
+    (trial,) = run_trials(study, sequence, [parameters], whole)
+    return trial, sequence
+
+
+def test_the_poses_are_the_program_s(make):
+    study = make()
+    trial, sequence = run(study)
+    assert not trial.faults
+    assert not trial.restarted.any()
+    np.testing.assert_allclose(
+        trial.T_odom_sensor[:, :3, 3], sequence.frames.T_ref_sensor[:, :3, 3], atol=0.1
+    )
+    # It is what the program finds with these values.
+    output = study.folder / "alone.tum"
+    file = output.with_suffix(".json")
+    file.write_text('{"registration": {"voxel": 0.6, "distance": 2.0}}')
+    program.main(study.config.sequences["one"].bag, "/points", str(output), str(file))
+    np.testing.assert_allclose(trial.T_odom_sensor[:, :3, 3], np.loadtxt(output)[:, 1:4], atol=1e-6)
+
+
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_every_layout_of_parameters(tmp_path, template):
+    path = tmp_path / template
+    path.write_text(TEMPLATES[template])
+    text = Template(path).fill({"registration.voxel": 1e-05, "distance": 2.0, "other": 1})
+    if template.endswith(".toml"):
+        data = tomllib.loads(text)
+    elif template.endswith(".json"):
+        data = json.loads(text)
+    else:
+        # As programs that go by YAML 1.1 read it.
+        data = yaml.safe_load(text)
+    expected = {
+        "ros1.yaml": {"odometry/registration": {"voxel": 1e-05, "distance": 2.0}, "frame": "on"},
+        "ros2.yaml": {
+            "/**": {"ros__parameters": {"registration.voxel": 1e-05, "registration.distance": 2.0}}
+        },
+        "nested.yaml": {
+            "/**": {"ros__parameters": {"registration": {"voxel": 1e-05, "distance": 2.0}}}
+        },
+        "file.json": {"registration": {"voxel": 1e-05, "distance": 2.0}, "names": ["a", "b"]},
+        "file.toml": {"registration": {"voxel": 1e-05, "distance": 2.0}},
+    }
+    assert data == expected[template]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["output=poses/run.csv", "format=evalio"],
+        ["output=run.txt", "format=kitti"],
+    ],
+    ids=["evalio", "kitti"],
+)
+def test_every_format_of_trajectories(make, overrides):
+    trial, sequence = run(make("pretend", *(f"odometry.settings.{o}" for o in overrides)))
+    assert not trial.faults
+    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+
+
+VIEW = "sequences.one.views=[{cut: [[0.0, 1.5], [2.0, 9.0]]}]"
+
+
+@pytest.mark.parametrize(
+    ("kind", "points"), [("bag", "{points}"), ("ros2", "{points}"), ("kitti", "")]
+)
+def test_a_view_is_written_once_for_the_program(make, kind, points):
+    arguments = f'["{{study}}/program.py", "{{input}}", "{points}", "{{output}}", "{{parameters}}"]'
+    command = arguments.replace("[", f"[{sys.executable}, ", 1)
+    format_ = "kitti" if kind == "kitti" else "tum"
+    study = make(
+        "none",
+        f"odometry.settings.command={command}",
+        "isolation.seconds=5",
+        f"odometry.settings.input={kind}",
+        f"odometry.settings.format={format_}",
+        f"odometry.settings.output=run.{'txt' if format_ == 'kitti' else 'tum'}",
+        VIEW,
+    )
+    trial, sequence = run(study)
+    assert not trial.faults
+    assert len(trial.T_odom_sensor) == len(sequence.frames.stamps) == 35
+    np.testing.assert_allclose(
+        trial.T_odom_sensor[:, :3, 3], sequence.frames.T_ref_sensor[:, :3, 3], atol=0.15
+    )
+    (written,) = (study.folder / "inputs" / "one").glob("input*")
+    before = written.stat().st_mtime_ns
+    run(study)
+    assert written.stat().st_mtime_ns == before
+
+
+def test_a_program_that_stamps_the_end_of_a_scan(make):
+    trial, _ = run(make("late"))
+    assert not trial.faults
+    assert not trial.restarted.any()
+    assert np.nanmax(trial.errors) < 5.0
+
+
+def test_another_frame(make):
+    with pytest.raises(OdometryError, match=r"another frame: turned by 120 degrees.*extrinsic"):
+        run(make("camera"))
+    lidar = "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]"
+    trial, sequence = run(make("camera", f"odometry.settings.extrinsic={lidar}"))
+    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+
+
+FAULTS = {
+    "exit": "its process ended with code 1: .*no planes here",
+    "abort": "its process was ended by SIGABRT",
+    "hang": r"longer than isolation.seconds = 0\.1 for each scan: reading one\.bag",
+    "memory": "code 1: .*MemoryError",
+    "nothing": r"it left no trajectory\.tum: reading one\.bag",
+    "half": r"trajectory\.tum has poses for 2[01] of 40 scans, the last at .* of 3\.9 s",
+    "cut": r"trajectory\.tum, line 42: a TUM line has 8 numbers",
+    "backwards": "line 4: its stamp does not come after the line before",
+    "clock": "its poses are of 0.000 s to 3.900 s, the scans of 1700000000",
+    "NaN": "line 8: a number is not finite",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_told_with_the_last_lines(make, fault):
+    study = make(fault, *["isolation.seconds=0.1"][: fault == "hang"])
+    trial, _ = run(study)
+    (told,) = trial.faults
+    assert re.search(FAULTS[fault], told, re.DOTALL), told
+    assert np.isinf(trial.errors[~np.isnan(trial.errors)][-1])
+
+
+def test_with_the_baseline_s_parameters_something_else_than_these_is_wrong(make):
+    study = make("exit")
+    with pytest.raises(OdometryError, match=r"with .*voxel.: 0\.5.*code 1: .*no planes here"):
+        run(study, study.space.baseline)
+
+
+def test_half_a_trajectory_counts_as_far_as_it_goes(make):
+    trial, _ = run(make("half"))
+    assert np.isfinite(trial.errors[:9]).all()
+    assert np.isinf(trial.errors[12:20]).all()
+
+
+def test_poses_without_stamps_that_are_too_many_or_not_rigid(make):
+    kitti = ["odometry.settings.output=run.txt", "odometry.settings.format=kitti"]
+    trial, _ = run(make("not rigid", *kitti))
+    assert "pose 4: that is not rigid" in trial.faults[0]
+    trial, _ = run(make("half", *kitti))
+    assert "20 of 40 scans" in trial.faults[0]
+    trial, _ = run(make("pretend", *kitti, "sequences.one.stop=2.0"))
+    assert "40 poses without stamps for 20 scans" in trial.faults[0]
+
+
+def test_a_lost_track_is_labelled_and_what_comes_after_judged_for_itself(make):
+    study = make("jump")
+    trial, sequence = run(study)
+    assert np.flatnonzero(trial.restarted).tolist() == [20]
+    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+    assert np.isinf(trial.errors[10:20]).all()
+    np.testing.assert_allclose(trial.errors[20:25], 0.0, atol=1e-3)
+    # No new start: the program has run once, and its motions are the same.
+    whole, _ = run(study, whole=True)
+    np.testing.assert_allclose(whole.T_odom_sensor[20:, 0, 3], 2.0 + 0.3 * np.arange(20, 40))
+    assert not whole.restarted.any()
+
+
+def test_the_whole_way(make):
+    study = make("pretend", "offline.trials=2")
+    training = train(study)
+    assert training.model.space.names == ("registration.voxel", "distance")
+    assert run_replays(study, study.folder / "model.npz") == 2
+    assert {row["mode"] for row in compare(study)} == {"baseline", "fixed"}
+    file = study.folder.parent / "file.json"
+    file.write_text(file.read_text() + " ")
+    with pytest.raises(ConfigurationError, match=r"other values of odometry\.template"):
+        study.open()
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("odometry.parameters=", "odometry.parameters: define what is tuned"),
+        ("odometry.parameters.distance={low: 1, high: 2, baseline: 1}", "give its type, one of"),
+        ("odometry.parameters.distance.type=real", "give its type, one of float, integer"),
+        ("odometry.parameters.distance.low=9", "low (9) must be less than high"),
+        (
+            "odometry.parameters.voxl={type: integer, low: 1, high: 2, baseline: 1}",
+            "voxl: no argument holds {voxl}, and file.json has no such value",
+        ),
+        ("odometry.settings.template=no.yaml", "no.yaml: there is no such file"),
+        ("odometry.settings.template=study.txt", "a template is a file of .yaml"),
+        ("odometry.settings.template=", "voxel}, and there is no template"),
+        ("odometry.settings.command=[slam3000, x]", "there is no program 'slam3000'"),
+        ("odometry.settings.command=[sh, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
+        ("odometry.settings.format=tumm", "odometry.settings.format: Input should be"),
+        ("odometry.settings.inpt=bag", "did you mean 'input'?"),
+        ("online.rules=[paired]", "online.rules: a command runs whole recordings"),
+        ("online.switching.mechanism=live", "command cannot change its parameters between scans"),
+    ],
+)
+def test_mistakes_in_the_study(make, override, words):
+    with pytest.raises(ConfigurationError) as caught:
+        make("none", override)
+    assert words in str(caught.value)
+
+
+def test_a_template_whose_values_share_a_name(make, tmp_path):
+    make()
+    twice = '{"registration": {"voxel": 1}, "a": {"distance": 1}, "b": {"distance": 2}}'
+    (tmp_path / "file.json").write_text(twice)
+    with pytest.raises(ConfigurationError, match=r"'distance' may be any of a.distance, b.dist"):
+        load_study(tmp_path / "study.yaml")
+    (tmp_path / "file.json").write_text("{1}")
+    with pytest.raises(ConfigurationError, match=r"file.json: Expecting"):
+        load_study(tmp_path / "study.yaml")
