@@ -165,17 +165,32 @@ def cache(
 
 
 @app.command()
-def serve() -> None:
+def serve(
+    odometry: Annotated[
+        str | None,
+        typer.Argument(help="The only one to serve.", show_default="as each hello says"),
+    ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(help="Serve all who connect to tcp://HOST:PORT or unix:PATH instead."),
+    ] = None,
+) -> None:
     """Answer another program's messages with an odometry, over standard input and output.
 
-    The first message names the odometry. What the odometry itself writes goes to standard error.
-    `docs/odometry.md` describes the messages.
+    What the odometry itself writes goes to standard error. `docs/odometry.md` describes the
+    messages.
     """
-    from adaptune.odometry.wire import serve as answer
+    from adaptune.odometry import process, wire
 
+    if listen is not None:
+        if odometry is None:
+            raise AdaptuneError("--listen serves one odometry: name it")
+        process.listen(
+            listen, odometry, lambda at: console.print(f"{odometry} at {at}", highlight=False)
+        )
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        answer(sys.stdin.buffer, writer)
+        wire.serve(sys.stdin.buffer, writer, odometry, process.anywhere)
 
 
 @app.command()

@@ -39,6 +39,7 @@ from adaptune.odometry import (
     Limits,
     Odometry,
     OdometryError,
+    Process,
     WarmUp,
     box_class,
 )
@@ -376,7 +377,7 @@ class Study:
         return self.folder.name
 
     @cached_property
-    def box(self) -> type[Odometry] | type[Command]:
+    def box(self) -> type[Odometry] | type[Command] | type[Process]:
         """Class of the odometry."""
         return _box(self.config.odometry.name)
 
@@ -427,6 +428,8 @@ class Study:
             strict = sequence in self.config.training and given == self.space.baseline
             material = None if sequence is None else partial(self._material, sequence)
             return Command(given, self.settings, limits, material, strict)
+        if issubclass(self.box, Process):
+            return Process(given, self.settings, limits)
         if self.box.clean and not isolated:
             return self.box(given, self.settings)
         return Isolated(self.config.odometry.name, given, self.settings, limits)
@@ -792,8 +795,10 @@ def _check_roles(data: dict[str, Any], known: set[Any], problems: list[_Problem]
                 problems.append(((role, i), f"{name!r} is trained on, and proves nothing here"))
 
 
-def _box(name: str) -> type[Odometry] | type[Command]:
-    return Command if name == "command" else box_class(name)
+def _box(name: str) -> type[Odometry] | type[Command] | type[Process]:
+    if name == "command":
+        return Command
+    return Process if name == "process" else box_class(name)
 
 
 def _check_odometry(data: dict[str, Any], problems: list[_Problem], folder: Path) -> None:

@@ -12,6 +12,7 @@ from adaptune.odometry.base import (
 from adaptune.odometry.command import Command
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.process import Process
 from adaptune.odometry.registry import BOXES, box_class, versions
 from adaptune.odometry.switching import Bank, HandOver
 
@@ -28,6 +29,7 @@ __all__ = [
     "Limits",
     "Odometry",
     "OdometryError",
+    "Process",
     "Registration",
     "WarmUp",
     "box_class",

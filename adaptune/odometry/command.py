@@ -16,13 +16,21 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import AfterValidator
 
 from adaptune.files import replacing_folder
 from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.metrics import window_ends
 from adaptune.odometry.base import BaseSettings, Description, OdometryError, Registration
-from adaptune.odometry.isolation import ONE_THREAD, Limits, last_lines, nonsense, verdict
+from adaptune.odometry.isolation import (
+    ONE_THREAD,
+    Arguments,
+    Limits,
+    bounded,
+    last_lines,
+    nonsense,
+    verdict,
+)
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.sequence import Scan, Sequence, SequenceConfig
 from adaptune.sequence.config import Transform, resolve, to_pose
@@ -36,15 +44,6 @@ _COVERAGE = 0.9
 """Share of the scans for which a whole trajectory has poses."""
 
 _PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
-
-
-def _in_study(argument: str, info: ValidationInfo) -> str:
-    folder = (info.context or {}).get("folder")
-    return argument if folder is None else argument.replace("{study}", str(folder.resolve()))
-
-
-Argument = Annotated[str, AfterValidator(_in_study)]
-"""``{study}`` in it is the folder of the study's file."""
 
 
 class Settings(BaseSettings):
@@ -69,7 +68,7 @@ class Settings(BaseSettings):
         The LiDAR's pose in the frame that the program's poses are of.
     """
 
-    command: tuple[Argument, ...] = Field(min_length=1)
+    command: Arguments
     template: Annotated[str, AfterValidator(resolve)] | None = None
     output: str = "trajectory.tum"
     format: Literal["tum", "kitti", "evalio"] = "tum"
@@ -329,11 +328,10 @@ class Command:
     def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:
         """Run the program, and tell how it ended if not well."""
         seconds = self._limits.seconds * n
-        # The shell bounds what exec leaves as it is: address space in kB, seconds on the core.
-        bounds = f"ulimit -v {round(self._limits.memory * 1e6)}; ulimit -t {round(seconds) + 1}"
         with log.open("wb") as file:
             process = subprocess.Popen(
-                ["/bin/sh", "-c", f'{bounds}; exec "$@"', "sh", *command],
+                # Should this process be killed, the time on the core is bounded still.
+                bounded(command, self._limits.memory, f"-t {round(seconds) + 1}"),
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=file,

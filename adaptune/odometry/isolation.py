@@ -11,11 +11,12 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from functools import cache
-from typing import Any, BinaryIO, NamedTuple, cast
+from typing import Annotated, Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
@@ -37,6 +38,15 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 """Environment of programs that must not start threads of their own."""
 
 _log = logging.getLogger(__name__)
+
+
+def _in_study(argument: str, info: ValidationInfo) -> str:
+    folder = (info.context or {}).get("folder")
+    return argument if folder is None else argument.replace("{study}", str(folder))
+
+
+Arguments = Annotated[tuple[Annotated[str, AfterValidator(_in_study)], ...], Field(min_length=1)]
+"""A program and its arguments; ``{study}`` in them is the folder of the study's file."""
 
 
 class Limits(BaseModel):
@@ -81,13 +91,16 @@ class Isolated:
         Megabytes that they took at most, what they began with included.
     """
 
+    _fresh = True
+    """Whether each start wants a new process."""
+
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
-        self.name = name
+        self.name: str | None = name
         self.parameters = box_class(name).space.baseline | parameters
         self.faults: list[str] = []
         self.cpu = self.memory = 0.0
         self._cpu_before = 0.0
-        self._settings = settings
+        self._settings = settings.model_dump(mode="json")
         self._limits = limits
         self._stream: BinaryIO | None = None
 
@@ -105,19 +118,13 @@ class Isolated:
         OdometryError
             If the odometry refuses its parameters or the scan.
         """
-        self.close()
-        if len(self.faults) >= MOST_FAULTS:
-            return
-        self._stream = _fork(self.name, self._limits)
-        self._ask(
-            {
-                "type": "hello",
-                "version": wire.VERSION,
-                "odometry": self.name,
-                "parameters": self.parameters,
-                "settings": self._settings.model_dump(mode="json"),
-            }
-        )
+        if self._fresh:
+            self.close()
+        if self._stream is None:
+            if len(self.faults) >= MOST_FAULTS:
+                return
+            self._stream = self._connect()
+            self._ask(wire.hello(self.name, self.parameters, self._settings))
         self._ask(
             {"type": "start", "stamp": prepared.stamp},
             **wire.scan_arrays(prepared),
@@ -132,6 +139,7 @@ class Isolated:
 
     def request(self, prepared: Scan) -> None:
         """Begin to `register`: several instances may be at work at once."""
+        self._asked = prepared.stamp
         self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
 
     def result(self) -> Registration:
@@ -139,13 +147,21 @@ class Isolated:
         answer = self._receive()
         if answer is None:
             return Registration(np.full((4, 4), np.nan), registered=False)
-        T_odom_sensor = answer.arrays["pose"]
-        if what := nonsense(T_odom_sensor):
+        try:
+            T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
+            stamp, registered = answer.header["stamp"], bool(answer.header["registered"])
+        except KeyError as error:
+            self._fault(f"it gave an answer without {error}")
+            return Registration(np.full((4, 4), np.nan), registered=False)
+        what = nonsense(T_odom_sensor)
+        if stamp != self._asked:
+            what = f"of another time, {1e-9 * (stamp - self._asked):+.3f} s from the scan's"
+        if what is not None:
             self._fault(f"it gave a pose {what}")
             return Registration(np.full((4, 4), np.nan), registered=False)
         self.cpu = self._cpu_before + answer.header.get("cpu", 0.0)
         self.memory = max(self.memory, answer.header.get("memory", 0.0))
-        return Registration(T_odom_sensor.copy(), answer.header["registered"])
+        return Registration(T_odom_sensor.copy(), registered)
 
     def configure(self, parameters: ParameterSet) -> None:
         """See `Odometry.configure`."""
@@ -177,16 +193,33 @@ class Isolated:
         """Wait for the answer; None if there is none any more."""
         if self._stream is None:
             return None
+        answer, what = None, "its process ended"
         try:
             answer = wire.receive(self._stream)
-        except (OSError, wire.WireError):
-            answer = None
-        if answer is None or answer.header["type"] == "fault":
-            self._fault("its process ended" if answer is None else answer.header["message"])
+        except TimeoutError:
+            what = f"a scan took longer than isolation.seconds = {self._limits.seconds:g}"
+        except OSError:
+            pass
+        except wire.WireError as error:
+            what = str(error)
+        if answer is None:
+            self._fault(self._verdict(what))
             return None
-        if answer.header["type"] == "refused":
-            raise OdometryError(f"{self.name}: {answer.header['message']}")
+        if answer.header.get("type") == "fault":
+            self._fault(str(answer.header.get("message")))
+            return None
+        if answer.header.get("type") == "refused":
+            raise OdometryError(f"{self.name}: {answer.header.get('message')}")
         return answer
+
+    def _connect(self) -> BinaryIO:
+        """A stream to a process that has yet to be told which odometry it is."""
+        assert self.name is not None
+        return _fork(self.name, self._limits)
+
+    def _verdict(self, what: str) -> str:
+        """What is known of the end of a conversation; a process that ended has told by itself."""
+        return what
 
     def _fault(self, what: str) -> None:
         self.close()
@@ -213,6 +246,12 @@ def verdict(code: int) -> str:
     if code >= 0:
         return f"its process ended with code {code}"
     return f"its process was ended by {signal.Signals(-code).name}"
+
+
+def bounded(command: Sequence[str], memory: float, *limits: str) -> list[str]:
+    """A command whose address space is bounded by so many gigabytes, and by more of ulimit's."""
+    bounds = "; ".join(f"ulimit {limit}" for limit in (f"-v {round(memory * 1e6)}", *limits))
+    return ["/bin/sh", "-c", f'{bounds}; exec "$@"', "sh", *command]
 
 
 def last_lines(output: BinaryIO) -> str:

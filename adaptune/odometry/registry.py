@@ -45,7 +45,10 @@ def versions(box: type[Odometry]) -> dict[str, str]:
     return found
 
 
-PROGRAMS = {"command": "adaptune.odometry.command:Command"}
+PROGRAMS = {
+    "command": "adaptune.odometry.command:Command",
+    "process": "adaptune.odometry.process:Process",
+}
 """Programs of the user's, which are no Python classes."""
 
 

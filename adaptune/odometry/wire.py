@@ -11,26 +11,30 @@ The odometry answers each message with one of its own:
 =============  =======================================================  =========================
 type           holds                                                    answer
 =============  =======================================================  =========================
-``hello``      version, odometry, parameters, settings                  ``done``: version, live
+``hello``      version, odometry?, parameters, settings                 ``done``: see below
 ``start``      stamp, points, times?, rings?, imu..?, pose, motion?     ``done``
-``register``   stamp, points, times?, rings?, imu..?                    ``pose``: registered, pose,
-                                                                        cpu?, memory?
+``register``   stamp, points, times?, rings?, imu..?                    ``pose``: see below
 ``configure``  parameters                                               ``done``
 =============  =======================================================  =========================
 
-or with ``refused`` and a ``message``, where it cannot do what is asked. Points are float32 of
-shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16, poses and motions
-float64 of shape (4, 4), stamps integer nanoseconds, cpu the seconds that the odometry's process has
-computed, memory its peak in megabytes. What an IMU measured since the scan before are four arrays:
-imu_stamps, int64; imu, float64 of shape (n, 6), rad/s and m/s^2; imu_pose, its pose in the LiDAR's
-frame; imu_noise, float64 of shape (4,), see `adaptune.sequence.imu.ImuNoise`. The other side ends
-by closing the stream.
+or with ``refused`` and a ``message``, where it cannot do what is asked, or with ``fault`` and a
+``message``, where it has ended. What answers a hello holds version, odometry (its name), live,
+needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline.
+A pose comes with the stamp of its scan, with registered, and where they are known with cpu, the
+seconds that the odometry's process has computed, and memory, its peak in megabytes. A ``start``
+forgets all scans.
+
+Points are float32 of shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16,
+poses and motions float64 of shape (4, 4), stamps integer nanoseconds. What an IMU measured since
+the scan before are four arrays: imu_stamps, int64; imu, float64 of shape (n, 6), rad/s and m/s^2;
+imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,), see
+`adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
 """
 
 import json
 import resource
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
@@ -39,15 +43,15 @@ from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.odometry.base import Odometry, OdometryError
+from adaptune.odometry.base import BaseSettings, Box, Description, Odometry, OdometryError
 from adaptune.odometry.registry import box_class
 from adaptune.sequence import Imu, Scan
 from adaptune.sequence.imu import ImuNoise
-from adaptune.space import nearest
+from adaptune.space import ParameterSet, ParameterSpace, nearest
 
 VERSION = 2
 _HOLDS = {
-    "hello": ("version", "odometry", "parameters", "settings"),
+    "hello": ("version", "parameters", "settings"),
     "start": ("stamp", "points", "pose"),
     "register": ("stamp", "points"),
     "configure": ("parameters",),
@@ -152,26 +156,82 @@ def to_scan(message: Message) -> Scan:
     return Scan(message.header["stamp"], points, times, rings, imu)
 
 
-def serve(reader: Readable, writer: BinaryIO) -> None:
+Make = Callable[[str, ParameterSet, BaseSettings], Box]
+"""Makes an odometry by its name."""
+
+
+def here(name: str, parameters: ParameterSet, settings: BaseSettings) -> Box:
+    """An odometry in this process."""
+    return box_class(name)(parameters, settings)
+
+
+def hello(
+    odometry: str | None, parameters: ParameterSet, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What begins a conversation; no name where the other side serves one odometry only."""
+    return {
+        "type": "hello",
+        "version": VERSION,
+        "odometry": odometry,
+        "parameters": parameters,
+        "settings": settings,
+    }
+
+
+def announced(answer: Message) -> Description:
+    """What an odometry says of itself when it answers a hello.
+
+    Raises
+    ------
+    WireError
+        If that is no answer of this version.
+    """
+    header = answer.header
+    if header.get("version") != VERSION:
+        raise WireError(
+            f"it speaks version {header.get('version')} of the protocol, this adaptune {VERSION}"
+        )
+    try:
+        space = ParameterSpace.load(header["space"])
+        return Description(space, bool(header["live"]), bool(header.get("needs_imu")))
+    except (KeyError, TypeError, AttributeError, ValidationError) as error:
+        raise WireError(f"its answer to hello does not describe it: {error}") from error
+
+
+def serve(reader: Readable, writer: BinaryIO, name: str | None = None, make: Make = here) -> None:
     """Answer messages with an odometry until the stream ends.
 
     Parameters
     ----------
     reader, writer
         Nothing else may read or write them.
+    name
+        The only odometry to serve; otherwise each hello names one.
+    make
+        Makes it.
 
     Raises
     ------
     WireError
         If what comes is no message.
     """
-    box: Odometry | None = None
+    box: Box | None = None
     while (message := receive(reader)) is not None:
         try:
             _check(message)
             if message.header["type"] == "hello":
-                box = _make(message.header)
-                send(writer, {"type": "done", "version": VERSION, "live": box.live})
+                served, cls, box = _make(message.header, name, make)
+                send(
+                    writer,
+                    {
+                        "type": "done",
+                        "version": VERSION,
+                        "odometry": served,
+                        "live": cls.live,
+                        "needs_imu": cls.needs_imu,
+                        "space": cls.space.dump(),
+                    },
+                )
             elif box is None:
                 raise OdometryError("the first message must be a hello")
             else:
@@ -192,17 +252,24 @@ def _check(message: Message) -> None:
         raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
 
 
-def _make(hello: Mapping[str, Any]) -> Odometry:
+def _make(
+    hello: Mapping[str, Any], only: str | None, make: Make
+) -> tuple[str, type[Odometry], Box]:
     if hello["version"] != VERSION:
         raise OdometryError(
             f"this adaptune speaks version {VERSION} of the protocol, not {hello['version']}"
         )
-    cls = box_class(hello["odometry"])
+    name = hello.get("odometry") or only
+    if name is None:
+        raise OdometryError("the hello names no odometry; name it, or serve one: adaptune serve X")
+    if only not in (None, name):
+        raise OdometryError(f"only {only} is served here, not {name}")
+    cls = box_class(name)
     try:
         settings = cls.settings_type.model_validate(hello["settings"])
     except ValidationError as error:
         raise OdometryError(f"settings: {error}") from error
-    return cls(hello["parameters"], settings)
+    return name, cls, make(name, hello["parameters"], settings)
 
 
 def _usage() -> dict[str, float]:
@@ -211,12 +278,16 @@ def _usage() -> dict[str, float]:
     return {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
 
 
-def _answer(box: Odometry, message: Message, writer: BinaryIO) -> None:
+def _answer(box: Box, message: Message, writer: BinaryIO) -> None:
     header, arrays = message
     if header["type"] == "register":
         T_odom_sensor, registered = box.register(box.prepare(to_scan(message)))
         pose: Poses = np.asarray(T_odom_sensor, np.float64)
-        send(writer, {"type": "pose", "registered": bool(registered), **_usage()}, pose=pose)
+        if (faults := getattr(box, "faults", None)) and not np.isfinite(pose).all():
+            send(writer, {"type": "fault", "message": faults[-1]})
+            return
+        answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
+        send(writer, answer | _usage(), pose=pose)
         return
     if header["type"] == "start":
         # Arrays from the stream are read-only; poses are an odometry's own to keep.

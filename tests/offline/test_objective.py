@@ -158,7 +158,7 @@ class Sideways(KeyframeGicp):
 
 
 def test_a_lost_track_is_in_the_metrics_of_the_trajectory(study_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(Study, "odometry", lambda self, p=None: Sideways(p, self.settings))
+    monkeypatch.setattr(Study, "odometry", lambda self, p=None, _=None: Sideways(p, self.settings))
     study = load_study(study_file, [], tmp_path / "study")
     sequence = PreparedSequence(study, "one", 1e9)
     (trial,) = run_trials(study, sequence, [study.space.baseline])

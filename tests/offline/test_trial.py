@@ -139,7 +139,7 @@ def test_repeats_are_averaged_and_kept(study, monkeypatch):
             T[1, 3] += 5.0 * (self.number == 4 and self.scan == 10)
             return Registration(T, ok)
 
-    monkeypatch.setattr(Study, "odometry", lambda self, p=None: Wavering(p, self.settings))
+    monkeypatch.setattr(Study, "odometry", lambda self, p=None, _=None: Wavering(p, self.settings))
     sequence = PreparedSequence(study, "one", 1e9)
     (trial,) = run_trials(with_offline(study, repeats=3), sequence, [GOOD])
     assert len(made) == 4

@@ -248,9 +248,10 @@ def test_a_conversation_with_the_command_line():
     [
         ({"type": "configure", "parameters": {}}, "the first message must be a hello"),
         (HELLO | {"version": 1}, "speaks version 2 of the protocol, not 1"),
+        (HELLO | {"odometry": None}, "the hello names no odometry"),
         (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
         (HELLO | {"settings": {"fualt": "hang"}}, "fualt"),
-        ({"type": "hello", "version": 2}, "hello lacks odometry, parameters, settings"),
+        ({"type": "hello", "version": 2}, "hello lacks parameters, settings"),
         ({"type": "begin"}, "no message of type 'begin'"),
         ({"type": "start", "stamp": 0}, "start lacks points, pose"),
         ({"type": "register", "stamp": 0}, "register lacks points"),

@@ -1,0 +1,189 @@
+import os
+import re
+import socket
+import sys
+import threading
+
+import numpy as np
+import pytest
+import server
+import turns
+
+from adaptune.odometry import Limits, OdometryError, Process
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.process import Settings, listen
+from adaptune.sequence import Scan
+from adaptune.study import ConfigurationError, load_study
+
+LIMITS = Limits(seconds=20.0)
+
+
+def program(fault="none"):
+    return Settings(command=(sys.executable, server.__file__, fault))
+
+
+def scan(i):
+    return Scan(i * 10**8, np.zeros((5, 3), np.float32))
+
+
+def test_it_drives_and_changes_its_parameters():
+    box = Process({"speed": 0.5}, program(), LIMITS)
+    box.start(scan(0), np.eye(4))
+    assert box.register(scan(1)).T_odom_sensor[0, 3] == 0.5
+    box.configure({"speed": 2.0})
+    assert box.register(scan(2)).T_odom_sensor[0, 3] == 2.5
+    T = np.eye(4)
+    T[0, 3] = 7.0
+    box.start(scan(3), T)
+    assert box.register(scan(4)).T_odom_sensor[0, 3] == 9.0
+    assert not box.faults
+
+
+def test_it_says_what_it_is():
+    described = Process.describe(program())
+    assert described.space.dump() == server.SPACE
+    assert described.live
+    assert not described.needs_imu
+
+
+FAULTS = {
+    "exit": "its process ended with code 3: about to go wrong",
+    "hang": r"a scan took longer than isolation\.seconds = 0\.5: about to go wrong",
+    "words": r"the stream holds no message of adaptune's.*: about to go wrong",
+    "backwards": r"a pose of another time, -0\.200 s from the scan's",
+    "no pose": "an answer without 'pose'",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_told_and_another_start_goes_on(fault):
+    box = Process({}, program(fault), Limits(seconds=0.5 if fault == "hang" else 20.0))
+    box.start(scan(0), np.eye(4))
+    for i in (1, 2):
+        assert np.isfinite(box.register(scan(i)).T_odom_sensor).all()
+    for i in (3, 4):
+        assert np.isnan(box.register(scan(i)).T_odom_sensor).all()
+    (told,) = box.faults
+    assert re.search(FAULTS[fault], told), told
+    box.start(scan(5), np.eye(4))
+    assert box.register(scan(6)).T_odom_sensor[0, 3] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (program("version"), r"it speaks version 1 of the protocol, this adaptune 2"),
+        (program("space"), "its answer to hello does not describe it: 'space'"),
+        (
+            Settings(command=("sh", "-c", "echo no licence >&2; exit 7")),
+            "its process ended with code 7: no licence",
+        ),
+        (Settings(command=("echo", "Hello, world!")), "ended|no message of adaptune's"),
+        (Settings(command=("no-such-program",)), "no-such-program: not found"),
+        (Settings(address="tcp://127.0.0.1:9"), r"nothing listens at tcp://127.0.0.1:9 \(Conn"),
+        (Settings(address="unix:/nowhere/there"), r"nothing listens at unix:/nowhere/there"),
+        (Settings(address="127.0.0.1:9000"), "neither tcp://HOST:PORT nor unix:PATH"),
+    ],
+)
+def test_programs_that_do_not_serve(settings, message):
+    with pytest.raises(OdometryError, match=message):
+        Process.describe(settings)
+
+
+@pytest.fixture
+def listening():
+    """Begins to serve in a thread, and tells where."""
+
+    def begin(address, name):
+        there, ready = [], threading.Event()
+
+        def tell(at):
+            there.append(at)
+            ready.set()
+
+        threading.Thread(target=listen, args=(address, name, tell), daemon=True).start()
+        assert ready.wait(10.0)
+        return there[0]
+
+    return begin
+
+
+def drive(box, n=12):
+    poses = []
+    box.start(box.prepare(turns.turn(0)), np.eye(4))
+    for i in range(1, n):
+        if i == 6:
+            box.configure({"keyframe_interval": 2.0})
+        poses.append(box.register(box.prepare(turns.turn(i))).T_odom_sensor)
+    return np.array(poses)
+
+
+NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+
+
+@pytest.mark.parametrize("kind", ["tcp", "unix"])
+def test_it_is_the_same_odometry_behind_a_socket(listening, tmp_path, kind):
+    where = "tcp://127.0.0.1:0" if kind == "tcp" else f"unix:{tmp_path / 'socket'}"
+    settings = Settings(address=listening(where, "gicp"), settings={"downsampling": 0.4})
+    described = Process.describe(settings)
+    assert described.space == KeyframeGicp.space
+    assert described.live
+    with pytest.raises(OdometryError, match="downsmapling"):
+        Process.describe(settings.model_copy(update={"settings": {"downsmapling": 1}}))
+    here = KeyframeGicp(NEAR, KeyframeGicp.settings_type(downsampling=0.4))
+    there, other = (Process(NEAR, settings, LIMITS) for _ in range(2))
+    other.start(turns.turn(5), np.eye(4))
+    np.testing.assert_array_equal(drive(there), drive(here))
+    assert not there.faults
+
+
+def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+    command = (sys.executable, "-m", "adaptune.cli", "serve", "gicp")
+    box = Process(NEAR, Settings(command=command), Limits(seconds=60.0))
+    np.testing.assert_array_equal(drive(box), drive(KeyframeGicp(NEAR)))
+    assert not box.faults
+
+
+def test_a_server_that_hangs_up():
+    with socket.create_server(("127.0.0.1", 0)) as quiet:
+        address = f"tcp://127.0.0.1:{quiet.getsockname()[1]}"
+
+        def hang_up():
+            quiet.accept()[0].close()
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        with pytest.raises(OdometryError, match="it ended the conversation"):
+            Process.describe(Settings(address=address))
+
+
+def test_garbage_ends_its_own_conversation_only(listening):
+    address = listening("tcp://127.0.0.1:0", "gicp")
+    host, port = address.removeprefix("tcp://").split(":")
+    with socket.create_connection((host, int(port))) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert not connection.recv(100)
+    assert Process.describe(Settings(address=address)).live
+
+
+def test_a_study_takes_its_space(study_file, tmp_path):
+    command = f"[{sys.executable}, {server.__file__}]"
+    overrides = [
+        "odometry.name=process",
+        f"odometry.settings={{command: {command}}}",
+        "odometry.parameters={speed: {high: 2.0}}",
+    ]
+    study = load_study(study_file, overrides, tmp_path / "study")
+    assert study.space.parameters["speed"].high == 2.0
+    assert study.mechanism == "live"
+    box = study.odometry({"speed": 1.5})
+    box.start(scan(0), np.eye(4))
+    assert box.register(scan(1)).T_odom_sensor[0, 3] == 1.5
+    for more, words in (
+        ("odometry.parameters={sped: {high: 2.0}}", "process has no parameter 'sped': did you"),
+        ("odometry.settings={address: 'tcp://127.0.0.1:9'}", "odometry.settings: nothing listens"),
+        ("odometry.settings={}", "odometry.settings: give a command or an address"),
+    ):
+        with pytest.raises(ConfigurationError) as caught:
+            load_study(study_file, [*overrides, more])
+        assert words in str(caught.value)
