@@ -177,8 +177,8 @@ def serve(
 ) -> None:
     """Answer another program's messages with an odometry, over standard input and output.
 
-    What the odometry itself writes goes to standard error. `docs/odometry.md` describes the
-    messages.
+    What the odometry itself writes goes to standard error, or is told with its fault where it has
+    a process of its own. `docs/odometry.md` describes the messages.
     """
     from adaptune.odometry import process, wire
 

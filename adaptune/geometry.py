@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 Poses = NDArray[np.float64]
 """Homogeneous matrices of shape (..., 4, 4), named ``T_target_source``."""
@@ -66,6 +66,28 @@ def steps(T_world_sensor: Poses) -> Poses:
         ``T_previous_current`` of every pose but the first.
     """
     return invert(T_world_sensor[:-1]) @ T_world_sensor[1:]
+
+
+def scale(T_previous_current: Poses, share: float) -> Poses:
+    """A motion that goes on for another time, at the same velocities.
+
+    Parameters
+    ----------
+    T_previous_current
+        The motion, of shape (4, 4).
+    share
+        Of its time.
+
+    Returns
+    -------
+    ndarray of shape (4, 4)
+        The screw motion through the same: `share` times its logarithm.
+    """
+    if share == 1.0:
+        return T_previous_current
+    screw = RigidTransform.from_matrix(T_previous_current).as_exp_coords()
+    T: Poses = RigidTransform.from_exp_coords(share * screw).as_matrix()
+    return T
 
 
 def rotation_angle(T_target_source: Poses) -> Any:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from adaptune.descriptor import Describer, DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
-from adaptune.geometry import Poses, invert, rotation_angle
+from adaptune.geometry import Poses, invert, rotation_angle, scale
 from adaptune.model import RULES, ErrorModel, Selection
 from adaptune.odometry import Box, HealthCheck
 from adaptune.sequence import Scan
@@ -208,28 +208,51 @@ def replay(
 
 
 class _Guard:
-    """Remembers the last healthy motion."""
+    """Remembers the last healthy motion, and for how long the pose has stood still since."""
 
     def __init__(self, health: HealthCheck):
         self._health = health
         self._T_previous_current = np.eye(4)
+        self._seconds = 1.0
         self._velocity: NDArray[np.float64] | None = None
         self._since = 0.0
+        self._moving: tuple[Poses, float] | None = None
+        self._still = 0.0
 
     def check(self, T_odom_previous: Poses, T_odom_current: Poses, elapsed: float) -> Poses | None:
         """The motion to go on with instead, or None if this one is healthy."""
         self._since += elapsed
         if not np.isfinite(T_odom_current).all():
-            return self._T_previous_current
+            return self._go_on(elapsed)
         T_previous_current = invert(T_odom_previous) @ T_odom_current
         velocity = T_previous_current[:3, 3] / elapsed
         turn_rate = float(rotation_angle(T_previous_current)) / elapsed
-        if self._health.healthy(velocity, self._velocity, self._since, turn_rate):
-            self._T_previous_current = T_previous_current
-            self._velocity = velocity
-            self._since = 0.0
-            return None
-        return self._T_previous_current
+        if not self._health.healthy(velocity, self._velocity, self._since, turn_rate):
+            return self._go_on(elapsed)
+        if self._frozen(T_previous_current, elapsed):
+            return self._go_on(elapsed)
+        self._T_previous_current, self._seconds = T_previous_current, elapsed
+        self._velocity = velocity
+        self._since = 0.0
+        return None
+
+    def _frozen(self, T_previous_current: Poses, elapsed: float) -> bool:
+        if not self._health.still(T_previous_current):
+            self._moving, self._still = (T_previous_current, elapsed), 0.0
+            return False
+        self._still += elapsed
+        if self._moving is None:
+            return False
+        T, seconds = self._moving
+        if not self._health.frozen(self._still, float(np.linalg.norm(T[:3, 3])) / seconds):
+            return False
+        self._T_previous_current, self._seconds = T, seconds
+        self._velocity, self._still = T[:3, 3] / seconds, 0.0
+        return True
+
+    def _go_on(self, elapsed: float) -> Poses:
+        """The last healthy motion, for as long as this scan has taken to come."""
+        return scale(self._T_previous_current, elapsed / self._seconds)
 
 
 def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None:

@@ -3,7 +3,12 @@
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, rotation_angle
+
+_STILL = 1e-6
+"""Metres and radians by which a pose that stays where it is may move."""
+_WALK = 0.5
+"""Metres a second."""
 
 
 class HealthCheck(BaseModel):
@@ -21,6 +26,11 @@ class HealthCheck(BaseModel):
         generous enough for the noise of two differentiations.
     max_turn_rate : float
         Degrees a second.
+    max_freeze : float
+        Seconds for which the pose may stay where it is to the micrometre, after a step faster than
+        half a metre a second. A robot that comes to a stand slows down before, and the noise of
+        its scans moves the pose of one that registers them: only an odometry that has given up
+        stops dead.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,6 +38,7 @@ class HealthCheck(BaseModel):
     max_speed: float = Field(40.0, gt=0)
     max_acceleration: float = Field(30.0, gt=0)
     max_turn_rate: float = Field(360.0, gt=0)
+    max_freeze: float = Field(1.0, gt=0)
 
     def healthy(
         self,
@@ -58,3 +69,20 @@ class HealthCheck(BaseModel):
             return True
         change = float(np.linalg.norm(velocity - last_velocity))
         return change <= self.max_acceleration * elapsed
+
+    def still(self, T_previous_current: Poses) -> bool:
+        """Whether a pose of shape (4, 4) stays where it is, to the micrometre."""
+        moved = np.linalg.norm(T_previous_current[:3, 3])
+        return bool(max(moved, rotation_angle(T_previous_current)) < _STILL)
+
+    def frozen(self, seconds: float, speed: float) -> bool:
+        """Whether a pose has frozen, and not come to a stand.
+
+        Parameters
+        ----------
+        seconds
+            For which it has been still.
+        speed
+            Metres a second, of the last step before.
+        """
+        return speed > _WALK and seconds > self.max_freeze

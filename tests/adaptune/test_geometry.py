@@ -12,6 +12,7 @@ from adaptune.geometry import (
     invert,
     rectify,
     rotation_angle,
+    scale,
     steps,
     to_quaternions,
 )
@@ -198,3 +199,12 @@ def test_nothing_is_interpolated_outside_or_in_gaps():
 def test_interpolation_of_a_single_pose():
     got = interpolate(np.array([5]), pose(x=2.0)[None], np.array([4, 5, 6]), 10)
     np.testing.assert_allclose(got[:, 0, 3], [np.nan, 2.0, np.nan])
+
+
+@modest
+@given(seeds, st.integers(1, 5))
+def test_a_motion_scaled_is_a_motion_repeated(seed, n):
+    T = random_poses(seed, size=1.0)
+    np.testing.assert_allclose(np.linalg.matrix_power(scale(T, 1.0 / n), n), T, atol=1e-9)
+    assert scale(T, 1.0) is T
+    np.testing.assert_allclose(scale(T, 0.0), np.eye(4), atol=1e-12)

@@ -169,7 +169,7 @@ def test_every_sub_trajectory_lies_in_an_episode(study, length):
 def test_episodes_begin_anew_and_do_not_hide_what_happens_between(study, monkeypatch):
     boxes = []
 
-    def odometry(self, parameters=None):
+    def odometry(self, parameters=None, _=None):
         boxes.append(Slipping(parameters, self.settings))
         return boxes[-1]
 

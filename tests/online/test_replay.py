@@ -113,6 +113,32 @@ def test_a_platform_that_did_change_its_motion_is_believed_in_the_end():
     assert np.diff(result.trajectory.T_world_sensor[:, 0, 3])[-1] == pytest.approx(0.45)
 
 
+def test_after_a_dropped_scan_the_last_motion_goes_on_for_longer():
+    box = Scripted([0.1, 0.1, 50.0, 0.1])
+    result = replay(scans([0.0, 0.1, 0.2, 0.5, 0.6]), box, HEALTH)
+    assert result.restarted.tolist() == [False, False, False, True, False]
+    x = result.trajectory.T_world_sensor[:, 0, 3]
+    np.testing.assert_allclose(x, [0.0, 0.1, 0.2, 0.5, 0.6])
+    (restart,) = [event for event in box.events if event[0] == "start"][1:]
+    np.testing.assert_allclose(restart[2:], [0.5, 0.3])
+
+
+def test_a_frozen_pose_starts_anew():
+    box = Scripted([0.1, 0.1] + [0.0] * 6 + [0.1])
+    check = HEALTH.model_copy(update={"max_freeze": 0.45})
+    result = replay(scans(0.1 * np.arange(9)), box, check)
+    assert np.flatnonzero(result.restarted).tolist() == [7]
+    np.testing.assert_allclose(result.trajectory.T_world_sensor[7, 0, 3], 0.3)
+
+
+def test_a_robot_that_comes_to_a_stand_has_not_frozen():
+    box = Scripted([0.1, 0.08, 0.06, 0.04, 0.02] + [0.0] * 40)
+    result = replay(scans(0.1 * np.arange(40)), box, HEALTH)
+    assert not result.restarted.any()
+    box = Scripted([0.0] * 40)
+    assert not replay(scans(0.1 * np.arange(40)), box, HEALTH).restarted.any()
+
+
 def test_poor_scans_are_counted(tmp_path):
     box = Scripted([0.1, None, 0.1])
     result = replay(scans(np.arange(5) / 10), box, HEALTH)

@@ -45,6 +45,30 @@ def test_turning(degrees, healthy):
     assert check.healthy(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees)) is healthy
 
 
+def moved(x, degrees=0.0):
+    T = np.eye(4)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    T[:2, :2] = [[c, -s], [s, c]]
+    T[0, 3] = x
+    return T
+
+
+@pytest.mark.parametrize(
+    ("T", "still"),
+    [(moved(0), True), (moved(5e-7), True), (moved(1e-4), False), (moved(0, 0.001), False)],
+)
+def test_standing_still_is_to_the_micrometre(T, still):
+    assert CHECK.still(T) is still
+
+
+@pytest.mark.parametrize(
+    ("seconds", "speed", "frozen"),
+    [(0.9, 5.0, False), (1.1, 5.0, True), (1.1, 0.4, False), (100.0, 0.0, False)],
+)
+def test_who_stops_dead_has_frozen(seconds, speed, frozen):
+    assert CHECK.frozen(seconds, speed) is frozen
+
+
 def test_a_vehicle_in_a_town_is_healthy():
     check = HealthCheck()
     assert check.healthy(np.array([16.7, 0.2, 0.0]), np.array([16.2, 0.0, 0.1]), 0.1)
