@@ -1,6 +1,7 @@
 """The odometries by name, imported when they are asked for."""
 
 from importlib import metadata
+from typing import Any
 
 from adaptune import plugins
 from adaptune.odometry.base import Odometry, OdometryError
@@ -27,7 +28,7 @@ _PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgi
 """Packages that odometries of ours run on, where their module is not named as those are."""
 
 
-def versions(box: type[Odometry]) -> dict[str, str]:
+def versions(box: type[Any]) -> dict[str, str]:
     """Versions of what a trial's outcome may depend on: adaptune, numpy, the odometry's package."""
     names = {"adaptune", "numpy"}
     package, _, module = box.__module__.rpartition(".")
