@@ -218,7 +218,9 @@ class Cluster:
             for scans in _chunks(sequence):
                 stamps += [scan.stamp for scan in scans]
                 self._client.run(_append, digest, scans, workers=[worker])
-            motion = _pack(sequence, np.array(stamps, np.int64), imu=self._study.box.needs_imu)
+            motion = _pack(
+                sequence, np.array(stamps, np.int64), imu=self._study.described.needs_imu
+            )
             if self._client.run(_end, digest, motion, workers=[worker])[worker]:
                 return
             problem = "its log tells why"
@@ -314,7 +316,7 @@ class AwayStudy(Study):
         if entry is None:
             raise LackingError(name)
         sent: Any = _Sent(entry)
-        return WithImu(sent) if self.box.needs_imu else sent
+        return WithImu(sent) if self.described.needs_imu else sent
 
 
 class _Sent:
