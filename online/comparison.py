@@ -127,10 +127,10 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
         return study.odometry(fixed if mode == "fixed" else None, name), None
     switching = study.config.online.switching
     if study.mechanism == "live":
-        return study.odometry(fixed), adaptive(model, mode)
+        return study.odometry(fixed), adaptive(model, mode, study.price())
     if study.mechanism == "hand_over":
         box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
-        return box, adaptive(model, mode)
+        return box, adaptive(model, mode, study.price())
     members, sets = bank_sets(study, model)
     select = adaptive(restrict(model, members), mode)
 
@@ -224,13 +224,15 @@ def _setting(study: Study, name: str) -> dict[str, Any]:
 
 
 def _switching(study: Study) -> dict[str, Any]:
-    """The mechanism and those of its settings that it heeds."""
+    """The mechanism, those of its settings that it heeds, and its price."""
     heeded = {"live": set[str](), "hand_over": {"beside"}, "bank": {"size", "sets"}}
     settings = study.config.online.switching.model_dump(
         mode="json", include=heeded[study.mechanism]
     )
     if study.mechanism != "live":
         settings["warm_up"] = study.warm_up._asdict()
+    if study.mechanism != "bank":
+        settings["price"] = study.price()
     return {"mechanism": study.mechanism} | settings
 
 
