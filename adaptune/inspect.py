@@ -370,6 +370,8 @@ def _entry(path: Path, given: dict[str, Any], reference: Trajectory | None) -> s
     text = yaml.dump({"sequences": {name or "recording": entry}})
     if reference is None and "reference" not in entry:
         text += "    # reference: its poses - a topic, or a TUM, KITTI or EuRoC file\n"
+    if "points" in entry and "stamp" not in entry:
+        text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
     return text
 
 
