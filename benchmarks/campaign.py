@@ -185,7 +185,7 @@ def fill(study: Study) -> None:
     campaign.Workers = Drawn  # type: ignore[assignment,misc]
     at = [100, 300, 1000, 3000, 10_000, 30_000]
 
-    def tell(what: str, done: int, _total: int) -> None:
+    def tell(what: str, done: int, *_: object) -> None:
         if what == "trials" and at and done >= at[0]:
             at.pop(0)
             print(f"{done:6d} trials: driver {_memory():6.1f} MB", flush=True)
