@@ -21,6 +21,7 @@ BOXES = {
     "loam": "adaptune.odometry.evalio:Loam",
     "mad_icp": "adaptune.odometry.evalio:MadIcp",
     "ndt": "adaptune.odometry.ndt:KeyframeNdt",
+    "rko_lio": "adaptune.odometry.rko_lio:RkoLio",
     "vgicp": "adaptune.odometry.vgicp:KeyframeVgicp",
 }
 

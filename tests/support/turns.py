@@ -1,16 +1,19 @@
 """Turns of a spinning LiDAR that drives straight ahead through a street of columns."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.sequence import Scan
+from adaptune.sequence import Imu, Scan
 
 STEP = 0.4
 """Metres that the sensor moves along x between scans, and during one."""
 PERIOD = 0.1
 ROWS, COLUMNS = 32, 450
+GRAVITY = 9.80665
+T_SENSOR_IMU = np.array([[0.0, 1, 0, 0.3], [-1, 0, 0, -0.2], [0, 0, 1, 0.1], [0, 0, 0, 1]])
 
 
 @cache
@@ -38,6 +41,14 @@ def turn(i: int, rows: int = ROWS, columns: int = COLUMNS) -> Scan:
         np.broadcast_to(PERIOD * share, hit.shape)[hit].astype(np.float32),
         ring.astype(np.uint16),
     )
+
+
+def measured(i: int, rows: int = 16, columns: int = 300) -> Scan:
+    """Scan `i`, with what an IMU measured that lies turned beside the LiDAR."""
+    stamps = np.arange(i * 10**8 + (0 if i == 0 else 10**7), (i + 1) * 10**8 + 1, 10**7)
+    noise = np.random.default_rng(i).normal(0.0, 1e-3, (2, len(stamps), 3))
+    imu = Imu(stamps, noise[0], noise[1] + [0.0, 0.0, GRAVITY], T_SENSOR_IMU)
+    return replace(turn(i, rows, columns), imu=imu)
 
 
 def cast(x: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:

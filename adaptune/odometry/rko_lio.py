@@ -1,0 +1,222 @@
+"""RKO-LIO, through the bindings of its Python package.
+
+Its own Python class converts stamps one numpy scalar at a time, so the bindings beneath it are
+called: hence the pinned version.
+"""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from adaptune.geometry import Poses, invert, rectify
+from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
+from adaptune.sequence import Imu, Scan
+from adaptune.space import Float, ParameterSet, ParameterSpace
+
+MIN_POINTS = 20
+
+_LATER = 10**9
+"""Nanoseconds added to all stamps: at time 0 it believes that nothing has come yet."""
+
+
+class Settings(BaseSettings):
+    """Settings of RKO-LIO.
+
+    Attributes
+    ----------
+    min_range, max_range : float
+        Metres.
+    deskew : bool
+        Take the motion out of scans whose points have times.
+    double_downsample : bool
+        Register fewer points than the map receives; sparse LiDARs may do better without.
+    """
+
+    min_range: float = Field(1.0, ge=0)
+    max_range: float = Field(100.0, gt=0)
+    deskew: bool = True
+    double_downsample: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A scan in its types.
+
+    Attributes
+    ----------
+    points : ndarray of shape (n, 3)
+        float64 metres.
+    stamps : list of int
+        Nanoseconds, of every point.
+    begin, end : int
+        Nanoseconds, of the first and the last one.
+    usable : bool
+        Whether enough points are in range.
+    imu : Imu
+    """
+
+    points: NDArray[np.float64]
+    stamps: list[int]
+    begin: int
+    end: int
+    usable: bool
+    imu: Imu
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, in bytes; a whole number takes 32 and its place in the list 8."""
+        return 256 + self.points.nbytes + 40 * len(self.stamps) + self.imu.nbytes
+
+
+@cache
+def _bindings() -> Any:
+    try:
+        from rko_lio import rko_lio_pybind
+    except ImportError as error:
+        raise OdometryError(
+            f"RKO-LIO cannot be imported ({error}); run `pip install 'adaptune[rko_lio]'`"
+        ) from error
+    return rko_lio_pybind
+
+
+with contextlib.suppress(OdometryError):
+    # Processes that are forked from one that has this module find it loaded.
+    _bindings()
+
+
+class RkoLio(Odometry):
+    """RKO-LIO (Malladi et al., RA-L 2026).
+
+    It reads its parameters when it begins, and begins at rest. It takes its first frame for level:
+    here that frame is turned so that the mean of the first accelerations points up. Its pose is
+    that of a scan's end.
+    """
+
+    space = ParameterSpace(
+        {
+            "voxel_size": Float(low=0.1, high=3.0, baseline=1.0, log=True),
+            "max_correspondence_distance": Float(low=0.1, high=3.0, baseline=0.5, log=True),
+            "max_expected_jerk": Float(low=0.3, high=30.0, baseline=3.0, log=True),
+            "min_beta": Float(low=10.0, high=5000.0, baseline=200.0, log=True),
+        }
+    )
+    settings_type: ClassVar[type[BaseSettings]] = Settings
+    live = False
+    needs_imu = True
+
+    def __init__(
+        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
+    ):
+        super().__init__(parameters, settings)
+        _bindings()
+
+    def prepare(self, scan: Scan) -> Prepared:
+        """See `Odometry.prepare`."""
+        if scan.imu is None:
+            raise OdometryError(
+                "rko_lio needs an IMU, and the scans do not bring along what one measured"
+            )
+        points = scan.points.astype(np.float64)
+        squared = np.einsum("ij,ij->i", points, points)
+        near, far = self.settings.min_range, self.settings.max_range
+        n_in_range = np.count_nonzero((squared > near**2) & (squared < far**2))
+        stamps = np.full(len(scan), scan.stamp + _LATER, np.int64)
+        if scan.times is not None:
+            stamps += (scan.times.astype(np.float64) * 1e9).astype(np.int64)
+        begin = end = scan.stamp + _LATER
+        if len(scan):
+            begin, end = int(stamps.min()), int(stamps.max())
+        usable = bool(n_in_range >= MIN_POINTS)
+        return Prepared(points, stamps.tolist(), begin, end, usable, scan.imu)
+
+    def start(
+        self,
+        prepared: Prepared,
+        T_odom_sensor: Poses,
+        T_previous_current: Poses | None = None,
+    ) -> None:
+        """See `Odometry.start`."""
+        self._T_odom_sensor = T_odom_sensor
+        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
+        self._lio: Any = None
+        if prepared.usable:
+            self._begin(prepared)
+
+    def _begin(self, prepared: Prepared) -> None:
+        """Make a new one, whose own frame is the level one of its first scan."""
+        bindings = _bindings()
+        config = bindings._LIOConfig()
+        for name, value in self.parameters.items():
+            setattr(config, name, float(value))
+        config.min_range, config.max_range = self.settings.min_range, self.settings.max_range
+        config.double_downsample = self.settings.double_downsample
+        config.deskew = self.settings.deskew and prepared.end > prepared.begin
+        config.max_num_threads = 1
+        self._lio = bindings._LIO(config)
+        T_sensor_imu = prepared.imu.T_sensor_imu
+        self._T_base_sensor = np.eye(4)
+        if len(prepared.imu):
+            up = T_sensor_imu[:3, :3] @ prepared.imu.acceleration.mean(axis=0)
+            self._T_base_sensor[:3, :3] = _levelling(up)
+        self._T_base_imu = self._T_base_sensor @ T_sensor_imu
+        self._early: Sequence[tuple[int, Any, Any]] = ()
+        self._add(prepared)
+        self._T_odom_own = self._T_odom_sensor @ invert(self._lio.pose() @ self._T_base_sensor)
+
+    def register(self, prepared: Prepared) -> Registration:
+        """See `Odometry.register`."""
+        T_odom_previous = self._T_odom_sensor
+        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
+        if self._lio is None:
+            if not prepared.usable:
+                return Registration(self._T_odom_sensor, registered=False)
+            self._begin(prepared)
+            return Registration(self._T_odom_sensor)
+        if not self._add(prepared):
+            return Registration(self._T_odom_sensor, registered=False)
+        self._T_odom_sensor = self._T_odom_own @ self._lio.pose() @ self._T_base_sensor
+        self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
+        return Registration(self._T_odom_sensor)
+
+    def _add(self, prepared: Prepared) -> bool:
+        """Hand over a scan and what was measured before its end, and tell whether it was used."""
+        imu = prepared.imu
+        measured = [
+            *self._early,
+            *zip(
+                (imu.stamps + _LATER).tolist(), imu.acceleration, imu.angular_velocity, strict=True
+            ),
+        ]
+        # A measurement after the scan's end is of the motion to the next one.
+        self._early = [one for one in measured if one[0] >= prepared.end]
+        for stamp, acceleration, gyro in measured[: len(measured) - len(self._early)]:
+            self._lio.add_imu_measurement(self._T_base_imu, acceleration, gyro, stamp)
+        if not prepared.usable:
+            return False
+        bindings = _bindings()
+        try:
+            self._lio.register_scan(
+                self._T_base_sensor,
+                bindings._Vector3sVector(prepared.points),
+                bindings._VectorInt64(prepared.stamps),
+                prepared.begin,
+                prepared.end,
+            )
+        except (bindings.InputError, bindings.RegistrationError):
+            return False
+        return True
+
+
+def _levelling(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The smallest rotation that takes a direction of shape (3,) to +z."""
+    if not np.linalg.norm(up) > 0:
+        return np.eye(3)
+    R: NDArray[np.float64] = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
+    return R
