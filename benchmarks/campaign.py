@@ -40,7 +40,7 @@ from offline.workers import Result, Task
 
 STUDY = """\
 odometry: {{name: gicp, settings: {{downsampling: 0.5}}}}
-courses: {{cave: {{scenes: [{{cave: {{length: {length:.0f}}}}}], sensor: hdl32e, seed: 1}}}}
+courses: {{cave: {{scenes: [cave], length: {length:.0f}, sensor: hdl32e, seed: 1}}}}
 training: [cave]
 offline: {{sampler: sobol, trials: {trials}}}
 """
@@ -101,7 +101,7 @@ def speed(trials: int, scans: int) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         file = folder / "cave.yaml"
-        file.write_text(STUDY.format(trials=trials, length=0.1 * scans * 3.0))
+        file.write_text(STUDY.format(trials=trials, length=0.1 * scans))
         for n in (1, 2):
             study = load_study(file, [f"offline.workers={n}"], folder / f"{n}")
             study.recording("cave").parent.mkdir(parents=True)

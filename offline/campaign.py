@@ -1,6 +1,7 @@
 """The offline stage: run trials batch by batch, then fit the error model."""
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -376,13 +377,22 @@ def _tasks(
     first: int,
     n_workers: int,
 ) -> list[Task]:
-    """Share every sequence's trials between the workers; reading it again is a task of its own."""
-    return [Task(name, (), (), frames=True) for name in unframed if not missing.get(name)] + [
-        Task(name, tuple(some), tuple(sets[n - first] for n in some), frames=name in unframed)
-        for name, numbers in missing.items()
-        for share in range(n_workers)
-        if (some := numbers[share::n_workers])
-    ]
+    """Share every sequence's trials between the workers; reading it again is a task of its own.
+
+    Those of the last one are shared in ever smaller pieces, so that all workers end together.
+    """
+    tasks = [Task(name, (), (), frames=True) for name in unframed if not missing.get(name)]
+    for last, (name, numbers) in enumerate(missing.items(), 1 - len(missing)):
+        left = numbers
+        while left:
+            size = math.ceil(len(left) / n_workers / (1 if last else 2))
+            tasks += [
+                Task(name, tuple(n), tuple(sets[i - first] for i in n), frames=name in unframed)
+                for share in range(n_workers)
+                if (n := left[share * size : (share + 1) * size])
+            ]
+            left = left[n_workers * size :]
+    return tasks
 
 
 def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[tuple[Task, int]]:
