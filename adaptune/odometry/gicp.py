@@ -29,6 +29,7 @@ class Settings(BaseSettings):
 class Prepared:
     """A downsampled cloud with its covariances and its search tree."""
 
+    stamp: int
     cloud: Any
     tree: Any
 
@@ -75,11 +76,11 @@ def prepare(scan: Scan, settings: Settings) -> Prepared:
     """Crop and downsample a scan, and estimate its covariances."""
     points = crop(scan, settings.min_range)
     if len(points) < MIN_POINTS:
-        return Prepared(small_gicp.PointCloud(points), None)
+        return Prepared(scan.stamp, small_gicp.PointCloud(points), None)
     cloud, tree = small_gicp.preprocess_points(
         points, downsampling_resolution=settings.downsampling, num_threads=1
     )
-    return Prepared(cloud, tree)
+    return Prepared(scan.stamp, cloud, tree)
 
 
 def crop(scan: Scan, min_range: float) -> Any:

@@ -5,8 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, invert, rectify, scale
 from adaptune.odometry.base import Odometry, Registration
+
+JITTER = 0.1
+"""Share by which the time between two scans may differ from that before and count as the same: a
+LiDAR turns more steadily than its stamps tell, and a missing scan makes it twice as long."""
 
 
 class Alignment(NamedTuple):
@@ -20,7 +24,9 @@ class KeyframeOdometry(Odometry):
     """Scan-to-keyframe odometry with a constant-velocity prediction.
 
     A scan becomes the new keyframe when it lies `keyframe_interval` metres or more from the old
-    one. After Koide et al., IROS 2021.
+    one. Where scans are missing, the last motion is predicted to go on for as long as it took the
+    next one to come; for that, what `prepare` returns has a `stamp` in nanoseconds. After Koide et
+    al., IROS 2021.
     """
 
     live = True
@@ -30,14 +36,20 @@ class KeyframeOdometry(Odometry):
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         """See `Odometry.start`."""
+        self._begin_keyframe(prepared, T_odom_sensor)
+        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
+        # What is given goes on for one scan, whatever time it was of.
+        self._stamp, self._duration = prepared.stamp, 0
+
+    def _begin_keyframe(self, prepared: Any, T_odom_sensor: Poses) -> None:
         self._keyframe = prepared
         self._T_odom_keyframe = T_odom_sensor
         self._T_keyframe_sensor = np.eye(4)
-        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
 
     def register(self, prepared: Any) -> Registration:
         """See `Odometry.register`."""
-        T_keyframe_guess = self._T_keyframe_sensor @ self._T_previous_current
+        elapsed, self._stamp = prepared.stamp - self._stamp, prepared.stamp
+        T_keyframe_guess = self._T_keyframe_sensor @ self._predict(elapsed)
         if not self.usable(prepared):
             self._T_keyframe_sensor = T_keyframe_guess
             return Registration(self._T_odom_keyframe @ T_keyframe_guess, registered=False)
@@ -47,6 +59,7 @@ class KeyframeOdometry(Odometry):
         if ok and np.isfinite(T_target_source).all():
             T_keyframe_sensor = rectify(T_target_source)
             self._T_previous_current = invert(self._T_keyframe_sensor) @ T_keyframe_sensor
+            self._duration = elapsed
         else:
             T_keyframe_sensor, ok = T_keyframe_guess, False
         self._T_keyframe_sensor = T_keyframe_sensor
@@ -54,8 +67,15 @@ class KeyframeOdometry(Odometry):
         # What cannot be matched to the keyframe now will not be later, from further away.
         interval = self.parameters["keyframe_interval"]
         if not ok or np.linalg.norm(T_keyframe_sensor[:3, 3]) >= interval:
-            self.start(prepared, T_odom_sensor, self._T_previous_current)
+            self._begin_keyframe(prepared, T_odom_sensor)
         return Registration(T_odom_sensor, ok)
+
+    def _predict(self, elapsed: int) -> Poses:
+        """The motion of so many nanoseconds, at the velocity of the last one."""
+        if self._duration <= 0 or elapsed <= 0:
+            return self._T_previous_current
+        share = elapsed / self._duration
+        return scale(self._T_previous_current, 1.0 if abs(share - 1.0) <= JITTER else share)
 
     @abstractmethod
     def usable(self, prepared: Any) -> bool:

@@ -28,6 +28,7 @@ class Settings(BaseSettings):
 class Prepared:
     """A downsampled cloud."""
 
+    stamp: int
     cloud: Any
     size: int
 
@@ -54,7 +55,7 @@ class KeyframeNdt(KeyframeOdometry):
         o3d = open3d.load()
         points = o3d.utility.Vector3dVector(crop(scan, self.settings.min_range))
         cloud = o3d.geometry.PointCloud(points).voxel_down_sample(self.settings.downsampling)
-        return Prepared(cloud, len(cloud.points))
+        return Prepared(scan.stamp, cloud, len(cloud.points))
 
     def usable(self, prepared: Prepared) -> bool:
         """See `KeyframeOdometry.usable`."""
