@@ -1,12 +1,13 @@
 """What selection gains on simulated sequences that were left out.
 
     python benchmarks/gain.py runs/gain --seeds 1 2 3    # hours on one core; resumes
-    python benchmarks/gain.py runs/gain --seeds 1 --odometries gicp
+    python benchmarks/gain.py runs/gain --seeds 1 --odometries gicp --length 60
 
-Each seed is another world: 16 sequences (3 caves, 3 streets, 3 open, 3 gardens, 4 mixed) on which
-keyframe GICP and NDT run the same parameter sets. One sequence after the other is left out, and
-the fixed set, the rules and their settings are fitted on the other 15. What is printed are ratios
-to the fixed set's error. No setting was chosen on seeds other than 0.
+Each seed is another world: 16 sequences (3 caves, 3 streets, 3 open, 3 gardens, of 150 m each, and
+4 mixed ones of three scenes, each 0.4 times as long) on which keyframe GICP and NDT run the same
+parameter sets. One sequence after the other is left out, and the fixed set, the rules and their
+settings are fitted on the other 15. What is printed are ratios to the fixed set's error. No setting
+was chosen on seeds other than 0.
 """
 
 import argparse
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.archive import Frames
 from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
@@ -31,10 +33,10 @@ N_SETS = 28
 KINDS = ("cave", "street", "open", "garden")
 
 
-def training_courses(seed: int) -> dict[str, Course]:
+def training_courses(seed: int, length: float) -> dict[str, Course]:
     """Sixteen courses by name; no world is shared with another seed's."""
     single = {
-        f"{kind}{i}": Course(scenes=(kind,), length=60.0, seed=1000 * seed + 10 * k + i)
+        f"{kind}{i}": Course(scenes=(kind,), length=length, seed=1000 * seed + 10 * k + i)
         for k, kind in enumerate(KINDS)
         for i in range(3)
     }
@@ -45,7 +47,7 @@ def training_courses(seed: int) -> dict[str, Course]:
         ("garden", "street", "open"),
     )
     mixed = {
-        f"mixed{i}": Course(scenes=scenes, length=35.0, seed=1000 * seed + 100 + i)
+        f"mixed{i}": Course(scenes=scenes, length=0.4 * length, seed=1000 * seed + 100 + i)
         for i, scenes in enumerate(orders)
     }
     return single | mixed
@@ -60,8 +62,8 @@ def study_of(odometry: str) -> Study:
 class Prepared:
     """What `run_trials` passes over."""
 
-    def __init__(self, prepared: list[Any], frames: Frames):
-        self._prepared, self.frames = prepared, frames
+    def __init__(self, name: str, prepared: list[Any], frames: Frames):
+        self.name, self._prepared, self.frames = name, prepared, frames
 
     def __iter__(self) -> Any:
         return iter(self._prepared)
@@ -82,7 +84,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     )
     sets = make_sampler(study.space, offline).propose([])
     box = study.odometry()
-    sequence: Any = Prepared([box.prepare(scan) for scan in scans], frames)
+    sequence: Any = Prepared(path.stem, [box.prepare(scan) for scan in scans], frames)
     errors = [trial.errors for trial in run_trials(study, sequence, sets)]
     with replacing(path) as beside, beside.open("wb") as file:
         np.savez_compressed(
@@ -95,10 +97,12 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
         )
 
 
-def trials(folder: Path, odometry: str, seed: int) -> None:
-    """Run what has not been run yet."""
-    for name, course in training_courses(seed).items():
-        path = folder / f"{odometry}-{seed}-{name}.npz"
+def trials(folder: Path, odometry: str, courses: dict[str, Course], seed: int) -> list[Path]:
+    """Run what has not been run yet, and tell where it is."""
+    paths = []
+    for name, course in courses.items():
+        path = folder / f"{odometry}-{seed}-{course.length:.0f}-{name}.npz"
+        paths.append(path)
         if not path.exists():
             run(path, course, odometry, seed)
         with np.load(path) as found:
@@ -109,22 +113,27 @@ def trials(folder: Path, odometry: str, seed: int) -> None:
                 f"best {means.min():6.3f}  median {np.median(means):6.3f} %",
                 flush=True,
             )
+    return paths
 
 
-def validate(folder: Path, odometry: str, seed: int) -> None:
-    """Leave each sequence out in turn, and print what came of it."""
-    sequences, sets = [], np.empty(0)
-    for name in training_courses(seed):
-        with np.load(folder / f"{odometry}-{seed}-{name}.npz") as found:
-            labelled = ~np.isnan(found["errors"]).any(axis=1)
-            seconds = (found["stamps"] - found["stamps"][0])[labelled] // 10**9
-            descriptors = found["histograms"][labelled].astype(np.float32)
+def labelled(paths: list[Path]) -> tuple[list[LabelledSequence], NDArray[np.float64]]:
+    """What was recorded, and the parameter sets in the unit cube."""
+    sequences = []
+    for path in paths:
+        with np.load(path) as found:
+            known = ~np.isnan(found["errors"]).any(axis=1)
+            seconds = (found["stamps"] - found["stamps"][0])[known] // 10**9
+            descriptors = found["histograms"][known].astype(np.float32)
+            name = path.stem.rsplit("-", 1)[1]
+            sequences.append(LabelledSequence(name, seconds, descriptors, found["errors"][known]))
             sets = found["sets"]
-            sequences.append(
-                LabelledSequence(name, seconds, descriptors, found["errors"][labelled])
-            )
-    validation = leave_one_out(sequences, sets)
-    print(f"\n{odometry}, seed {seed}: geometric, arithmetic, worst ratio to the fixed set's error")
+    return sequences, sets
+
+
+def validate(paths: list[Path]) -> None:
+    """Leave each sequence out in turn, and print what came of it."""
+    validation = leave_one_out(*labelled(paths))
+    print("geometric, arithmetic, worst ratio to the fixed set's error")
     for mode in validation.ratios:
         s = validation.summary(mode)
         print(
@@ -142,14 +151,15 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--length", type=float, default=150.0, help="metres of a course")
     parser.add_argument("--odometries", nargs="+", default=ODOMETRIES, choices=ODOMETRIES)
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     # Open3D's NDT differs in its last bits from run to run on more than one core.
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
     for seed, odometry in itertools.product(arguments.seeds, arguments.odometries):
-        trials(arguments.folder, odometry, seed)
-        validate(arguments.folder, odometry, seed)
+        courses = training_courses(seed, arguments.length)
+        validate(trials(arguments.folder, odometry, courses, seed))
 
 
 if __name__ == "__main__":

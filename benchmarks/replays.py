@@ -1,0 +1,150 @@
+"""What selection gains where it really drives: courses that no rule has seen.
+
+    python benchmarks/replays.py runs/gain --seed 1    # after benchmarks/gain.py --seeds 1
+
+Rules are fitted on the 16 sequences of `benchmarks/gain.py`, and eight mixed courses of other
+worlds are replayed with keyframe GICP, each with the health check. Printed are the mean of
+min(RTE, 30 %) over 25 m, in brackets how often the odometry was started anew, and ratios to the
+fixed set's error. The rivals: the defaults; the set that is fixed by the geometric mean of the
+training sequences' errors; a bank that nobody asks for a set, which takes the fixed set's motion
+where another confirms it, and else the medoid of all.
+"""
+
+import argparse
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from gain import labelled, study_of, training_courses, trials
+
+from adaptune.descriptor import ScaledPCA
+from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.metrics import cap, sub_trajectory_rte
+from adaptune.model import RULES, Rule, Selection, Settings, TrainingData
+from adaptune.model.base import complementary
+from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
+from adaptune.sequence import Scan
+from adaptune.simulation import Course, simulate
+from adaptune.space import ParameterSet
+from offline.validation import training_data, tune
+from online.replay import Policy, replay
+
+ORDERS = (
+    ("cave", "open", "street"),
+    ("street", "cave", "open"),
+    ("open", "street", "cave"),
+    ("cave", "street", "open"),
+    ("street", "garden", "cave"),
+    ("garden", "cave", "open"),
+    ("open", "garden", "street"),
+    ("garden", "open", "cave"),
+)
+LENGTH, WINDOW = 60.0, 25.0
+
+
+def asking(rule: Rule, pca: ScaledPCA, members: Sequence[int]) -> Policy:
+    """A policy that asks a rule, whose sets go by these numbers."""
+    current: int | None = None
+
+    def select(scan: Scan) -> Selection:
+        nonlocal current
+        histogram = ndt_histogram(scan.points)[None].astype(np.float32)
+        selection = rule.select(pca.transform(histogram)[0], current)
+        current = selection.set_index
+        return selection._replace(set_index=members[current])
+
+    return select
+
+
+def geometric(data: TrainingData) -> int:
+    """The set with the least geometric mean of the sequences' errors."""
+    of = [cap(data.errors[data.sequence == s]).mean(axis=0) for s in np.unique(data.sequence)]
+    return int(np.argmin(np.log(np.array(of) + 0.02).mean(axis=0)))
+
+
+Way = tuple[Callable[[], Box], Policy | None]
+"""What is driven, and what chooses its parameters."""
+
+
+def ways(paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
+    """The sets that were tried, and all ways to drive, by name."""
+    sequences, units = labelled(paths)
+    data, pca = training_data(sequences, units)
+    settings = tune(sequences, units)
+    print(f"settings of the paired rule: {settings}")
+    study = study_of("gicp")
+    sets = study.space.from_unit(units)
+    everything = range(len(units))
+
+    def alone(number: int | None) -> Way:
+        return lambda: study.odometry(None if number is None else sets[number]), None
+
+    def live(name: str) -> Way:
+        rule = RULES[name](settings, 0.0).fit(data)
+        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca, everything)
+
+    def bank(size: int, asked: bool) -> Way:
+        members = complementary(data.errors, data.sequence, data.fixed, size)
+        few = TrainingData(data.features, data.sequence, data.errors[:, members], units[members], 0)
+        rule = RULES["paired"](Settings(n_sets=None, sharpness=settings.sharpness), 0.0).fit(few)
+        its = [sets[i] for i in members]
+        return (
+            lambda: Bank(study.odometry, its, WarmUp()),
+            asking(rule, pca, members) if asked else None,
+        )
+
+    return sets, {
+        "baseline": alone(None),
+        "fixed": alone(data.fixed),
+        "fixed, geometric": alone(geometric(data)),
+        "paper": live("paper"),
+        "paired": live("paired"),
+        "bank of 2": bank(2, True),
+        "bank of 3": bank(3, True),
+        "bank of 4": bank(4, True),
+        "medoid of 3": bank(3, False),
+        "medoid of 4": bank(4, False),
+    }
+
+
+def main() -> None:
+    """Drive all courses in all ways."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--length", type=float, default=150.0, help="of the training courses")
+    arguments = parser.parse_args()
+    os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
+    courses = training_courses(arguments.seed, arguments.length)
+    sets, driven = ways(trials(arguments.folder, "gicp", courses, arguments.seed))
+    print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in driven))
+    means: list[list[float]] = []
+    for i, scenes in enumerate(ORDERS):
+        course = Course(scenes=scenes, length=LENGTH, seed=1000 * arguments.seed + 500 + i)
+        scans = list(simulate(course))
+        T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
+        means.append([])
+        row = f"{' '.join(scenes):32}"
+        for make, policy in driven.values():
+            result = replay(scans, make(), HealthCheck(), policy, sets)
+            errors = sub_trajectory_rte(T_world_sensor, result.trajectory.T_world_sensor, WINDOW)
+            means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
+            row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
+        print(row, flush=True)
+    table = np.array(means)
+    ratio = table / table[:, [list(driven).index("fixed")]]
+    for what, values in (
+        ("arithmetic mean", table.mean(axis=0)),
+        ("geometric mean", np.exp(np.log(table).mean(axis=0))),
+        ("ratio of arithmetic means", table.mean(axis=0) / table.mean(axis=0)[1]),
+        ("geometric mean ratio", np.exp(np.log(ratio).mean(axis=0))),
+        ("worst ratio", ratio.max(axis=0)),
+    ):
+        print(f"{what:32}" + "".join(f"{value:12.3f}      " for value in values))
+
+
+if __name__ == "__main__":
+    main()
