@@ -70,6 +70,9 @@ class Trial:
     repeats : tuple of dict
         Where the trial was run several times, RTE and metrics of every run. Poses are then the
         first run's, and errors the mean of the capped ones of all.
+    unhealthy : dict
+        What the health check would have said, and how often, see
+        `adaptune.odometry.health.Guard.check`; of the first run.
     """
 
     parameters: ParameterSet
@@ -82,6 +85,7 @@ class Trial:
     metrics: dict[str, float] = field(default_factory=dict)
     usage: dict[str, float] = field(default_factory=dict)
     repeats: tuple[dict[str, float], ...] = ()
+    unhealthy: dict[str, int] = field(default_factory=dict)
 
     @property
     def mean_error(self) -> float:
@@ -108,6 +112,8 @@ class Summary:
         Other metrics by name.
     repeats : sequence of dict
         See `Trial`.
+    unhealthy : dict
+        See `Trial`.
     """
 
     parameters: ParameterSet
@@ -117,6 +123,7 @@ class Summary:
     ms: float
     others: dict[str, float] = field(default_factory=dict)
     repeats: Sequence[dict[str, float]] = ()
+    unhealthy: dict[str, int] = field(default_factory=dict)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -136,6 +143,7 @@ def summarise(trial: Trial) -> Summary:
         float(1e3 * seconds.mean(dtype=np.float64)) if len(seconds) else 0.0,
         trial.metrics | trial.usage,
         list(trial.repeats),
+        trial.unhealthy,
     )
 
 
@@ -293,6 +301,7 @@ class Archive:
                 metrics=np.frombuffer(json.dumps(trial.metrics).encode(), np.uint8),
                 usage=np.frombuffer(json.dumps(trial.usage).encode(), np.uint8),
                 repeats=np.frombuffer(json.dumps(trial.repeats).encode(), np.uint8),
+                unhealthy=np.frombuffer(json.dumps(trial.unhealthy).encode(), np.uint8),
             )
         if whole:
             return
@@ -324,6 +333,8 @@ class Archive:
                 json.loads(data["metrics"].tobytes()),
                 json.loads(data["usage"].tobytes()),
                 tuple(json.loads(data["repeats"].tobytes())),
+                # Older files do not tell.
+                json.loads(data["unhealthy"].tobytes()) if "unhealthy" in data else {},
             )
         except (KeyError, ValueError) as error:
             raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error

@@ -301,8 +301,8 @@ def trials(
     """List the study's finished trials, also while it runs.
 
     Columns are the trial's number, its parameters, its mean RTE in percent over all training
-    sequences and on each of them, how often it lost track, how often its process ended, and its
-    other metrics.
+    sequences and on each of them, how often it lost track, how often its process ended, how often
+    the health check would have spoken, and its other metrics.
     """
     from adaptune import report
     from adaptune import trials as table

@@ -45,8 +45,9 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     -------
     list of dict
         Number, parameters, mean error in percent (None before the trial is finished on all
-        sequences), the mean on each sequence, how often it lost track and how often its process
-        ended on all of them, and its other metrics.
+        sequences), the mean on each sequence, how often it lost track, how often its process
+        ended and how often the health check would have spoken on all of them, and its other
+        metrics.
     """
     finished = {name: archive.finished(name) for name in names}
     return [
@@ -62,6 +63,7 @@ def _row(number: int, trials: Mapping[str, Summary | None]) -> Row:
     row["mean"] = float(np.mean([trial.mean_error for trial in there])) if whole else None
     row |= {name: trial and trial.mean_error for name, trial in trials.items()}
     row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
+    row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
     metrics = [m for m in there[0].metrics if m != "rte"]
     return row | {m: float(np.mean([t.metrics[m] for t in there])) for m in metrics}
 

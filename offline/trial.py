@@ -13,6 +13,7 @@ from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.odometry import Box, Isolated
 from adaptune.odometry.base import prepared_bytes
+from adaptune.odometry.health import unhealthy
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from offline.objective import trajectory_metrics
@@ -294,6 +295,9 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         if after is not None:
             T = run.T_odom_sensor
             lost_steps[after.begin] = invert(T[after.begin - 1]) @ T[after.begin]
+    T_steps = steps(T_odom_sensor)
+    for i, T_step in lost_steps.items():
+        T_steps[i - 1] = T_step
     duration = (frames.stamps[-1] - frames.stamps[0]) * 1e-9
     isolated = [r.odometry for r in pieces if isinstance(r.odometry, Isolated)]
     usage = {"cpu": 100.0 * cpu / duration}
@@ -309,6 +313,7 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         tuple(fault for run in pieces for fault in getattr(run.odometry, "faults", ())),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
         usage,
+        unhealthy=unhealthy(study.config.health, T_steps, frames.stamps, registered),
     )
 
 
@@ -327,4 +332,5 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         {m: float(np.mean([t.metrics[m] for t in repeats])) for m in repeats[0].metrics},
         {m: float(np.mean([t.usage[m] for t in repeats])) for m in repeats[0].usage},
         tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
+        repeats[0].unhealthy,
     )

@@ -3,7 +3,7 @@
 import csv
 import json
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from adaptune.descriptor import Describer, DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
-from adaptune.geometry import Poses, invert, rotation_angle, scale
+from adaptune.geometry import Poses, invert
 from adaptune.model import RULES, ErrorModel, Selection
 from adaptune.odometry import Box, HealthCheck
+from adaptune.odometry.health import Guard
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory, write_tum
@@ -61,6 +62,8 @@ class Replay:
     choices : list of Choice
     seconds : float
         The whole replay, reading included.
+    unhealthy : dict
+        What the health check said, and how often.
     """
 
     trajectory: Trajectory
@@ -70,6 +73,7 @@ class Replay:
     register_seconds: NDArray[np.float64]
     choices: list[Choice]
     seconds: float
+    unhealthy: dict[str, int]
 
 
 def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
@@ -156,7 +160,7 @@ def replay(
     registered: list[bool] = []
     timings: list[tuple[float, float]] = []
     choices: list[Choice] = []
-    guard = _Guard(health)
+    guard, unhealthy = Guard(health), Counter[str]()
     n_periods = 0
     for scan in scans:
         first = stamps[0] if stamps else scan.stamp
@@ -183,10 +187,12 @@ def replay(
         else:
             T_odom_sensor, ok = odometry.register(prepared)
             elapsed = (scan.stamp - stamps[-1]) * 1e-9
-            T_healthy = guard.check(poses[-1], T_odom_sensor, elapsed)
-            restarted.append(T_healthy is not None)
+            what = guard.check(invert(poses[-1]) @ T_odom_sensor, elapsed, ok)
+            restarted.append(what is not None)
             registered.append(ok)
-            if T_healthy is not None:
+            if what is not None:
+                unhealthy[what] += 1
+                T_healthy = guard.go_on(elapsed)
                 T_odom_sensor = poses[-1] @ T_healthy
                 odometry.start(prepared, T_odom_sensor, T_healthy)
         timings.append((t_register - t_prepare, time.perf_counter() - t_register))
@@ -204,55 +210,8 @@ def replay(
         register_seconds,
         choices,
         time.perf_counter() - begin,
+        dict(unhealthy),
     )
-
-
-class _Guard:
-    """Remembers the last healthy motion, and for how long the pose has stood still since."""
-
-    def __init__(self, health: HealthCheck):
-        self._health = health
-        self._T_previous_current = np.eye(4)
-        self._seconds = 1.0
-        self._velocity: NDArray[np.float64] | None = None
-        self._since = 0.0
-        self._moving: tuple[Poses, float] | None = None
-        self._still = 0.0
-
-    def check(self, T_odom_previous: Poses, T_odom_current: Poses, elapsed: float) -> Poses | None:
-        """The motion to go on with instead, or None if this one is healthy."""
-        self._since += elapsed
-        if not np.isfinite(T_odom_current).all():
-            return self._go_on(elapsed)
-        T_previous_current = invert(T_odom_previous) @ T_odom_current
-        velocity = T_previous_current[:3, 3] / elapsed
-        turn_rate = float(rotation_angle(T_previous_current)) / elapsed
-        if not self._health.healthy(velocity, self._velocity, self._since, turn_rate):
-            return self._go_on(elapsed)
-        if self._frozen(T_previous_current, elapsed):
-            return self._go_on(elapsed)
-        self._T_previous_current, self._seconds = T_previous_current, elapsed
-        self._velocity = velocity
-        self._since = 0.0
-        return None
-
-    def _frozen(self, T_previous_current: Poses, elapsed: float) -> bool:
-        if not self._health.still(T_previous_current):
-            self._moving, self._still = (T_previous_current, elapsed), 0.0
-            return False
-        self._still += elapsed
-        if self._moving is None:
-            return False
-        T, seconds = self._moving
-        if not self._health.frozen(self._still, float(np.linalg.norm(T[:3, 3])) / seconds):
-            return False
-        self._T_previous_current, self._seconds = T, seconds
-        self._velocity, self._still = T[:3, 3] / seconds, 0.0
-        return True
-
-    def _go_on(self, elapsed: float) -> Poses:
-        """The last healthy motion, for as long as this scan has taken to come."""
-        return scale(self._T_previous_current, elapsed / self._seconds)
 
 
 def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None:
@@ -304,6 +263,7 @@ def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None
         "duration_s": round(duration, 3),
         "replay_s": round(result.seconds, 3),
         "restarts": int(result.restarted.sum()),
+        "unhealthy": result.unhealthy,
         "poor_scans": int((~result.registered).sum()),
         "selections": len(result.choices),
         "about": about,

@@ -1,9 +1,12 @@
 """A check of an odometry's poses that needs no reference."""
 
+from collections import Counter
+
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from adaptune.geometry import Poses, rotation_angle
+from adaptune.geometry import Poses, rotation_angle, scale
 
 _STILL = 1e-6
 """Metres and radians by which a pose that stays where it is may move."""
@@ -31,6 +34,8 @@ class HealthCheck(BaseModel):
         half a metre a second. A robot that comes to a stand slows down before, and the noise of
         its scans moves the pose of one that registers them: only an odometry that has given up
         stops dead.
+    max_unregistered : int
+        Scans in a row that the odometry says it could not register.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -39,15 +44,16 @@ class HealthCheck(BaseModel):
     max_acceleration: float = Field(30.0, gt=0)
     max_turn_rate: float = Field(360.0, gt=0)
     max_freeze: float = Field(1.0, gt=0)
+    max_unregistered: int = Field(10, ge=1)
 
-    def healthy(
+    def exceeded(
         self,
         velocity: Poses,
         last_velocity: Poses | None,
         elapsed: float,
         turn_rate: float = 0.0,
-    ) -> bool:
-        """Whether the platform can have moved like this.
+    ) -> str | None:
+        """The bound that the platform would have exceeded to move like this, if any.
 
         Parameters
         ----------
@@ -61,14 +67,14 @@ class HealthCheck(BaseModel):
             Radians a second.
         """
         if not turn_rate <= np.radians(self.max_turn_rate):
-            return False
+            return "max_turn_rate"
         speed = np.linalg.norm(velocity)
         if not np.isfinite(speed) or speed > self.max_speed:
-            return False
+            return "max_speed"
         if last_velocity is None:
-            return True
+            return None
         change = float(np.linalg.norm(velocity - last_velocity))
-        return change <= self.max_acceleration * elapsed
+        return "max_acceleration" if change > self.max_acceleration * elapsed else None
 
     def still(self, T_previous_current: Poses) -> bool:
         """Whether a pose of shape (4, 4) stays where it is, to the micrometre."""
@@ -86,3 +92,104 @@ class HealthCheck(BaseModel):
             Metres a second, of the last step before.
         """
         return speed > _WALK and seconds > self.max_freeze
+
+
+class Guard:
+    """Goes along with a drive: remembers the last healthy motion, and how long none came.
+
+    Parameters
+    ----------
+    check
+        The bounds.
+    """
+
+    def __init__(self, check: HealthCheck):
+        self._health = check
+        self._T_previous_current = np.eye(4)
+        self._seconds = 1.0
+        self._velocity: NDArray[np.float64] | None = None
+        self._since = 0.0
+        self._moving: tuple[Poses, float] | None = None
+        self._still = 0.0
+        self._unregistered = 0
+
+    def check(
+        self, T_previous_current: Poses, elapsed: float, registered: bool = True
+    ) -> str | None:
+        """What is wrong with a motion: `no_pose`, or the name of a bound; None if it is healthy.
+
+        Parameters
+        ----------
+        T_previous_current
+            The motion, of shape (4, 4); not finite where the odometry gave no pose.
+        elapsed
+            Seconds that it took.
+        registered
+            What the odometry says.
+        """
+        self._since += elapsed
+        self._unregistered = 0 if registered else self._unregistered + 1
+        if not np.isfinite(T_previous_current).all():
+            return "no_pose"
+        velocity = T_previous_current[:3, 3] / elapsed
+        turn_rate = float(rotation_angle(T_previous_current)) / elapsed
+        what = self._health.exceeded(velocity, self._velocity, self._since, turn_rate)
+        if what is not None:
+            return what
+        if self._frozen(T_previous_current, elapsed):
+            return "max_freeze"
+        self._T_previous_current, self._seconds = T_previous_current, elapsed
+        self._velocity = velocity
+        self._since = 0.0
+        if self._unregistered >= self._health.max_unregistered:
+            self._unregistered = 0
+            return "max_unregistered"
+        return None
+
+    def _frozen(self, T_previous_current: Poses, elapsed: float) -> bool:
+        if not self._health.still(T_previous_current):
+            self._moving, self._still = (T_previous_current, elapsed), 0.0
+            return False
+        self._still += elapsed
+        if self._moving is None:
+            return False
+        T, seconds = self._moving
+        if not self._health.frozen(self._still, float(np.linalg.norm(T[:3, 3])) / seconds):
+            return False
+        self._T_previous_current, self._seconds = T, seconds
+        self._velocity, self._still = T[:3, 3] / seconds, 0.0
+        return True
+
+    def go_on(self, elapsed: float) -> Poses:
+        """The last healthy motion, for so many seconds."""
+        return scale(self._T_previous_current, elapsed / self._seconds)
+
+
+def unhealthy(
+    check: HealthCheck,
+    T_previous_current: Poses,
+    stamps: NDArray[np.int64],
+    registered: NDArray[np.bool_],
+) -> dict[str, int]:
+    """How often the check would have spoken on a drive, by what it would have said.
+
+    Parameters
+    ----------
+    check
+        The bounds.
+    T_previous_current
+        Motions of shape (n - 1, 4, 4).
+    stamps
+        Nanoseconds, of shape (n,).
+    registered
+        Of shape (n,).
+
+    Returns
+    -------
+    dict
+        See `Guard.check`.
+    """
+    guard = Guard(check)
+    elapsed = (np.diff(stamps) * 1e-9).tolist()
+    said = map(guard.check, T_previous_current, elapsed, registered[1:].tolist())
+    return dict(Counter(what for what in said if what is not None))

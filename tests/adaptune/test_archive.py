@@ -26,6 +26,7 @@ def random_trial(seed=0, parameters=PARAMETERS):
         metrics={"rte": rng.random()},
         usage={"cpu": rng.random()},
         repeats=({"rte": rng.random()}, {"rte": rng.random()}),
+        unhealthy={"max_speed": 3},
     )
 
 

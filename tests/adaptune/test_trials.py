@@ -28,7 +28,9 @@ def archive(tmp_path):
         few = rng.random(len(STAMPS)) < 0.2
         parameters = {"distance": rng.random(), "kernel": "Huber"}
         errors, seconds = rng.gamma(1.0, size=(2, len(STAMPS)))
-        archive.write(name, number, Trial(parameters, drive(seed), errors, few, ~few, seconds))
+        said = {"max_speed": seed, "no_pose": 1}
+        trial = Trial(parameters, drive(seed), errors, few, ~few, seconds, unhealthy=said)
+        archive.write(name, number, trial)
     archive.write("cave", 1, archive.read("cave", 0), whole=True)
     return archive
 
@@ -39,6 +41,7 @@ def test_there_is_a_row_for_every_trial(archive):
     first = archive.read("cave", 0), archive.read("street", 0)
     assert table[0]["mean"] == pytest.approx(np.mean([trial.mean_error for trial in first]))
     assert table[0]["lost"] == sum(trial.restarted.sum() for trial in first)
+    assert [row["unhealthy"] for row in table] == [1 + 5, 2, 3, 4]
     assert table[1]["street"] is None
     assert table[1]["mean"] is None
     assert table[3]["kernel"] == "Huber"

@@ -115,8 +115,11 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monk
     assert np.flatnonzero(np.isinf(trial.errors)).tolist() == list(range(10))
     assert trial.errors[10:29].max() < 3.0
     assert trial.mean_error == pytest.approx((10 * 30.0 + trial.errors[10:29].sum()) / 29)
+    # What the odometry did counts, not the new start.
+    assert trial.unhealthy == {"max_speed": 1}
     (whole,) = run_trials(study, sequence, [GOOD], whole=True)
     assert not whole.restarted.any()
+    assert whole.unhealthy == {"max_speed": 2}
     assert np.isfinite(whole.errors[:29]).all()
 
 

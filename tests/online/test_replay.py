@@ -147,6 +147,17 @@ def test_poor_scans_are_counted(tmp_path):
     assert json.loads((tmp_path / "replay.json").read_text())["poor_scans"] == 1
 
 
+def test_too_many_scans_that_do_not_register_start_anew(tmp_path):
+    box = Scripted([0.1, 0.1, *[None] * 7, 0.1])
+    check = HEALTH.model_copy(update={"max_unregistered": 3})
+    result = replay(scans(np.arange(11) / 10), box, check)
+    assert np.flatnonzero(result.restarted).tolist() == [5, 8]
+    assert result.unhealthy == {"max_unregistered": 2}
+    write_replay(tmp_path, result, {})
+    told = json.loads((tmp_path / "replay.json").read_text())
+    assert told["unhealthy"] == {"max_unregistered": 2}
+
+
 def test_no_scans():
     with pytest.raises(AdaptuneError, match="no scan"):
         replay([], Scripted(), HEALTH)

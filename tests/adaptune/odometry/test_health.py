@@ -5,6 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from adaptune.odometry import HealthCheck
+from adaptune.odometry.health import Guard, unhealthy
 
 CHECK = HealthCheck(max_speed=10.0, max_acceleration=5.0)
 
@@ -34,7 +35,7 @@ CHECK = HealthCheck(max_speed=10.0, max_acceleration=5.0)
 )
 def test_healthy(velocity, last, elapsed, healthy):
     last = None if last is None else np.array(last, float)
-    assert CHECK.healthy(np.array(velocity, float), last, elapsed) is healthy
+    assert (CHECK.exceeded(np.array(velocity, float), last, elapsed) is None) is healthy
 
 
 @pytest.mark.parametrize(
@@ -42,7 +43,8 @@ def test_healthy(velocity, last, elapsed, healthy):
 )
 def test_turning(degrees, healthy):
     check = HealthCheck(max_turn_rate=90.0)
-    assert check.healthy(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees)) is healthy
+    said = check.exceeded(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees))
+    assert said == (None if healthy else "max_turn_rate")
 
 
 def moved(x, degrees=0.0):
@@ -71,14 +73,57 @@ def test_who_stops_dead_has_frozen(seconds, speed, frozen):
 
 def test_a_vehicle_in_a_town_is_healthy():
     check = HealthCheck()
-    assert check.healthy(np.array([16.7, 0.2, 0.0]), np.array([16.2, 0.0, 0.1]), 0.1)
-    assert not check.healthy(np.array([16.7, 5.0, 0.0]), np.array([16.7, 0.0, 0.0]), 0.1)
-    assert not check.healthy(np.array([60.0, 0.0, 0.0]), None, 0.1)
+    fast = np.array([16.7, 0.0, 0.0])
+    assert check.exceeded(np.array([16.7, 0.2, 0.0]), np.array([16.2, 0.0, 0.1]), 0.1) is None
+    assert check.exceeded(np.array([16.7, 5.0, 0.0]), fast, 0.1) == "max_acceleration"
+    assert check.exceeded(np.array([60.0, 0.0, 0.0]), None, 0.1) == "max_speed"
 
 
 @pytest.mark.parametrize(
-    "bounds", [{"max_speed": 0}, {"max_acceleration": -1}, {"max_jerk": 1}, {"max_speed": "fast"}]
+    "bounds",
+    [
+        {"max_speed": 0},
+        {"max_acceleration": -1},
+        {"max_jerk": 1},
+        {"max_speed": "fast"},
+        {"max_unregistered": 0},
+    ],
 )
 def test_bounds_that_make_no_sense(bounds):
     with pytest.raises(ValidationError):
         HealthCheck(**bounds)
+
+
+def test_what_would_have_been_said_of_a_drive():
+    steps = [0.1, 0.1, 9.0, 0.1, 0.1, np.nan, 0.1, *[0.0] * 6, 0.1, 0.8, *[0.1] * 5]
+    check = HealthCheck(max_speed=10.0, max_acceleration=20.0, max_freeze=0.45, max_unregistered=3)
+    registered = np.ones(len(steps) + 1, bool)
+    registered[-4:] = False
+    said = unhealthy(
+        check, np.array([moved(x) for x in steps]), np.arange(len(steps) + 1) * 10**8, registered
+    )
+    assert said == {
+        "max_speed": 1,
+        "no_pose": 1,
+        "max_freeze": 1,
+        "max_acceleration": 1,
+        "max_unregistered": 1,
+    }
+    regular = np.array([moved(0.1)] * 20)
+    assert unhealthy(check, regular, np.arange(21) * 10**8, np.ones(21, bool)) == {}
+
+
+@pytest.mark.parametrize(("in_a_row", "said"), [(9, None), (10, "max_unregistered")])
+def test_scans_that_do_not_register(in_a_row, said):
+    guard = Guard(HealthCheck())
+    for i in range(50):
+        assert guard.check(moved(0.1), 0.1, registered=i % 10 == 0) is None
+    guard.check(moved(0.1), 0.1)
+    for _ in range(in_a_row):
+        last = guard.check(moved(0.1), 0.1, registered=False)
+    assert last == said
+    # It begins to count anew, and the motion that was predicted goes on.
+    assert guard.check(moved(0.1), 0.1, registered=False) == (
+        "max_unregistered" if not said else None
+    )
+    np.testing.assert_allclose(guard.go_on(0.2), moved(0.2), atol=1e-12)
