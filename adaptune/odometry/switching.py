@@ -5,6 +5,7 @@ Both ways are driven like an odometry that is `live`: a replay need not know whi
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import Box, OdometryError, Registration, WarmUp
 from adaptune.odometry.isolation import Isolated
-from adaptune.sequence import Scan
+from adaptune.sequence import Imu, Scan
+from adaptune.sequence.imu import joined
 from adaptune.space import ParameterSet
 
 Make = Callable[[ParameterSet], Box]
@@ -24,24 +26,34 @@ AGREEMENT = 0.1
 
 
 class Stamped(NamedTuple):
-    """A prepared scan and its stamp in nanoseconds."""
+    """A prepared scan and its stamp in nanoseconds; the scan too, if it brings an IMU along."""
 
     stamp: int
     prepared: Any
+    scan: Scan | None
+
+    @classmethod
+    def by(cls, box: Box, scan: Scan) -> "Stamped":
+        """What a box makes of a scan."""
+        return cls(scan.stamp, box.prepare(scan), scan if scan.imu is not None else None)
 
 
 class _Past(NamedTuple):
-    stamp: int
-    prepared: Any
+    scan: Stamped
     T_odom_sensor: Poses
     T_previous_current: Poses | None
+
+    @property
+    def imu(self) -> Imu | None:
+        return None if self.scan.scan is None else self.scan.scan.imu
 
 
 class _Recent:
     """The last seconds of scans, with the poses that were given for them."""
 
-    def __init__(self, warm_up: WarmUp):
+    def __init__(self, warm_up: WarmUp, first: Box):
         self._warm_up = warm_up
+        self._first = first
         self._past: deque[_Past] = deque()
         self._forgotten = 0
 
@@ -50,12 +62,12 @@ class _Recent:
 
     def begin(self, scan: Stamped, T_odom_sensor: Poses, motion: Poses | None) -> None:
         self._past.clear()
-        self._past.append(_Past(*scan, T_odom_sensor, motion))
+        self._past.append(_Past(scan, T_odom_sensor, motion))
         self._forgotten = 0
 
     def add(self, scan: Stamped, T_odom_sensor: Poses) -> None:
         T_previous_current = invert(self._past[-1].T_odom_sensor) @ T_odom_sensor
-        self._past.append(_Past(*scan, T_odom_sensor, T_previous_current))
+        self._past.append(_Past(scan, T_odom_sensor, T_previous_current))
         while len(self._past) > 1 and self._age(self._past[0]) > self._warm_up.seconds:
             self._past.popleft()
             self._forgotten += 1
@@ -71,12 +83,23 @@ class _Recent:
     def newcomer(self, box: Box) -> "_Newcomer":
         """Let a new instance begin with these scans."""
         _, full_rate, stride = self._warm_up
-        seen = [
-            past
-            for number, past in enumerate(self._past, self._forgotten)
-            if self._age(past) <= full_rate or number % stride == 0
-        ]
+        seen: list[_Past] = []
+        missed: list[Imu] = []
+        for number, past in enumerate(self._past, self._forgotten):
+            if self._age(past) <= full_rate or number % stride == 0:
+                seen.append(self._catching_up(past, missed))
+                missed = []
+            elif seen and past.imu is not None:
+                missed.append(past.imu)
         return _Newcomer(box, seen)
+
+    def _catching_up(self, past: _Past, missed: list[Imu]) -> _Past:
+        """A scan with what was measured since the last one that is seen."""
+        scan = past.scan.scan
+        if not missed or scan is None or scan.imu is None:
+            return past
+        scan = replace(scan, imu=joined([*missed, scan.imu]))
+        return past._replace(scan=Stamped.by(self._first, scan))
 
     def warm_up(self, box: Box) -> Poses:
         """Let a new instance see these scans, and tell where it believes to be."""
@@ -85,7 +108,7 @@ class _Recent:
         return newcomer.T_own_sensor
 
     def _age(self, past: _Past) -> float:
-        return (self._past[-1].stamp - past.stamp) * 1e-9
+        return (self._past[-1].scan.stamp - past.scan.stamp) * 1e-9
 
 
 class _Newcomer:
@@ -100,7 +123,7 @@ class _Newcomer:
         """See at most `n` scans more."""
         for _ in range(min(n, len(self.waiting))):
             past = self.waiting.popleft()
-            self.T_own_sensor = self.box.register(past.prepared).T_odom_sensor
+            self.T_own_sensor = self.box.register(past.scan.prepared).T_odom_sensor
             if not np.isfinite(self.T_own_sensor).all():
                 # It begins without a past.
                 self._start(self.waiting.pop() if self.waiting else past)
@@ -108,7 +131,7 @@ class _Newcomer:
                 return
 
     def _start(self, past: _Past) -> None:
-        self.box.start(past.prepared, past.T_odom_sensor, past.T_previous_current)
+        self.box.start(past.scan.prepared, past.T_odom_sensor, past.T_previous_current)
         self.T_own_sensor = past.T_odom_sensor
 
 
@@ -142,17 +165,17 @@ class HandOver:
     def __init__(self, make: Make, parameters: ParameterSet, warm_up: WarmUp, beside: int = 0):
         self.parameters = dict(parameters)
         self._make = make
-        self._recent = _Recent(warm_up)
         self._beside = beside
         # What one instance has learnt from the first scan's layout must serve all.
         self._first = self._box = make(self.parameters)
+        self._recent = _Recent(warm_up, self._first)
         self._present = self.parameters
         self._newcomer: _Newcomer | None = None
         self._T_odom_own = np.eye(4)
 
     def prepare(self, scan: Scan) -> Stamped:
         """See `Odometry.prepare`."""
-        return Stamped(scan.stamp, self._first.prepare(scan))
+        return Stamped.by(self._first, scan)
 
     def start(
         self, prepared: Stamped, T_odom_sensor: Poses, T_previous_current: Poses | None = None
@@ -238,11 +261,11 @@ class Bank:
         self._T_own_sensor = [np.eye(4)] * len(self.sets)
         self._T_odom_own = np.eye(4)
         self._chosen = self._taken = 0
-        self._recent = _Recent(warm_up)
+        self._recent = _Recent(warm_up, self._boxes[0])
 
     def prepare(self, scan: Scan) -> Stamped:
         """See `Odometry.prepare`."""
-        return Stamped(scan.stamp, self._boxes[0].prepare(scan))
+        return Stamped.by(self._boxes[0], scan)
 
     def configure(self, parameters: ParameterSet) -> None:
         """Choose the instance that has these parameters.

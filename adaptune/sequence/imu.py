@@ -1,5 +1,6 @@
 """Measurements of an IMU."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -77,6 +78,16 @@ class Imu:
             angular_velocity=self.angular_velocity[first:last],
             acceleration=self.acceleration[first:last],
         )
+
+
+def joined(parts: Sequence[Imu]) -> Imu:
+    """Measurements of one IMU, one part after the other."""
+    return replace(
+        parts[0],
+        stamps=np.concatenate([part.stamps for part in parts]),
+        angular_velocity=np.concatenate([part.angular_velocity for part in parts]),
+        acceleration=np.concatenate([part.acceleration for part in parts]),
+    )
 
 
 def clock_offset(

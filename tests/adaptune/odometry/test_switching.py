@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import turns
@@ -14,7 +16,7 @@ from adaptune.odometry import (
     WarmUp,
 )
 from adaptune.odometry.gicp import KeyframeGicp, Settings
-from adaptune.sequence import Scan
+from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, ParameterSpace
 
 NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -102,6 +104,46 @@ def test_hand_over_sees_less_of_what_is_long_ago():
     box = HandOver(make, {"speed": 1.0}, WarmUp(8.0, 2.0, 3))
     x_of(box, range(14), {12: {"speed": 2.0}})
     assert made[1].seen == [3, 6, 9, 10, 11, 12, 13]
+
+
+@pytest.mark.parametrize("beside", [0, 3])
+def test_what_an_imu_measured_during_scans_that_are_left_out_is_seen(beside):
+    class Measured(Walker):
+        def prepare(self, scan):
+            return super().prepare(scan), scan.imu.stamps.tolist()
+
+        def start(self, prepared, *motion):
+            super().start(prepared[0], *motion)
+            self.stamps = prepared[1]
+
+        def register(self, prepared):
+            self.stamps = self.stamps + prepared[1]
+            return super().register(prepared[0])
+
+    made = []
+
+    def make(parameters):
+        made.append(Measured(parameters))
+        return made[-1]
+
+    def scan(second):
+        stamps = np.arange(10) * 10**8 + (second - 1) * 10**9 + 1
+        return replace(at(second), imu=Imu(stamps, *np.zeros((2, 10, 3))))
+
+    box = HandOver(make, {"speed": 1.0}, WarmUp(8.0, 2.0, 3), beside)
+    for second in range(20):
+        if second == 12:
+            box.configure({"speed": 2.0})
+        prepared = box.prepare(scan(second))
+        if second == 0:
+            box.start(prepared, np.eye(4))
+        else:
+            box.register(prepared)
+    old, new = made
+    assert new.seen == [3, 6, 9, *range(10, 20)]
+    # All since the one it began with, in order and each once.
+    assert new.stamps == [t for second in range(3, 20) for t in scan(second).imu.stamps]
+    assert old.stamps == [t for second in range(old.seen[-1] + 1) for t in scan(second).imu.stamps]
 
 
 def test_hand_over_beside_the_old_instance():
