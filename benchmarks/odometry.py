@@ -110,7 +110,7 @@ def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     ndt = registration.registration_ndt
     small_gicp.align, small_gicp.preprocess_points = map(clock.wrap, originals)
     registration.registration_ndt = clock.wrap(ndt)
-    for attribute in ("_kiss", "_pipeline"):
+    for attribute in ("_kiss", "_pipeline", "_lio"):
         if hasattr(box, attribute):
             setattr(box, attribute, Timed(getattr(box, attribute), clock))
     poses, own = [np.eye(4)], []

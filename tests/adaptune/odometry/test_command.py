@@ -1,3 +1,4 @@
+import importlib.util
 import json
 import re
 import sys
@@ -8,6 +9,7 @@ import numpy as np
 import program
 import pytest
 import yaml
+from needs import lacking
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
@@ -228,6 +230,41 @@ def test_a_lost_track_is_labelled_and_what_comes_after_judged_for_itself(make):
     whole, _ = run(study, whole=True)
     np.testing.assert_allclose(whole.T_odom_sensor[20:, 0, 3], 2.0 + 0.3 * np.arange(20, 40))
     assert not whole.restarted.any()
+
+
+EVALIO = """\
+datasets: bag/drive
+pipelines:
+  - {name: tuned, pipeline: kiss, voxel_size: 1.0, max_num_threads: 1}
+"""
+
+
+def test_a_real_one_evalio_s_command_line(make, tmp_path):
+    if importlib.util.find_spec("evalio") is None:
+        lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")
+    make()
+    (tmp_path / "kiss.yaml").write_text(EVALIO)
+    support = Path(program.__file__).parent
+    evalio = Path(sys.executable).parent / "evalio"
+    command = f"[env, PYTHONPATH={support}, 'BAG={{input}}', 'POINTS={{points}}', {evalio}, -M, \
+evalio_bag, run, -c, '{{parameters}}']"
+    overrides = [
+        f"odometry.settings.command={command}",
+        "odometry.settings.template=kiss.yaml",
+        "odometry.settings.output=evalio_results/kiss/bag/drive/tuned.csv",
+        "odometry.settings.format=evalio",
+        "odometry.parameters={voxel_size: {type: float, low: 0.1, high: 3, baseline: 1}}",
+        "isolation.memory=16",
+    ]
+    study = load_study(tmp_path / "study.yaml", overrides, tmp_path / "runs")
+    fine, sequence = run(study, {"voxel_size": 0.5})
+    coarse, _ = run(study, {"voxel_size": 1.0})
+    for trial in (fine, coarse):
+        assert not trial.faults
+        np.testing.assert_allclose(
+            trial.T_odom_sensor[:, :3, 3], sequence.frames.T_ref_sensor[:, :3, 3], atol=0.3
+        )
+    assert np.abs(fine.T_odom_sensor - coarse.T_odom_sensor).max() > 1e-4
 
 
 def test_the_whole_way(make):
