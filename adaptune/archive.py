@@ -36,12 +36,15 @@ class Frames:
         float32.
     blocks : dict
         By name, in order, how many of the features are each descriptor's.
+    elevations : ndarray of shape (n,)
+        float32 degrees, of each scan's lowest points, see `adaptune.descriptor.lowest_elevation`.
     """
 
     stamps: NDArray[np.int64]
     T_ref_sensor: Poses
     descriptors: NDArray[np.float32]
     blocks: dict[str, int]
+    elevations: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,6 +265,7 @@ class Archive:
                 T_ref_sensor=frames.T_ref_sensor,
                 descriptors=compact(frames.descriptors),
                 blocks=np.frombuffer(json.dumps(frames.blocks).encode(), np.uint8),
+                elevations=frames.elevations.astype(np.float32),
             )
 
     def read_frames(self, sequence: str) -> Frames:
@@ -279,6 +283,7 @@ class Archive:
                 data["T_ref_sensor"],
                 data["descriptors"].astype(np.float32),
                 dict(json.loads(data["blocks"].tobytes())),
+                data["elevations"],
             )
         except KeyError as error:
             raise ArchiveError(f"{path}: lacks {error}; run `adaptune offline`") from error

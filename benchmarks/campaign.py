@@ -157,6 +157,7 @@ class Drawn:
             np.tile(np.eye(4), (N_FRAMES, 1, 1)),
             np.random.default_rng(0).integers(0, 99, (N_FRAMES, 90)).astype(np.float32),
             {"ndt": 90},
+            np.zeros(N_FRAMES, np.float32),
         )
         return [(0, Result([_drawn(*p) for p in pairs], frames if self._task.frames else None))]
 

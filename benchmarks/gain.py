@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Frames
+from adaptune.descriptor import lowest_elevation
 from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
 from adaptune.simulation import Course, simulate
@@ -77,6 +78,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
         np.array([scan.T_world_sensor for scan in scans]),
         np.array([ndt_histogram(scan.points) for scan in scans], np.float32),
         {"ndt": N_FEATURES},
+        np.array([lowest_elevation(scan) for scan in scans], np.float32),
     )
     study = study_of(odometry)
     offline = study.config.offline.model_copy(

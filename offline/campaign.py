@@ -448,7 +448,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         Number of the fixed set's.
     """
     numbers = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
-    descriptors, sequence, errors = [], [], []
+    descriptors, sequence, errors, elevations = [], [], [], []
     window = study.window
     for s, name in enumerate(study.training):
         of_sequence = archive.read_errors(name, numbers)
@@ -458,6 +458,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         period = study.config.online.period
         described = averaged(frames.descriptors, frames.stamps, window, period)
         descriptors.append(described[labelled])
+        elevations.append(float(np.nanmedian(frames.elevations)))
         sequence.append(np.full(labelled.sum(), s))
         errors.append(of_sequence[labelled])
     model = ErrorModel(
@@ -475,6 +476,7 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
         descriptors=np.concatenate(descriptors),
         sequence=np.concatenate(sequence),
         errors=np.concatenate(errors),
+        elevations=elevations,
         provenance={"versions": versions(study.box), "trials": numbers}
         | study.config.offline.model_dump(
             mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adaptune.archive import Frames, Trial
-from adaptune.descriptor import Describer
+from adaptune.descriptor import Describer, lowest_elevation
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
@@ -56,11 +56,12 @@ class PreparedSequence:
         self._kept: list[Any] = []
         self.nbytes = 0
         describe = Describer(study.config.descriptor.names)
-        stamps, descriptors, full, enough = [], [], False, False
+        stamps, descriptors, elevations, full, enough = [], [], [], False, False
         for scan in self._sequence:
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
             descriptors.append(describe(scan))
+            elevations.append(lowest_elevation(scan))
             if full:
                 continue
             prepared = self._box.prepare(scan)
@@ -81,7 +82,13 @@ class PreparedSequence:
         at = np.array(stamps, np.int64)
         T_ref_sensor = reference.at(at)
         check_reference(study, name, T_ref_sensor)
-        self.frames = Frames(at, T_ref_sensor, np.array(descriptors), describe.blocks)
+        self.frames = Frames(
+            at,
+            T_ref_sensor,
+            np.array(descriptors),
+            describe.blocks,
+            np.array(elevations, np.float32),
+        )
 
     def __iter__(self) -> Iterator[Any]:
         yield from self._kept

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import logging
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.descriptor import Describer, DescriptorError
+from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
@@ -22,6 +23,11 @@ from adaptune.odometry.health import Guard
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory, write_tum
+
+_log = logging.getLogger(__name__)
+
+SCANS_TO_KNOW = 10
+"""A sensor by: the median of so many scans that selections are made from."""
 
 Policy = Callable[[Scan], Selection]
 """Chooses a parameter set for a scan."""
@@ -79,6 +85,9 @@ class Replay:
 def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
     """A policy that asks an error model.
 
+    By the paired rule, scans of a sensor or mount that was not trained with, see
+    `ErrorModel.is_foreign`, get the fixed set.
+
     Parameters
     ----------
     model
@@ -96,6 +105,7 @@ def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
             f"the model was fitted to descriptors of {model.blocks} numbers, these have "
             f"{describe.blocks}; run `adaptune offline` again"
         )
+    foreign = _foreign(model)
     last: deque[NDArray[np.float32]] = deque(maxlen=model.window)
     current: int | None = None
 
@@ -104,6 +114,9 @@ def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
         last.append(describe(scan))
         mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
+        if rule == "paired" and foreign(scan):
+            fixed = selection.predicted_fixed
+            selection = Selection(model.fixed, fixed, fixed, 0.0)
         current = selection.set_index
         return selection
 
@@ -112,6 +125,31 @@ def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
     last.clear()
     current = None
     return select
+
+
+def _foreign(model: ErrorModel) -> Callable[[Scan], bool]:
+    """Tells, scan after scan, whether they come from a sensor that was not trained with."""
+    seen: list[float] = []
+    told = False
+
+    def foreign(scan: Scan) -> bool:
+        nonlocal told
+        if len(scan) and len(seen) < SCANS_TO_KNOW:
+            seen.append(lowest_elevation(scan))
+        if not seen or not model.is_foreign(lowest := float(np.median(seen))):
+            return False
+        if not told:
+            known = sorted({f"{elevation:.0f}" for elevation in model.elevations})
+            _log.warning(
+                "the scans' lowest points lie at %.0f degrees, those of training at %s: this is "
+                "another sensor or mount; the fixed set is kept",
+                lowest,
+                ", ".join(known),
+            )
+        told = True
+        return True
+
+    return foreign
 
 
 def replay(

@@ -8,6 +8,7 @@ from adaptune.descriptor.base import (
     ScaledPCA,
     averaged,
     descriptor,
+    lowest_elevation,
 )
 
 __all__ = [
@@ -18,4 +19,5 @@ __all__ = [
     "ScaledPCA",
     "averaged",
     "descriptor",
+    "lowest_elevation",
 ]

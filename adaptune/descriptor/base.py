@@ -1,5 +1,6 @@
 """Descriptors by name, one or several of them, and what is learnt to compare them by."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Self
 
@@ -99,6 +100,23 @@ class Describer:
         if not np.isfinite(found).all():
             raise DescriptorError(f"{name}: described scan {scan.stamp} by NaN or infinity")
         return found
+
+
+def lowest_elevation(scan: Scan) -> float:
+    """Elevation below which one point in a hundred lies.
+
+    It is that of the lowest beam, which ends on the ground almost everywhere, and so tells the
+    sensor and its mount, and not the place.
+
+    Returns
+    -------
+    float
+        Degrees; NaN for an empty scan.
+    """
+    if not len(scan):
+        return math.nan
+    x, y, z = scan.points[:: max(1, len(scan) // 2000)].T
+    return math.degrees(math.atan(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), 0.01)))
 
 
 class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]

@@ -25,6 +25,9 @@ from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 FORMAT = 2
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
+SAME_SENSOR = 3.0
+"""Degrees by which the lowest points of one sensor's scans may differ between drives."""
+
 _TYPES = {
     "header": ("|u1",),
     "descriptors": ("<u2", "<f4"),
@@ -54,6 +57,7 @@ class _Header(BaseModel):
     sequences: list[str]
     blocks: dict[str, PositiveInt]
     window: PositiveInt
+    elevations: list[float] = []
     paired: Settings = Settings()
     provenance: dict[str, Any]
     validation: dict[str, Any]
@@ -89,6 +93,9 @@ class ErrorModel:
         float32 percent, infinite where the track was lost, NaN where the set was never run.
     provenance : dict
         Where the model comes from, for people.
+    elevations : list of float, optional
+        For each training sequence, degrees at which its scans' lowest points lie, see
+        `adaptune.descriptor.lowest_elevation`; empty if that is not known.
     paired : Settings
         Of the paired rule, chosen on the training sequences.
     validation : dict
@@ -107,6 +114,7 @@ class ErrorModel:
     sequence: NDArray[np.intp]
     errors: NDArray[np.float32]
     provenance: dict[str, Any]
+    elevations: list[float] = field(default_factory=list)
     paired: Settings = field(default_factory=Settings)
     validation: dict[str, Any] = field(default_factory=dict)
 
@@ -123,6 +131,17 @@ class ErrorModel:
             self.space.to_unit(self.sets),
             self.fixed,
         )
+
+    def is_foreign(self, elevation: float) -> bool:
+        """Whether scans whose lowest points lie there come from no sensor of the training's.
+
+        Parameters
+        ----------
+        elevation
+            Degrees, the median of some scans' `adaptune.descriptor.lowest_elevation`.
+        """
+        apart = [abs(elevation - known) for known in self.elevations]
+        return bool(apart) and min(apart) > SAME_SENSOR
 
     def _arrays(self) -> dict[str, Any]:
         return {
@@ -141,6 +160,7 @@ class ErrorModel:
             "sequences": self.sequences,
             "blocks": self.blocks,
             "window": self.window,
+            "elevations": self.elevations,
             "paired": self.paired.model_dump(),
         }
 
@@ -194,6 +214,7 @@ class ErrorModel:
                     sequence=_read(file, size, "sequence").astype(np.intp),
                     errors=_read(file, size, "errors"),
                     provenance=header.provenance,
+                    elevations=header.elevations,
                     paired=header.paired,
                     validation=header.validation,
                 )

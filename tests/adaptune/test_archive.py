@@ -36,7 +36,8 @@ def random_frames(seed=0):
     T_ref_sensor[2] = np.nan
     stamps = 1_700_000_000_123_456_789 + np.arange(N) * 100_000_001
     counts = rng.integers(0, 1000, (N, 90)).astype(np.float32)
-    return Frames(stamps, T_ref_sensor, counts, {"ndt": 90})
+    elevations = rng.normal(-15.0, 1.0, N).astype(np.float32)
+    return Frames(stamps, T_ref_sensor, counts, {"ndt": 90}, elevations)
 
 
 def assert_same(a, b):

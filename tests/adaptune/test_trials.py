@@ -109,7 +109,9 @@ def test_the_index_opens_in_pandas(archive):
 
 
 def test_trajectories_are_exported(archive, tmp_path):
-    frames = Frames(STAMPS, drive(9), np.zeros((len(STAMPS), 90), np.float32), {"ndt": 90})
+    n = len(STAMPS)
+    nothing = np.zeros((n, 90), np.float32)
+    frames = Frames(STAMPS, drive(9), nothing, {"ndt": 90}, np.zeros(n, np.float32))
     archive.write_frames("cave", frames)
     assert export(archive, ["cave", "street"], [1, 3, 8], tmp_path / "out") == 2
     assert sorted(p.name for p in (tmp_path / "out/cave").iterdir()) == [

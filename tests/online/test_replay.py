@@ -5,14 +5,16 @@ import drives
 import numpy as np
 import pytest
 
+from adaptune.descriptor.ndt import describe
 from adaptune.errors import AdaptuneError
-from adaptune.model import Selection
+from adaptune.model import ErrorModel, Selection
 from adaptune.odometry import HealthCheck, Odometry, OdometryError, Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.sequence import Scan
+from adaptune.simulation import Course, simulate
 from adaptune.space import Float, ParameterSpace
 from adaptune.trajectory import read_tum
-from online.replay import replay, write_replay
+from online.replay import adaptive, replay, write_replay
 
 
 class Scripted(Odometry):
@@ -194,3 +196,39 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
     assert [int(row["stamp_ns"]) for row in rows] == [c.stamp for c in results[0].choices]
     assert {row["predicted_error_percent"] for row in rows} == {"0.5000"}
     assert {float(row["keyframe_interval"]) for row in rows} == {1.0, 3.0}
+
+
+def drive_cave(sensor, seed):
+    course = Course(scenes=("cave",), length=10.0, sensor=sensor, seed=seed)
+    return [Scan(s.stamp, s.points) for s in list(simulate(course))[::10]]
+
+
+def test_scans_of_another_sensor_get_the_fixed_set(caplog):
+    """A cave looks alike to many sensors; what lies lowest does not."""
+    drives = [drive_cave("hdl32e", seed) for seed in (1, 2)]
+    trained = [scan for drive in drives for scan in drive]
+    model = ErrorModel(
+        odometry={"name": "gicp"},
+        space=Scripted.space,
+        sets=[{"speed": 1.0}, {"speed": 8.0}],
+        fixed=0,
+        length=25.0,
+        sequences=["one", "two"],
+        blocks={"ndt": 90},
+        window=1,
+        descriptors=np.stack([describe(scan) for scan in trained]),
+        sequence=np.repeat([0, 1], [len(drive) for drive in drives]),
+        errors=np.tile(np.float32([1.0, 0.1]), (len(trained), 1)),
+        provenance={},
+        elevations=[-30.7, -30.7],
+    )
+    for sensor, chosen in (("hdl32e", 1), ("vlp16", 0)):
+        select = adaptive(model, "paired")
+        selections = [select(scan) for scan in drive_cave(sensor, 3)]
+        assert np.mean([s.set_index == chosen for s in selections]) > 0.9
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert "-15 degrees, those of training at -31" in caplog.text
+    assert all(s.set_index == 0 and s.familiarity == 0.0 for s in selections)
+    # The published rule has no such doubts.
+    select = adaptive(model, "paper")
+    assert all(select(scan).set_index == 1 for scan in drive_cave("vlp16", 3))

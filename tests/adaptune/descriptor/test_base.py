@@ -14,6 +14,7 @@ from adaptune.descriptor import (
     ScaledPCA,
     averaged,
     descriptor,
+    lowest_elevation,
 )
 from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.sequence import Scan
@@ -140,3 +141,15 @@ def test_averages_are_of_what_a_selector_has_seen():
     np.testing.assert_array_equal(
         averaged(descriptors, (stamps * 1e9).astype(np.int64), 1, 1.0), descriptors
     )
+
+
+def test_lowest_elevation_is_the_lowest_beams():
+    azimuth = np.linspace(-np.pi, np.pi, 500)
+    beams = []
+    for degrees in (-30.0, -10.0, 10.0):
+        r = 5.0 + np.sin(azimuth)
+        beams.append([r * np.cos(azimuth), r * np.sin(azimuth), r * np.tan(np.radians(degrees))])
+    points = np.concatenate([np.array(b).T for b in beams]).astype(np.float32)
+    points[7] = [1.0, 0.0, -50.0]  # one stray return
+    assert lowest_elevation(Scan(0, points)) == pytest.approx(-30.0, abs=1e-3)
+    assert np.isnan(lowest_elevation(Scan(0, np.empty((0, 3), np.float32))))

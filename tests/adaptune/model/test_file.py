@@ -40,7 +40,15 @@ def random_model(seed=0, n_frames=50, n_sets=6):
         sequence=rng.integers(0, 2, n_frames),
         errors=errors,
         provenance={"trials": n_sets, "note": None},
+        elevations=[-30.7, -15.0],
     )
+
+
+def test_knows_the_sensors_of_its_training():
+    model = dataclasses.replace(random_model(), elevations=[-30.7, -15.0])
+    assert [model.is_foreign(e) for e in (-33.0, -25.0, -16.0, 0.0)] == [False, True, False, True]
+    model = dataclasses.replace(model, elevations=[])
+    assert not model.is_foreign(0.0)  # where nothing is known, nothing is said
 
 
 def assert_same(a, b):
