@@ -9,7 +9,7 @@ same topics. *adapters* runs every odometry that can be had with its default par
 what a scan takes, how much of that is not spent in the odometry's own code, and how much more a
 process of its own takes. Limit: 5 % of the odometry's time, or 0.3 ms where that is more.
 *switching* hands over to the same parameters every 5 s. RTE over 25 m, or as many as are given; one
-core, seconds of its own time, so that other work on the machine counts less. *faults* plants each
+core, medians of its own time, so that other work on the machine counts less. *faults* plants each
 kind of fault at the fourth scan.
 """
 
@@ -36,6 +36,8 @@ WARM_UPS = (
     WarmUp(12.0, 4.0, 2),
 )
 EVERY = 5.0
+SOME = 30
+"""Scans from which is told what another process adds."""
 
 
 class Clock:
@@ -88,20 +90,25 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
 
 def drive(
     box: Box, scans: list[Scan], before: Callable[[int], None] = lambda _: None
-) -> tuple[Poses, list[float]]:
-    """Poses, and what each scan but the first took in seconds."""
+) -> tuple[Poses, float]:
+    """Poses, and what a scan took in milliseconds of processors' time, the median."""
     box.start(box.prepare(scans[0]), np.eye(4))
-    poses, seconds = [np.eye(4)], []
+    poses, at = [np.eye(4)], []
     for i, scan in enumerate(scans[1:], start=1):
         before(i)
-        begin = time.perf_counter()
         poses.append(box.register(box.prepare(scan)).T_odom_sensor)
-        seconds.append(time.perf_counter() - begin)
-    return np.array(poses), seconds
+        # Another process tells what it has computed with each pose, not before the first.
+        at.append(computed(box))
+    return np.array(poses), 1e3 * float(np.median(np.diff(at)))
+
+
+def computed(box: Box) -> float:
+    """Seconds of processors' time, here and in the other process if there is one."""
+    return time.process_time() + (box.cpu if isinstance(box, Isolated) else 0.0)
 
 
 def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
-    """Poses, milliseconds a scan, and those of them in the odometry's own code."""
+    """Poses, milliseconds a scan, and those of them not in the odometry's own code; medians."""
     clock = Clock()
     box: Any = box_class(name)()
     box.start(box.prepare(scans[0]), np.eye(4))
@@ -113,16 +120,16 @@ def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     for attribute in ("_kiss", "_pipeline", "_lio"):
         if hasattr(box, attribute):
             setattr(box, attribute, Timed(getattr(box, attribute), clock))
-    poses, own = [np.eye(4)], []
-    begin = time.process_time()
+    poses, whole, own = [np.eye(4)], [], []
     for scan in scans[1:]:
-        at = clock.seconds
+        at, begin = clock.seconds, time.process_time()
         poses.append(box.register(box.prepare(scan)).T_odom_sensor)
+        whole.append(time.process_time() - begin)
         own.append(clock.seconds - at)
-    whole = (time.process_time() - begin) / len(own)
     small_gicp.align, small_gicp.preprocess_points = originals
     registration.registration_ndt = ndt
-    return np.array(poses), 1e3 * whole, 1e3 * float(np.mean(own))
+    added = np.subtract(whole, own)
+    return np.array(poses), 1e3 * float(np.median(whole)), 1e3 * float(np.median(added))
 
 
 def adapters(path: Path, length: float) -> None:
@@ -132,20 +139,19 @@ def adapters(path: Path, length: float) -> None:
     for name in BOXES:
         cls = box_class(name)
         try:
-            poses, whole, own = own_time(name, scans)
+            poses, whole, added = own_time(name, scans)
         except Exception as error:
             print(f"{name:16} {error}", flush=True)
             continue
         isolated = ""
         if not cls.clean:
-            some = scans[:60]
-            box: Any = cls()
-            here = drive(box, some)[1]
+            some = scans[:SOME]
+            here = drive(cls(), some)[1]
             there = drive(Isolated(name, {}, cls.settings_type(), Limits()), some)[1]
-            isolated = f"{1e3 * np.median(np.subtract(there, here)):.2f}"
+            isolated = f"{there - here:.2f}"
         rte = np.nanmean(sub_trajectory_rte(T_ref, poses, length))
         print(
-            f"{name:16} {rte:6.3f} {whole:6.1f} {whole - own:6.2f} ({(whole - own) / own:4.0%})"
+            f"{name:16} {rte:6.3f} {whole:6.1f} {added:6.2f} ({added / (whole - added):4.0%})"
             f"  {isolated:>8}       {'itself' if cls.live else 'bank, hand-over'}",
             flush=True,
         )
