@@ -39,9 +39,10 @@ SAFE = 1.02
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
 SETTINGS = tuple(
-    Settings(n_sets=n_sets, sharpness=sharpness)
-    for n_sets in (2, 3, 5)
-    for sharpness in (6.0, 3.0, 12.0)
+    Settings(n_sets=n_sets, width=width, sharpness=sharpness)
+    for n_sets in (2, 5)
+    for width in (0.12, 0.05)
+    for sharpness in (6.0, 12.0, 24.0)
 )
 """What `tune` chooses from; of equally good ones the first."""
 
@@ -491,12 +492,12 @@ def _tried(
     data, pca = training_data(others, sets)
     rule = PairedExpectedRatio(settings[0]).fit(data)
     first, period = _periods(sequence)
-    evidence = [rule.evidence(x) for x in pca.transform(sequence.descriptors[first])]
+    near = [rule.near(x) for x in pca.transform(sequence.descriptors[first])]
     capped = cap(sequence.errors)
     logs = []
     for some in settings:
         rule.configure(some)
-        chosen = np.array([rule.choose(e).set_index for e in evidence])
+        chosen = np.array([rule.choose(frames).set_index for frames in near])
         errors = capped[np.arange(len(capped)), chosen[period]]
         logs.append(float(np.log(errors.mean() / capped[:, data.fixed].mean())))
     return logs

@@ -13,9 +13,8 @@ from pydantic import (
     PositiveInt,
 )
 
-from adaptune.metrics import FAILURE
+from adaptune.metrics import FAILURE, cap
 from adaptune.model.base import Rule, Selection, TrainingData, complementary
-from adaptune.model.knn import nearest_frames
 
 ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
@@ -47,38 +46,34 @@ class Settings(BaseModel):
 
     n_sets: PositiveInt | None = 2
     sharpness: NonNegativeFloat = 6.0
-    width: PositiveFloat = 0.05
-    n_frames: PositiveInt = 30
+    width: PositiveFloat = 0.12
+    n_frames: PositiveInt = 300
     threshold: Annotated[float, Field(le=0.0)] = -0.1
 
 
-class Evidence(NamedTuple):
-    """What each training sequence says about a scan.
+class Near(NamedTuple):
+    """The frames of each training sequence that are nearest to a scan.
 
     Attributes
     ----------
     squared : ndarray of shape (n_sequences,)
-        Mean squared distance of the sequence's frames that are nearest to the scan.
-    ratios : ndarray of shape (n_sequences, n_sets)
-        Mean over these frames of a set's error divided by the fixed set's; NaN where the set was
-        never run there.
-    fixed : ndarray of shape (n_sequences,)
-        Mean error of the fixed set on these frames, in percent.
+        Their mean squared distance.
+    frames : list of ndarray
+        Their numbers.
     """
 
     squared: NDArray[np.float64]
-    ratios: NDArray[np.float64]
-    fixed: NDArray[np.float64]
+    frames: list[NDArray[np.intp]]
 
 
 class PairedExpectedRatio(Rule):
-    """Compare every set with the fixed one on the same frames, and choose on the mean ratio.
+    """Compare every set with the fixed one on the same frames, and choose on the expected ratio.
 
-    For each training sequence, the mean over the frames nearest to the scan of a set's error
-    divided by the fixed set's on that frame; sequences are weighted by how near those frames are,
+    For each training sequence, a set's mean error on the frames nearest to the scan divided by the
+    fixed set's on the same frames; sequences are weighted by how near those frames are,
     neighbouring sets share their evidence, and a set must promise enough to be taken instead of
-    the fixed one. A rare failure weighs as much as it costs, and what makes a place hard for all
-    sets cancels out.
+    the fixed one. A rare failure weighs as much as it costs, and what makes a sequence hard for
+    all sets cancels out.
 
     A sequence that has not seen a set, nor one close to it, says nothing for it: its ratio
     counts as 1. The farther a scan is from all training sequences, compared with how far these
@@ -100,19 +95,23 @@ class PairedExpectedRatio(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        # Ratios of all frames would take twice the memory, and seconds.
-        self.errors_ = np.minimum(data.errors, np.float32(FAILURE))
-        self.fixed_errors_ = self.errors_[:, data.fixed].astype(np.float64)
-        self.complete_ = not np.isnan(self.errors_).any()
+        self.fixed_errors_ = cap(data.errors[:, data.fixed])
         self.sequences_ = [np.flatnonzero(data.sequence == s) for s in np.unique(data.sequence)]
         self.features_ = [data.features[members] for members in self.sequences_]
         self.novelty_ = self._calibrate()
-        return self.configure(self.settings)
+        self._mix()
+        return self
 
     def configure(self, settings: Settings) -> Self:
-        """Change the settings of a fitted rule, but for `n_frames`, which `evidence` rests on."""
-        self.settings = settings
-        data = self.data_
+        """Change the settings of a fitted rule, but for `n_frames`, which `near` rests on."""
+        before, self.settings = self.settings, settings
+        if (settings.n_sets, settings.width) != (before.n_sets, before.width):
+            self._mix()
+        return self
+
+    def _mix(self) -> None:
+        """Choose the candidates, and mix each one's errors with its neighbours'."""
+        data, settings = self.data_, self.settings
         n_sets = len(data.sets) if settings.n_sets is None else settings.n_sets
         self.candidates_ = np.arange(len(data.sets))
         if n_sets < len(data.sets):
@@ -121,40 +120,36 @@ class PairedExpectedRatio(Rule):
         candidates = data.sets[self.candidates_]
         squared = ((candidates[:, None, :] - data.sets[None, :, :]) ** 2).sum(axis=2)
         kernel = np.exp(-0.5 * squared / settings.width**2)
-        self.kernel_ = kernel / kernel.sum(axis=1, keepdims=True)
-        return self
-
-    def evidence(self, feature: NDArray[np.float64]) -> Evidence:
-        """What each training sequence says about a scan of shape (n_features,)."""
-        squared, ratios, fixed = [], [], []
-        for members, features in zip(self.sequences_, self.features_, strict=True):
-            distances, near = nearest_frames(features, feature, self.settings.n_frames)
-            frames = members[near]
-            of_fixed = self.fixed_errors_[frames]
-            paired = self.errors_[frames].astype(np.float64) + ERROR_FLOOR
-            weights = 1.0 / (of_fixed + ERROR_FLOOR)
-            if self.complete_:
-                ratios.append(weights @ paired / len(frames))
-            else:
-                known = ~np.isnan(paired)
-                number = known.sum(axis=0)
-                total = weights @ np.where(known, paired, 0.0)
-                ratios.append(np.where(number > 0, total / np.maximum(number, 1), np.nan))
-            squared.append(distances.mean())
-            fixed.append(of_fixed.mean())
-        return Evidence(np.array(squared), np.array(ratios), np.array(fixed))
-
-    def ratios(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Expected ratio of every candidate to the fixed set, of shape (n_candidates,)."""
-        weights = self._weights(evidence.squared)
-        if self.complete_:
-            ratio = self.kernel_ @ (weights @ evidence.ratios)
+        kernel = (kernel / kernel.sum(axis=1, keepdims=True)).astype(np.float32).T
+        # A ratio of means is linear in its numerator, so neighbouring sets can be mixed before.
+        errors = np.minimum(data.errors, np.float32(FAILURE))
+        known = ~np.isnan(errors)
+        if known.all():
+            self.errors_ = (errors @ kernel).astype(np.float64)
         else:
-            known = ~np.isnan(evidence.ratios)
-            share = known @ self.kernel_.T
-            said = np.where(known, evidence.ratios, 0.0) @ self.kernel_.T + (1.0 - share)
-            ratio = weights @ said
-        return np.asarray(1.0 + self._familiar(evidence) * (ratio - 1.0))
+            missing = 1.0 - known.astype(np.float32) @ kernel
+            self.errors_ = np.where(known, errors, np.float32(0.0)) @ kernel
+            self.errors_ = self.errors_ + missing * self.fixed_errors_[:, None]
+
+    def near(self, feature: NDArray[np.float64]) -> Near:
+        """The training frames nearest to a scan of shape (n_features,)."""
+        squared, frames = [], []
+        for members, features in zip(self.sequences_, self.features_, strict=True):
+            distance, nearest = _nearest(features, feature, self.settings.n_frames)
+            squared.append(distance)
+            frames.append(members[nearest])
+        return Near(np.array(squared), frames)
+
+    def ratios(self, near: Near) -> NDArray[np.float64]:
+        """Expected ratio of every candidate to the fixed set, of shape (n_candidates,)."""
+        means = np.array([self.errors_[frames].mean(axis=0) for frames in near.frames])
+        ratio = (means + ERROR_FLOOR) / (self._fixed(near)[:, None] + ERROR_FLOOR)
+        expected = self._weights(near.squared) @ ratio
+        return np.asarray(1.0 + self._familiar(near) * (expected - 1.0))
+
+    def _fixed(self, near: Near) -> NDArray[np.float64]:
+        """Mean error of the fixed set on the near frames of each sequence."""
+        return np.array([self.fixed_errors_[frames].mean() for frames in near.frames])
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         # With the median at zero every sequence has the very same place in it.
@@ -162,15 +157,15 @@ class PairedExpectedRatio(Rule):
         weights = np.exp(-self.settings.sharpness * (squared - squared.min()) / spread)
         return np.asarray(weights / weights.sum())
 
-    def _familiar(self, evidence: Evidence) -> float:
+    def _familiar(self, near: Near) -> float:
         """From 1, as near to training as its sequences to each other, to 0, beyond all of them."""
-        return min(1.0, self._novelty(evidence) / NOVEL)
+        return min(1.0, self._novelty(near) / NOVEL)
 
-    def _novelty(self, evidence: Evidence) -> float:
+    def _novelty(self, near: Near) -> float:
         """Share of training that is farther from the other sequences than this scan is."""
         if not len(self.novelty_):
             return 1.0
-        below = np.searchsorted(self.novelty_, evidence.squared.min(), side="left")
+        below = np.searchsorted(self.novelty_, near.squared.min(), side="left")
         return float(1.0 - below / len(self.novelty_))
 
     def _calibrate(self) -> NDArray[np.float64]:
@@ -182,7 +177,7 @@ class PairedExpectedRatio(Rule):
             some = features[:: max(1, len(features) // _QUANTILES)]
             others = self.features_[:s] + self.features_[s + 1 :]
             n = self.settings.n_frames
-            near = [[nearest_frames(o, x, n)[0].mean() for o in others] for x in some]
+            near = [[_nearest(o, x, n)[0] for o in others] for x in some]
             distances.append(
                 np.quantile(np.min(near, axis=1), (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
             )
@@ -194,19 +189,19 @@ class PairedExpectedRatio(Rule):
         Sets that are not chosen among have an infinite error. For the fixed set too this is the
         smoothed ratio times its error; `select` tells the error itself.
         """
-        evidence = self.evidence(feature)
-        fixed = self._weights(evidence.squared) @ evidence.fixed
+        near = self.near(feature)
+        fixed = self._weights(near.squared) @ self._fixed(near)
         predicted = np.full(len(self.data_.sets), np.inf)
-        predicted[self.candidates_] = self.ratios(evidence) * fixed
+        predicted[self.candidates_] = self.ratios(near) * fixed
         return predicted
 
     def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
         """See `Rule.select`."""
-        return self.choose(self.evidence(feature), current)
+        return self.choose(self.near(feature), current)
 
-    def choose(self, evidence: Evidence, current: int | None = None) -> Selection:
-        """Choose a set on the evidence about a scan."""
-        ratio = self.ratios(evidence)
+    def choose(self, near: Near, current: int | None = None) -> Selection:
+        """Choose a set by the frames near to a scan."""
+        ratio = self.ratios(near)
         # Smoothing is not for the one that all are compared with.
         ratio = np.where(self.candidates_ == self.data_.fixed, 1.0, ratio)
         best = int(np.argmin(ratio))
@@ -216,12 +211,24 @@ class PairedExpectedRatio(Rule):
             at = np.flatnonzero(self.candidates_ == current)
             if len(at) and ratio[at[0]] - ratio[best] <= self.price:
                 best = int(at[0])
-        weights = self._weights(evidence.squared)
-        fixed = float(weights @ evidence.fixed)
+        weights = self._weights(near.squared)
+        fixed = float(weights @ self._fixed(near))
         return Selection(
             int(self.candidates_[best]),
             float(ratio[best] * fixed),
             fixed,
-            self._novelty(evidence),
+            self._novelty(near),
             float(1.0 / (weights @ weights)),
         )
+
+
+def _nearest(
+    features: NDArray[np.float64], feature: NDArray[np.float64], n: int
+) -> tuple[float, NDArray[np.intp]]:
+    """Mean squared distance of the `n` frames nearest to a scan, and their numbers in any order."""
+    apart = features - feature
+    squared = np.einsum("ij,ij->i", apart, apart)
+    if n >= len(features):
+        return float(squared.mean()), np.arange(len(features))
+    nearest = np.argpartition(squared, n - 1)[:n]
+    return float(squared[nearest].mean()), nearest

@@ -32,26 +32,21 @@ def random_data(seed, n_frames, n_sets, n_sequences=3, n_features=3, n_parameter
 
 
 def plain_evidence(data, feature, m, sequences):
-    """For each sequence: distance, ratio of every set, and the fixed set's error, in loops."""
+    """For each sequence: distance, mean errors of all sets, and of the fixed one, in loops."""
 
     def error(i, j):
         return min(float(data.errors[i, j]), 30.0)
 
-    distances, ratios, fixed = [], [], []
+    distances, means, fixed = [], [], []
     for s in sequences:
         frames = [i for i in range(len(data.features)) if data.sequence[i] == s]
         frames.sort(key=lambda i: (math.dist(data.features[i], feature), i))
         frames = frames[:m]
         n = len(frames)
         distances.append(sum(math.dist(data.features[i], feature) ** 2 for i in frames) / n)
-        ratios.append(
-            [
-                sum((error(i, j) + 0.02) / (error(i, data.fixed) + 0.02) for i in frames) / n
-                for j in range(len(data.sets))
-            ]
-        )
+        means.append([sum(error(i, j) for i in frames) / n for j in range(len(data.sets))])
         fixed.append(sum(error(i, data.fixed) for i in frames) / n)
-    return distances, ratios, fixed
+    return distances, means, fixed
 
 
 def plain_familiarity(data, distance, m):
@@ -72,7 +67,8 @@ def plain_familiarity(data, distance, m):
 def plain_ratios(data, feature, m, h, tau):
     """Expected ratio of every set, and the fixed set's expected error, in plain loops."""
     names = sorted(set(data.sequence.tolist()))
-    distances, ratios, fixed = plain_evidence(data, feature, m, names)
+    distances, means, fixed = plain_evidence(data, feature, m, names)
+    ratios = [[(y + 0.02) / (f + 0.02) for y in of] for of, f in zip(means, fixed, strict=True)]
     middle = statistics.median(distances)
     weights = [math.exp(-tau * (a - min(distances)) / middle) for a in distances]
     weights = [w / sum(weights) for w in weights]
@@ -128,7 +124,7 @@ def test_it_chooses_among_complementary_sets(seed, n_frames, n_sets, n_sequences
 
 
 def test_its_constants():
-    assert tuple(Settings().model_dump().values()) == (2, 6.0, 0.05, 30, -0.1)
+    assert tuple(Settings().model_dump().values()) == (2, 6.0, 0.12, 300, -0.1)
     assert next(iter(RULES)) == "paired"
     assert isinstance(RULES["paired"](Settings(), 0.0), PairedExpectedRatio)
 
@@ -170,14 +166,25 @@ def test_a_rare_failure_weighs_as_much_as_it_costs():
     data = two_sets(1.0, 0.5, n=30)
     assert PairedExpectedRatio().fit(data).select(np.zeros(2)).set_index == 1
     data.errors[4, 1] = np.inf
-    # One of 30 fails: (29 * 0.52 + 30.02) / 30 / 1.02 = 1.47.
+    # One of 30 fails: ((29 * 0.5 + 30) / 30 + 0.02) / 1.02 = 1.47.
     assert PairedExpectedRatio().fit(data).select(np.zeros(2)).set_index == 0
 
 
 def test_what_is_hard_for_all_cancels_out():
-    data = two_sets(1.0, 0.5, n=30)
-    data.errors[:10] = [29.0, 28.0]
-    # By their means over the frames, the sets would differ by 4 %.
+    n = 30
+    errors = np.tile(np.array([[1.0, 0.5]], np.float32), (2 * n, 1))
+    errors[n:] = [29.0, 28.0]
+    data = TrainingData(
+        np.zeros((2 * n, 2)), np.repeat([0, 1], n), errors, np.array([[0.0, 0.0], [1.0, 1.0]]), 0
+    )
+    # By their means over both sequences, the sets would differ by 5 %.
+    assert PairedExpectedRatio().fit(data).select(np.zeros(2)).set_index == 1
+
+
+def test_within_a_sequence_errors_count_as_large_as_they_are():
+    data = two_sets(0.1, 1.0, n=30)
+    data.errors[:10] = [20.0, 10.0]
+    # Ten times the error in most places, but half of it all in all.
     assert PairedExpectedRatio().fit(data).select(np.zeros(2)).set_index == 1
 
 
