@@ -2,11 +2,11 @@
 
     python benchmarks/kill.py [KILLS] [SEED]
 
-A driver (by chance, or where there is no worker yet) or one of its two workers is sent SIGKILL at
-a random moment of as many seconds as the undisturbed campaign took; a driver is then started
-again. After every kill no finished trial may be missing or have been written again, and at the end
-archive, model and fixed set must equal the undisturbed campaign's byte for byte but for times,
-with every trial once in the index and in Optuna's journal. Fifty kills take several campaigns.
+With equal chance a driver or one of its two workers is sent SIGKILL, shortly after a random number
+of trials was finished since the last one; a driver is then started again. Whenever one has ended no
+finished trial may be missing or have been written again, and at the end archive, model and fixed
+set must equal the undisturbed campaign's byte for byte but for times, with every trial once in the
+index and in Optuna's journal. Fifty kills take several campaigns.
 """
 
 import sys
@@ -33,22 +33,22 @@ def main(n_kills: int, seed: int) -> None:
         folder = Path(temporary)
         study_file = drives.write_study(folder)
         begin = time.monotonic()
-        kills.disturb(study_file, folder / "undisturbed", 0, 0.0, rng, *OVERRIDES)
-        longest = time.monotonic() - begin
-        print(f"undisturbed: {longest:.1f} s", flush=True)
+        kills.disturb(study_file, folder / "undisturbed", 0, 0, rng, *OVERRIDES)
+        print(f"undisturbed: {time.monotonic() - begin:.1f} s", flush=True)
         expected = kills.contents(folder / "undisturbed")
+        n_files = len(kills.files(folder / "undisturbed"))
         killed = np.zeros(2, int)
         campaigns = 0
         while killed.sum() < n_kills:
             disturbed = folder / f"disturbed-{campaigns}" / "undisturbed"
             left = n_kills - int(killed.sum())
-            killed += kills.disturb(study_file, disturbed, left, longest, rng, *OVERRIDES)
+            killed += kills.disturb(study_file, disturbed, left, n_files, rng, *OVERRIDES)
             assert kills.contents(disturbed) == expected, f"{disturbed} is not the same"
             kills.check_once(disturbed, N_TRIALS, ["one", "two"])
             campaigns += 1
             print(
                 f"{campaigns} campaigns the same; {killed[0]} drivers and {killed[1]} workers "
-                f"killed",
+                f"killed, {time.monotonic() - begin:.0f} s",
                 flush=True,
             )
 

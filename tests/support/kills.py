@@ -1,9 +1,11 @@
 """Campaigns whose processes are killed at random moments, and what must be left of them."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,9 @@ import optuna
 from optuna.storages.journal import JournalFileBackend
 
 from adaptune.archive import INDEX, Archive
+
+PAUSE = 0.5
+"""Seconds; about what a driver takes to start, or to end after its last trial."""
 
 
 def contents(folder: Path) -> dict[Path, object]:
@@ -64,11 +69,15 @@ def disturb(
     study_file: Path,
     folder: Path,
     kills: int,
-    longest: float,
+    n_files: int,
     rng: np.random.Generator,
     *overrides: str,
 ) -> tuple[int, int]:
     """Run a campaign to its end, killing its driver or one of its workers at random moments.
+
+    Moments are counted in trials and not in seconds, so that as many kills land on a machine that
+    is busy: each comes up to `PAUSE` after up to a fifth of all trials were finished since the
+    last one, be it while the driver starts or while the model is fitted.
 
     Parameters
     ----------
@@ -76,10 +85,10 @@ def disturb(
         The study.
     kills
         The most to kill.
-    longest
-        Seconds; each kill comes at a random moment of as many since the last one.
+    n_files
+        How many trials an undisturbed campaign writes, see `files`.
     rng
-        Chooses.
+        Chooses moments, and whether a driver or a worker is killed, with equal chance.
     overrides
         Of the study's values.
 
@@ -92,23 +101,45 @@ def disturb(
     finished: dict[Path, tuple[int, int]] = {}
     driver = begin(study_file, folder, *overrides)
     while True:
-        if sum(killed) < kills:
-            try:
-                driver.wait(rng.uniform(0.0, longest))
-            except subprocess.TimeoutExpired:
-                pool = workers(driver.pid) if rng.random() < 0.5 else []
-                os.kill(int(rng.choice(pool or [driver.pid])), signal.SIGKILL)
-                killed[bool(pool)] += 1
-                if pool:
-                    continue
+        while sum(killed) < kills:
+            n = min(len(files(folder)) + int(rng.integers(n_files // 5 + 1)), n_files)
+            of_workers = bool(rng.random() < 0.5)
+            victim = _victim(driver, folder, n, of_workers, float(rng.uniform(0.0, PAUSE)), rng)
+            if victim is None:
+                break
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(victim, signal.SIGKILL)
+                killed[of_workers] += 1
+            if not of_workers:
+                break
         _, said = driver.communicate()
         now = files(folder)
         assert now.items() >= finished.items(), "a finished trial was lost or run again"
         finished = now
         if driver.returncode == 0:
             return killed[0], killed[1]
-        assert driver.returncode == -signal.SIGKILL, said
+        # By chance, several workers may have been killed at the same trials.
+        assert driver.returncode == -signal.SIGKILL or "workers died" in said, said
         driver = begin(study_file, folder, *overrides)
+
+
+def _victim(
+    driver: subprocess.Popen[str],
+    folder: Path,
+    n: int,
+    of_workers: bool,
+    pause: float,
+    rng: np.random.Generator,
+) -> int | None:
+    """Wait for `n` trials, then `pause` seconds; tell whom to kill, None if all is over."""
+    while driver.poll() is None:
+        pool = workers(driver.pid) if of_workers else [driver.pid]
+        if pool and len(list((folder / "trials").glob("*/[0-9]*.npz"))) >= n:
+            time.sleep(pause)
+            pool = workers(driver.pid) if of_workers else pool
+            return int(rng.choice(pool)) if pool and driver.poll() is None else None
+        time.sleep(0.05)
+    return None
 
 
 def check_once(folder: Path, n_trials: int, sequences: list[str]) -> None:
