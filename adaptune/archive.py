@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.files import DAMAGED_NPZ, replacing, write_text
+from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import cap
 from adaptune.space import ParameterSet
@@ -312,7 +312,8 @@ class Archive:
             return
         status, summary = path.stat(), summarise(trial)
         entry = _Entry(sequence, number, status.st_size, status.st_mtime_ns, summary)
-        with (self.folder / INDEX).open("a", encoding="utf-8") as file:
+        index = self.folder / INDEX
+        with needing_room(index), index.open("a", encoding="utf-8") as file:
             file.write(entry.dump())
         if self._finished is not None:
             self._finished.setdefault(sequence, {})[number] = summary

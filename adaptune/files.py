@@ -1,5 +1,6 @@
 """Files that are there whole or not at all."""
 
+import errno
 import os
 import tempfile
 import zipfile
@@ -7,6 +8,8 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from adaptune.errors import AdaptuneError
 
 DAMAGED_NPZ = (
     OSError,
@@ -18,6 +21,30 @@ DAMAGED_NPZ = (
     zlib.error,
 )
 """What numpy and zipfile raise on ``.npz`` files that are not what they say."""
+
+
+class FullError(AdaptuneError, OSError):
+    """There is no room for a file."""
+
+
+@contextmanager
+def needing_room(path: Path) -> Iterator[None]:
+    """Tell which file there is no room for.
+
+    Raises
+    ------
+    FullError
+        If the block finds the disk or a quota full, or the file too large.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        raise FullError(
+            f"{path}: cannot be written ({error.strerror}); make room, and run the same command "
+            f"again"
+        ) from error
 
 
 @contextmanager
@@ -34,13 +61,21 @@ def replacing(path: Path) -> Iterator[Path]:
     Path
         An unused name in the same folder with the same suffix. The file there replaces `path` in
         one step when the block ends, and is removed when the block raises.
+
+    Raises
+    ------
+    FullError
+        If there is no room for it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    with needing_room(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stem, suffix = f".{path.stem}.", path.suffix
+        handle, name = tempfile.mkstemp(prefix=stem, suffix=suffix, dir=path.parent)
     os.close(handle)
     beside = Path(name)
     try:
-        yield beside
+        with needing_room(path):
+            yield beside
         # mkstemp makes the file private; what a user receives is as readable as any new file.
         umask = os.umask(0)
         os.umask(umask)
