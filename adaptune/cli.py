@@ -255,7 +255,7 @@ def offline(
     console.print(
         report.table(
             f"RTE [%] over {model.length:g} m in training, "
-            f"{loaded.config.offline.trials} parameter sets",
+            f"{len(next(iter(training.means.values())))} parameter sets",
             training.rows,
             "Trials start anew at the reference after a lost track, which counts as 30 %; whole "
             "runs do not.",

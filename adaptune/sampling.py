@@ -399,9 +399,10 @@ def check_sampler(
         if axes is not None:
             yield from _check_grid(name, axes, space, budgeted)
     elif name != "sobol":
-        for key in ("seed", "n_startup_trials"):
+        elsewhere = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
+        for key, told in elsewhere.items():
             if key in settings:
-                yield (key,), f"is told by offline.{'seed' if key == 'seed' else 'initial'}"
+                yield (key,), f"is told by offline.{told}"
                 return
         try:
             optuna_sampler(name, settings, 0)

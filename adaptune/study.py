@@ -114,7 +114,9 @@ class Limit(_Section):
     max: float = Field(gt=0, allow_inf_nan=False)
 
 
-PRESETS: dict[str, dict[str, Any]] = {"paper": {"sampler": "tpe", "trials": 256, "runs": "whole"}}
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {"sampler": "tpe", "trials": 256, "sets": "own", "runs": "whole"}
+}
 """What presets of the offline stage set, where nothing else is said."""
 
 
@@ -127,8 +129,12 @@ class OfflineConfig(_Section):
         One of `adaptune.sampling.NAMES`, or a class of Optuna's kind as ``package.module:Class``.
     sampler_settings : dict
         What may be set of it.
+    sets : str
+        `shared`: one search, each of whose sets is run on every training sequence. `own`: a search
+        for every sequence, whose sets are run on that one alone. `both`: the one, and then the
+        others.
     trials : int, optional
-        Parameter sets, each run on every training sequence; the first is the baseline.
+        Parameter sets of a search; the first is the baseline.
     hours, stagnation, target : optional
         Other budgets: hours that batches have taken; trials in a row without a new best; a value
         of the first objective that is good enough. The search stops at the border of the batch in
@@ -167,6 +173,7 @@ class OfflineConfig(_Section):
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = {}
+    sets: Literal["shared", "own", "both"] = "shared"
     trials: int | None = Field(None, ge=1)
     hours: float | None = Field(None, gt=0, allow_inf_nan=False)
     stagnation: int | None = Field(None, ge=1)
@@ -192,6 +199,11 @@ class OfflineConfig(_Section):
     def _check_pruning(self) -> Self:
         if self.pruning != "none" and len(self.objective) > 1:
             raise ValueError("pruning goes by one objective; give one, or set pruning: none")
+        if self.pruning != "none" and self.sets == "own":
+            raise ValueError(
+                "pruning spares trials further sequences, and with sets: own each is run on one; "
+                "set pruning: none, or sets: shared or both"
+            )
         return self
 
     @model_validator(mode="before")
@@ -668,9 +680,11 @@ def _lasting(config: Mapping[str, Any]) -> dict[str, Any]:
             entry.pop("cache", None)  # changes nothing but the time it takes
             lasting[f"{kind}.{name}"] = entry
     offline = config.get("offline", {})
-    searched = ("sampler", "sampler_settings", "initial", "batch", "seed", "objective", "limits")
+    searched = ("sampler", "sampler_settings", "sets", "initial", "batch", "seed")
+    judged = ("objective", "limits")
     learned = ("runs", "repeats", "augment", "pruning")
-    lasting["offline"] = {k: value for k in (*searched, *learned) if (value := offline.get(k))}
+    keys = (*searched, *judged, *learned)
+    lasting["offline"] = {key: value for key in keys if (value := offline.get(key))}
     return lasting
 
 

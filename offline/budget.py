@@ -24,7 +24,7 @@ def max_trials(config: OfflineConfig) -> int | None:
 
 
 def spent(
-    config: OfflineConfig, verdicts: Sequence[Verdict], best: int, hours: float
+    config: OfflineConfig, verdicts: Sequence[Verdict], best: int, hours: float, number: int
 ) -> str | None:
     """Tell why a search stops at the border of a batch.
 
@@ -38,6 +38,8 @@ def spent(
         Number of the best of them.
     hours
         What their batches took.
+    number
+        By which users know the best.
 
     Returns
     -------
@@ -54,10 +56,10 @@ def spent(
     if config.target is not None and (
         verdicts[best].feasible and verdicts[best].values[0] <= config.target
     ):
-        return f"trial {best} has reached the target of {config.target:g}"
+        return f"trial {number} has reached the target of {config.target:g}"
     since = len(verdicts) - 1 - best
     if config.stagnation is not None and since >= config.stagnation:
-        return f"none of {since} trials was better than trial {best}"
+        return f"none of {since} trials was better than trial {number}"
     return None
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune import report, yaml
-from adaptune.archive import Archive, Summary
+from adaptune.archive import Archive
 from adaptune.cores import available
 from adaptune.descriptor import averaged
 from adaptune.files import write_text
@@ -17,19 +17,11 @@ from adaptune.model import ErrorModel, thin
 from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
-from offline.budget import BUDGETS, Clock, max_trials, spent
+from offline.budget import BUDGETS, Clock
 from offline.cluster import Cluster
-from offline.objective import (
-    Verdict,
-    choose_fixed,
-    judge,
-    label,
-    pareto_front,
-    told,
-    weighted,
-)
-from offline.pruning import estimate, rungs, survivors
-from offline.samplers import make_sampler
+from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
+from offline.pruning import rungs
+from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
 from offline.storage import Told, open_mirror
 from offline.validation import labelled_sequences, tune
 from offline.workers import Pool, Task, Workers, run
@@ -47,8 +39,8 @@ class Training(NamedTuple):
     ----------
     model : ErrorModel
     means : dict
-        For every training sequence the mean capped error of each trial in percent, of shape
-        (n_trials,).
+        For every training sequence the mean capped error in percent of each trial, by rising
+        number, of shape (n_trials,); NaN where it was not run.
     fixed : int
         Number of the trial of the fixed set.
     rows : list of dict
@@ -102,16 +94,16 @@ def train(
     model = replace(model, paired=tune(*labelled_sequences(study, model)))
     model.save(study.folder / "model.npz")
     finished = {
-        name: [archive.finished(name).get(n) for n in range(len(verdicts))]
+        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
         for name in study.training
     }
     means = {
-        name: [trial.mean_error if trial else np.nan for trial in trials]
+        name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
         for name, trials in finished.items()
     }
     write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
     table = _trial_rows(config, verdicts, finished)
-    report.write_rows(study.folder, "trials", table)
+    report.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
         _write_pareto(study, verdicts, table)
     rows = _training_rows(config, verdicts, finished, fixed, whole)
@@ -120,44 +112,40 @@ def train(
 
 
 def _trial_rows(
-    config: OfflineConfig,
-    verdicts: Sequence[Verdict],
-    finished: Mapping[str, Sequence[Summary | None]],
-) -> list[dict[str, Any]]:
+    config: OfflineConfig, verdicts: Mapping[int, Verdict], finished: Finished
+) -> dict[int, dict[str, Any]]:
     """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
-    rows: list[dict[str, Any]] = []
-    for n, verdict in enumerate(verdicts):
-        runs = [run for trials in finished.values() if (run := trials[n])]
-        rows.append({"trial": n, **verdict.parameters})
+    rows: dict[int, dict[str, Any]] = {}
+    for n, verdict in verdicts.items():
+        runs = [finished[name][n] for name in verdict.sequences]
+        row = rows[n] = {"trial": n, **verdict.parameters}
         if config.metrics != {"rte"}:
             judged = zip(config.objective, verdict.values, strict=True)
-            rows[-1] |= {label(weights): value for weights, value in judged}
+            row |= {label(weights): value for weights, value in judged}
             for metric in sorted(config.metrics):
-                rows[-1][metric] = float(np.mean([run.metrics[metric] for run in runs]))
+                row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.limits:
-            rows[-1]["excess"] = verdict.excess
+            row["excess"] = verdict.excess
         if config.repeats > 1:
-            rows[-1]["margin"] = verdict.margin
+            row["margin"] = verdict.margin
         mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
-        rows[-1]["mean"] = mean
+        row["mean"] = mean
         for name, trials in finished.items():
-            rows[-1][name] = run.mean_error if (run := trials[n]) else None
+            row[name] = trials[n].mean_error if n in trials else None
     return rows
 
 
 def _training_rows(
     config: OfflineConfig,
-    verdicts: Sequence[Verdict],
-    finished: Mapping[str, Sequence[Summary | None]],
+    verdicts: Mapping[int, Verdict],
+    finished: Finished,
     fixed: int,
     whole: Mapping[str, tuple[float, float]],
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
-    for name, trials in finished.items():
-        runs = {n: run for n, run in enumerate(trials) if run}
-        alone = {n: judge(config, [run]) for n, run in runs.items()}
-        best = list(runs)[choose_fixed(config, list(alone.values()))]
+    for name, runs in finished.items():
+        best = choose_fixed(config, {n: judge(config, [run]) for n, run in runs.items()})
         rows.append(
             {
                 "sequence": name,
@@ -176,10 +164,10 @@ def _training_rows(
 
 
 def _write_pareto(
-    study: Study, verdicts: Sequence[Verdict], trials: Sequence[Mapping[str, Any]]
+    study: Study, verdicts: Mapping[int, Verdict], trials: Mapping[int, Mapping[str, Any]]
 ) -> None:
     """The sets that none that keeps the limits is better than in every objective."""
-    feasible = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
+    feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
     values = np.array([verdicts[n].values for n in feasible])
     front = [feasible[i] for i in pareto_front(values)]
     report.write_rows(study.folder, "pareto", [trials[n] for n in front])
@@ -191,7 +179,7 @@ def _write_pareto(
 
 def run_batches(
     study: Study, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
-) -> list[Verdict]:
+) -> dict[int, Verdict]:
     """Run all trials that are not in the archive yet, and tell how each did.
 
     Parameters
@@ -204,139 +192,163 @@ def run_batches(
         Who runs them.
     progress
         Told about every finished trial.
+
+    Returns
+    -------
+    dict
+        Verdicts by the trials' numbers, which rise.
     """
-    config = study.config.offline
-    names, described = study.training, study.config.descriptor.names
-    finished = {name: archive.finished(name) for name in names}
-    mirror = open_mirror(study, {n: s.parameters for n, s in finished[names[0]].items()})
-    verdicts: list[Verdict] = []
-
-    sampler = make_sampler(study.space, config)
-    clock = Clock(study.folder / "elapsed.json")
-    limit = max_trials(config)
-    tally = _Tally(progress, finished)
-    batch = best = 0
-    while (reason := spent(config, verdicts, best, clock.hours(batch))) is None:
-        first = batch * config.batch
-        numbers = range(first, min(first + config.batch, limit or first + config.batch))
-        order = _hardest_first(config, finished) if batch else names
-        sets: list[ParameterSet] = []
-        if any(n not in finished[order[0]] for n in numbers):
-            sets = sampler.propose(told(verdicts))
-            numbers = numbers[: len(sets)]
-        if not numbers:
-            reason = "there is nothing else to try"
-            break
-        tally.begin((limit or numbers.stop) * len(names), numbers)
-        alive = list(numbers)
-        unframed = [name for name in names if not archive.has_frames(name, described)]
-        begun = False
-        for m in rungs(config.pruning, batch, len(names)):
-            missing = {name: [n for n in alive if n not in finished[name]] for name in order[:m]}
-            if any(missing.values()) or unframed:
-                begun = True
-                sets = sets or sampler.propose(told(verdicts))
-                tasks = _tasks(missing, unframed, sets, first, len(workers.workers()))
-                with clock.running(batch):
-                    tally.watch(_run(archive, workers, tasks))
-                unframed = []
-            if m < len(names):
-                alive = _survivors(config, order, finished, m, alive, first)
-        verdicts.extend(_verdict(config, order, finished, n) for n in numbers)
-        best = min((best, *numbers), key=lambda n: _rank(verdicts[n]))
-        tally.best = _best(config, best, verdicts[best])
-        if begun:
-            mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
-            tally.catch_up(len(verdicts) * len(names))
-            _log.info("trials %d to %d done; %s", numbers[0], numbers[-1], tally.best)
-        if len(numbers) < config.batch and limit != len(verdicts):
-            reason = "there is nothing else to try"
-            break
-        batch += 1
-    mirror.tell(len(verdicts), lambda n: _told(config, verdicts[n], finished, n))
-    tally.catch_up(len(verdicts) * len(names), end=True)
-    _log.info("the search ends: %s", reason)
-    return verdicts
+    return _Campaign(study, archive, workers, progress).run()
 
 
-def _rank(verdict: Verdict) -> tuple[bool, float, float]:
-    return not verdict.complete, verdict.excess, verdict.values[0]
+class _Campaign:
+    """Searches on their way."""
+
+    def __init__(self, study: Study, archive: Archive, workers: Pool[Any], progress: Progress):
+        self._study, self._archive, self._workers = study, archive, workers
+        self._progress = progress
+        self._config, self._names = study.config.offline, study.training
+        self._finished = {name: archive.finished(name) for name in self._names}
+        of_sequences = self._finished.values()
+        known = {n: trial.parameters for trials in of_sequences for n, trial in trials.items()}
+        self._mirror = open_mirror(study, known)
+        described = study.config.descriptor.names
+        self._unframed = [name for name in self._names if not archive.has_frames(name, described)]
+        self._stages = make_stages(study, self._finished)
+        self._tally = _Tally(progress, self._finished, self._stages)
+        # By the trials' numbers, the sequences that they are of.
+        self._counted: dict[int, Sequence[str]] = {}
+
+    def run(self) -> dict[int, Verdict]:
+        hours = 0.0
+        best: dict[int, Verdict] = {}
+        for stage in self._stages:
+            hours += self._run_stage(stage, hours)
+            best |= best_of_each(self._config, stage) if stage.alone else {}
+        self._tell()
+        self._tally.catch_up()
+        self._run_everywhere(best)
+        return {n: self._verdict(n) for n in sorted(self._counted)}
+
+    def _run_stage(self, stage: Stage, hours: float) -> float:
+        clock = Clock(self._study.folder / ("elapsed-own.json" if stage.alone else "elapsed.json"))
+        batch = 0
+        while at_work := [s for s in stage.searches if s.begin(hours + clock.hours(batch))]:
+            self._tally.begin(at_work)
+            begun = False
+            for m in rungs(self._config.pruning, batch, len(at_work[0].sequences)):
+                missing = [Missing(search.missing(m), search.parameters) for search in at_work]
+                if tasks := self._tasks(missing):
+                    begun = True
+                    with clock.running(batch):
+                        self._tally.watch(_run(self._archive, self._workers, tasks))
+                for search in at_work:
+                    search.prune(m)
+            numbers = sorted({n for search in at_work for n in search.numbers})
+            for search in at_work:
+                self._counted |= dict.fromkeys(search.numbers, search.sequences)
+                search.close()
+            self._counted[0] = self._names
+            self._tally.best = _best(self._config, stage)
+            if begun:
+                self._tell()
+                self._tally.catch_up()
+                _log.info("trials %d to %d done; %s", numbers[0], numbers[-1], self._tally.best)
+            batch += 1
+        for search in stage.searches:
+            where = f" on {search.sequences[0]}" if stage.alone else ""
+            _log.info("the search%s ends: %s", where, search.end)
+        return clock.hours(batch)
+
+    def _run_everywhere(self, best: Mapping[int, Verdict]) -> None:
+        """Run the best set of each sequence on the others, to choose the fixed one among them."""
+        missing = {name: [n for n in best if n not in self._finished[name]] for name in self._names}
+        tasks = self._tasks([Missing(missing, lambda n: best[n].parameters)])
+        for done, _ in enumerate(_run(self._archive, self._workers, tasks), start=1):
+            self._progress("best sets of each on the others", done, len(tasks), "")
+        self._counted |= dict.fromkeys(best, self._names)
+
+    def _tasks(self, missing: Sequence["Missing"]) -> list[Task]:
+        unframed, self._unframed = self._unframed, []
+        return _tasks(missing, unframed, len(self._workers.workers()))
+
+    def _verdict(self, n: int) -> Verdict:
+        return assess(n, self._counted[n], self._config, self._names, self._finished)
+
+    def _tell(self) -> None:
+        self._mirror.tell(
+            self._counted, lambda n: _told(self._config, self._verdict(n), self._finished, n)
+        )
 
 
-Finished = Mapping[str, Mapping[int, Summary]]
-"""The finished trials on every sequence, by number."""
+class Missing(NamedTuple):
+    """What is still to be run.
+
+    Attributes
+    ----------
+    numbers : dict
+        On every sequence, of the trials.
+    parameters : callable
+        Tells a trial's set.
+    """
+
+    numbers: Mapping[str, Sequence[int]]
+    parameters: Callable[[int], ParameterSet]
+
+
+def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) -> list[Task]:
+    """Share every sequence's trials between the workers; reading it again is a task of its own.
+
+    Those of the last one are shared in ever smaller pieces, so that all workers end together.
+    """
+    lacking = [
+        (name, numbers, some.parameters)
+        for some in missing
+        for name, numbers in some.numbers.items()
+        if numbers
+    ]
+    to_read = [name for name in unframed if name not in {n for n, *_ in lacking}]
+    tasks = [Task(name, (), (), frames=True) for name in to_read]
+    for last, (name, numbers, parameters) in enumerate(lacking, 1 - len(lacking)):
+        left = numbers
+        while left:
+            size = math.ceil(len(left) / n_workers / (1 if last else 2))
+            tasks += [
+                Task(name, tuple(n), tuple(map(parameters, n)), frames=name in unframed)
+                for share in range(n_workers)
+                if (n := left[share * size : (share + 1) * size])
+            ]
+            left = left[n_workers * size :]
+    return tasks
 
 
 def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> Told:
     """What the mirror is told of a trial."""
-    trials = {name: of[n] for name, of in finished.items() if n in of}
+    trials = {name: finished[name][n] for name in verdict.sequences}
     attributes = {name: trial.mean_error for name, trial in trials.items()}
     attributes["lost"] = sum(trial.lost for trial in trials.values())
     attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
-    if config.limits:
-        attributes["excess"] = verdict.excess
-    return Told(verdict.parameters, verdict.values, attributes)
-
-
-def _values(config: OfflineConfig, order: Sequence[str], finished: Finished, n: int) -> list[float]:
-    """A trial's first objective on the sequences that it was run on."""
-    runs = [finished[name][n] for name in order if n in finished[name]]
-    return [weighted(config.objective[0], run.metrics) for run in runs]
-
-
-def _hardest_first(config: OfflineConfig, finished: Finished) -> list[str]:
-    """The sequences by falling mean of the first objective over the first batch."""
-    first = range(config.batch)
-    means = {
-        name: np.mean([weighted(config.objective[0], trials[n].metrics) for n in first])
-        for name, trials in finished.items()
+    constraints = {
+        f"{name} <= {limit.max:g}": by
+        for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
     }
-    return sorted(means, key=lambda name: -means[name])
-
-
-def _survivors(
-    config: OfflineConfig,
-    order: Sequence[str],
-    finished: Finished,
-    m: int,
-    alive: Sequence[int],
-    first: int,
-) -> list[int]:
-    """Those of a batch that begins with trial `first` that go on beyond `m` sequences."""
-
-    def values(numbers: Iterable[int], seen: Sequence[str]) -> dict[int, list[float]]:
-        return {
-            n: _values(config, seen, finished, n)
-            for n in numbers
-            if _verdict(config, seen, finished, n).feasible
-        }
-
-    return survivors(config.pruning, m, values(alive, order[:m]), values(range(first), order))
-
-
-def _verdict(config: OfflineConfig, order: Sequence[str], finished: Finished, n: int) -> Verdict:
-    """What a trial came to, or would have if it had not been given up."""
-    verdict = judge(config, [finished[name][n] for name in order if n in finished[name]])
-    if all(n in finished[name] for name in order):
-        return verdict
-    value = estimate(_values(config, order, finished, n), _values(config, order, finished, 0))
-    return verdict._replace(values=(value,), complete=False)
+    return Told(verdict.parameters, verdict.values, attributes, constraints)
 
 
 class _Tally:
     """What the progress tells of trials."""
 
-    def __init__(self, progress: Progress, finished: Finished):
+    def __init__(self, progress: Progress, finished: Finished, stages: Sequence[Stage]):
         self.best = ""
         self._progress, self._finished = progress, finished
-        self._done = self._failed = self._total = 0
+        self._searches = [search for stage in stages for search in stage.searches]
+        self._done = self._failed = 0
 
-    def begin(self, total: int, numbers: Iterable[int]) -> None:
+    def begin(self, at_work: Iterable[Search]) -> None:
         """Begin a batch, some of whose trials may be finished."""
-        self._total = total
-        numbers = list(numbers)
-        for name, finished in self._finished.items():
-            self._add(name, [n for n in numbers if n in finished])
+        for search in at_work:
+            for name in search.sequences:
+                self._add(name, [n for n in search.numbers if n in self._finished[name]])
         self._show()
 
     def watch(self, tasks: Iterable[tuple[Task, int]]) -> None:
@@ -345,10 +357,9 @@ class _Tally:
             self._add(task.sequence, task.numbers)
             self._show(running)
 
-    def catch_up(self, done: int, end: bool = False) -> None:
+    def catch_up(self) -> None:
         """Count as done what will not be run, too."""
-        self._done = done
-        self._total = done if end else self._total
+        self._done = sum(len(s.verdicts) * len(s.sequences) for s in self._searches)
         self._show()
 
     def _add(self, name: str, numbers: Iterable[int]) -> None:
@@ -360,39 +371,20 @@ class _Tally:
         remarks = [f"{running} running"] if running else []
         remarks += [self.best] if self.best else []
         remarks += [f"{self._failed} lost track or failed"] if self._failed else []
-        self._progress("trials", self._done, self._total, ", ".join(remarks))
+        total = sum(search.total() for search in self._searches)
+        self._progress("trials", self._done, total, ", ".join(remarks))
 
 
-def _best(config: OfflineConfig, number: int, verdict: Verdict) -> str:
-    what = f"{label(config.objective[0])} {verdict.values[0]:.3f}"
-    return f"best {what} (trial {number})" + (
-        "" if verdict.feasible else ", which does not keep the limits"
-    )
-
-
-def _tasks(
-    missing: dict[str, list[int]],
-    unframed: list[str],
-    sets: list[ParameterSet],
-    first: int,
-    n_workers: int,
-) -> list[Task]:
-    """Share every sequence's trials between the workers; reading it again is a task of its own.
-
-    Those of the last one are shared in ever smaller pieces, so that all workers end together.
-    """
-    tasks = [Task(name, (), (), frames=True) for name in unframed if not missing.get(name)]
-    for last, (name, numbers) in enumerate(missing.items(), 1 - len(missing)):
-        left = numbers
-        while left:
-            size = math.ceil(len(left) / n_workers / (1 if last else 2))
-            tasks += [
-                Task(name, tuple(n), tuple(sets[i - first] for i in n), frames=name in unframed)
-                for share in range(n_workers)
-                if (n := left[share * size : (share + 1) * size])
-            ]
-            left = left[n_workers * size :]
-    return tasks
+def _best(config: OfflineConfig, stage: Stage) -> str:
+    """The best so far; the mean of them where each is of one sequence."""
+    best = [search.verdicts[search.best] for search in stage.searches]
+    value = float(np.mean([verdict.values[0] for verdict in best]))
+    what = f"best {label(config.objective[0])} {value:.3f}"
+    if stage.alone:
+        return f"{what} in the mean of {len(best)} sequences"
+    (search,) = stage.searches
+    feasible = "" if best[0].feasible else ", which does not keep the limits"
+    return f"{what} (trial {search.number(search.best)}){feasible}"
 
 
 def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[tuple[Task, int]]:
@@ -409,7 +401,7 @@ def _run_whole(
     study: Study,
     archive: Archive,
     workers: Pool[Any],
-    verdicts: Sequence[Verdict],
+    verdicts: Mapping[int, Verdict],
     fixed: int,
     progress: Progress,
 ) -> dict[str, tuple[float, float]]:
@@ -431,10 +423,10 @@ def _run_whole(
     return {name: (means[name, 0], means[name, fixed]) for name in names}
 
 
-def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int) -> ErrorModel:
+def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int) -> ErrorModel:
     """Make the error model of all trials that keep the limits.
 
-    Sets that were given up have no errors (NaN) on the sequences that they were not run on.
+    Sets have no errors (NaN) on the sequences that they were not run on.
 
     Parameters
     ----------
@@ -443,15 +435,17 @@ def fit(study: Study, archive: Archive, verdicts: Sequence[Verdict], fixed: int)
     archive
         Its trials.
     verdicts
-        How they did, in their order.
+        How they did, by their numbers.
     fixed
         Number of the fixed set's.
     """
-    numbers = [n for n, verdict in enumerate(verdicts) if verdict.feasible]
+    numbers = [n for n, verdict in verdicts.items() if verdict.feasible]
     descriptors, sequence, errors, elevations = [], [], [], []
     window = study.window
     for s, name in enumerate(study.training):
         of_sequence = archive.read_errors(name, numbers)
+        # What another budget has had run besides does not count.
+        of_sequence[:, [name not in verdicts[n].sequences for n in numbers]] = np.nan
         # Whether there is a sub-trajectory depends on the reference alone.
         labelled = ~np.isnan(of_sequence).all(axis=1)
         frames = archive.read_frames(name)

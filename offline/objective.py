@@ -47,25 +47,55 @@ class Verdict(NamedTuple):
     parameters : dict
     values : tuple of float
         Of every objective, the mean over the sequences.
-    excess : float
-        By how much limits are exceeded, each in parts of the limit; 0 if it keeps them all.
+    constraints : tuple of float
+        For every limit by how much it is exceeded, in parts of it; negative if it is kept.
     margin : float
         From the first value to the upper end of its one-sided 95 % confidence interval, where
         trials are repeated; 0 where they are not.
     complete : bool
-        Whether it was run on all sequences; if not, its value is an estimate.
+        Whether it was run on all sequences; if not, its values are estimates.
+    sequences : tuple of str
+        Those that it was run on.
     """
 
     parameters: ParameterSet
     values: tuple[float, ...]
-    excess: float
+    constraints: tuple[float, ...] = ()
     margin: float = 0.0
     complete: bool = True
+    sequences: tuple[str, ...] = ()
+
+    @property
+    def excess(self) -> float:
+        """By how much all limits together are exceeded, each in parts of the limit."""
+        return exceeded(self.constraints)
 
     @property
     def feasible(self) -> bool:
         """Whether it keeps all limits."""
         return self.excess == 0.0
+
+
+class Result(NamedTuple):
+    """What samplers are told of a trial.
+
+    Attributes
+    ----------
+    parameters : dict
+    value : float or tuple of float
+        To be minimised.
+    constraints : tuple of float
+        See `Verdict`.
+    """
+
+    parameters: ParameterSet
+    value: Value
+    constraints: tuple[float, ...] = ()
+
+
+def exceeded(constraints: Sequence[float]) -> float:
+    """Sum of what is exceeded."""
+    return sum(max(0.0, by) for by in constraints)
 
 
 def trajectory_metrics(
@@ -130,9 +160,11 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
         float(np.mean([weighted(weights, of_run) for of_run in metrics]))
         for weights in config.objective
     )
-    worst = {name: max(of_run[name] for of_run in metrics) for name in config.limits}
-    excess = sum(max(0.0, worst[m] / limit.max - 1.0) for m, limit in config.limits.items())
-    return Verdict(runs[0].parameters, values, excess, _margin(config.objective[0], runs))
+    constraints = tuple(
+        max(of_run[name] for of_run in metrics) / limit.max - 1.0
+        for name, limit in config.limits.items()
+    )
+    return Verdict(runs[0].parameters, values, constraints, _margin(config.objective[0], runs))
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -151,30 +183,44 @@ def _margin(weights: Mapping[Metric, float], runs: Sequence[Summary]) -> float:
     return float(stats.t.ppf(0.95, n_runs * (n_repeats - 1)) * error)
 
 
-def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, Value]]:
+def told(verdicts: Sequence[Verdict]) -> list[Result]:
     """What samplers are told: values, a tuple of them where there are several objectives.
-
-    Sets that break limits are told to be worse by ten times the baseline's value, and the more so
-    the more they exceed: what is proposed next keeps away from them.
 
     Parameters
     ----------
     verdicts
+        Of all trials.
+    """
+    return [
+        Result(v.parameters, v.values if len(v.values) > 1 else v.values[0], v.constraints)
+        for v in verdicts
+    ]
+
+
+def penalised(history: Sequence[Result]) -> list[Result]:
+    """Put limits into the values, for samplers that know nothing of constraints.
+
+    Sets that break limits are worse by ten times the baseline's value, and the more so the more
+    they exceed: what is proposed next keeps away from them.
+
+    Parameters
+    ----------
+    history
         Of all trials, the baseline's first.
     """
-    history: list[tuple[ParameterSet, Value]] = []
-    for verdict in verdicts:
-        values = verdict.values
-        if not verdict.feasible:
-            values = tuple(
-                value + SEVERITY * (baseline or 1.0) * (1.0 + verdict.excess)
-                for value, baseline in zip(values, verdicts[0].values, strict=True)
-            )
-        history.append((verdict.parameters, values if len(values) > 1 else values[0]))
-    return history
+    if not any(result.constraints for result in history):
+        return list(history)
+    made = []
+    for parameters, value, constraints in history:
+        values, baseline = np.atleast_1d(value), np.atleast_1d(history[0].value)
+        if (excess := exceeded(constraints)) > 0.0:
+            values = values + SEVERITY * np.where(baseline, baseline, 1.0) * (1.0 + excess)
+        several = tuple(values.tolist())
+        made.append(Result(parameters, several if len(several) > 1 else several[0]))
+    return made
 
 
-def choose_fixed(config: OfflineConfig, verdicts: Sequence[Verdict]) -> int:
+def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
     """Number of the set that does best by the first objective among those that keep all limits.
 
     Where trials are repeated, the one whose value is surely least: the upper end of its confidence
@@ -185,12 +231,13 @@ def choose_fixed(config: OfflineConfig, verdicts: Sequence[Verdict]) -> int:
     AdaptuneError
         If there is none.
     """
-    feasible = [n for n, verdict in enumerate(verdicts) if verdict.feasible and verdict.complete]
+    complete = [n for n, verdict in verdicts.items() if verdict.complete]
+    feasible = [n for n in complete if verdicts[n].feasible]
     if not feasible:
-        nearest = min(range(len(verdicts)), key=lambda n: verdicts[n].excess)
+        nearest = min(complete, key=lambda n: verdicts[n].excess)
         limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
         raise AdaptuneError(
-            f"offline.limits: none of {len(verdicts)} parameter sets keeps {limits} on every "
+            f"offline.limits: none of {len(complete)} parameter sets keeps {limits} on every "
             f"sequence; nearest comes trial {nearest}, {verdicts[nearest].excess:.0%} beyond: "
             f"loosen the limits, widen the ranges of the parameters, or run more trials"
         )

@@ -7,7 +7,7 @@ been told.
 import logging
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ import sqlalchemy.exc
 from optuna.storages.journal import JournalFileBackend
 
 from adaptune.errors import AdaptuneError
+from adaptune.files import needing_room
 from adaptune.space import Categorical, Float, Integer, ParameterSet
 from adaptune.study import Study
 
@@ -26,7 +27,7 @@ JOURNAL = "optuna.log"
 _NUMBER = "adaptune trial"
 # Each trial is a line of the journal with this in it.
 _LINE = re.compile(rb'"adaptune trial":(\d+)[^\n]*\n')
-_TOLD = re.compile(r"://(.*@)")
+_LOGIN = re.compile(r"://(.*@)")
 
 _log = logging.getLogger(__name__)
 
@@ -45,11 +46,14 @@ class Told(NamedTuple):
         What is minimised, one for each objective.
     attributes : dict
         What else there is to know, as plain data.
+    constraints : dict
+        For every limit by how much it is exceeded; negative if it is kept.
     """
 
     parameters: ParameterSet
     values: tuple[float, ...]
     attributes: Mapping[str, Any] = {}
+    constraints: Mapping[str, float] = {}
 
 
 def open_mirror(study: Study, finished: Mapping[int, ParameterSet]) -> "Mirror":
@@ -82,8 +86,8 @@ class Mirror(ABC):
         self._distributions = {n: distribution(p) for n, p in study.space.parameters.items()}
 
     @abstractmethod
-    def tell(self, n: int, trial: Callable[[int], Told]) -> None:
-        """Tell of the first `n` trials; those that it knows are not asked for again."""
+    def tell(self, numbers: Collection[int], trial: Callable[[int], Told]) -> None:
+        """Tell of trials in this order; those that it knows are not asked for again."""
 
     def _create(self, storage: Any) -> optuna.Study:
         return optuna.create_study(
@@ -93,17 +97,28 @@ class Mirror(ABC):
             directions=self._directions,
         )
 
-    def _add(self, mirror: optuna.Study, n: int, trial: Callable[[int], Told]) -> None:
-        for number in range(len(mirror.get_trials(deepcopy=False)), n):
-            parameters, values, attributes = trial(number)
-            finite = np.isfinite(values).all()
+    @staticmethod
+    def _known(mirror: optuna.Study) -> dict[int, ParameterSet]:
+        trials = mirror.get_trials(deepcopy=False)
+        return {trial.user_attrs.get(_NUMBER, trial.number): trial.params for trial in trials}
+
+    def _add(
+        self, mirror: optuna.Study, numbers: Collection[int], trial: Callable[[int], Told]
+    ) -> None:
+        known = self._known(mirror)
+        for number in numbers:
+            if number in known:
+                continue
+            told = trial(number)
+            finite = np.isfinite(told.values).all()
             mirror.add_trial(
                 optuna.trial.create_trial(
                     state=optuna.trial.TrialState.COMPLETE if finite else _FAIL,
-                    params=parameters,
+                    params=told.parameters,
                     distributions=self._distributions,
-                    values=values if finite else None,
-                    user_attrs={_NUMBER: number} | dict(attributes),
+                    values=told.values if finite else None,
+                    user_attrs={_NUMBER: number} | dict(told.attributes),
+                    constraints=dict(told.constraints),
                 )
             )
 
@@ -121,14 +136,16 @@ class JournalMirror(Mirror):
         # A driver that was killed may have left its lock behind.
         self._path.with_name(JOURNAL + ".lock").unlink(missing_ok=True)
 
-    def tell(self, n: int, trial: Callable[[int], Told]) -> None:
+    def tell(self, numbers: Collection[int], trial: Callable[[int], Told]) -> None:
         """See `Mirror`."""
         if self._mirror is None:
             # Optuna replays a journal when it is opened, which takes its time.
-            if _n_told(self._path) >= n:
+            if _told(self._path).issuperset(numbers):
                 return
-            self._mirror = self._open()
-        self._add(self._mirror, n, trial)
+            with needing_room(self._path):
+                self._mirror = self._open()
+        with needing_room(self._path):
+            self._add(self._mirror, numbers, trial)
 
     def _open(self) -> optuna.Study:
         if self._path.exists() and not self._path.read_bytes().endswith(b"\n"):
@@ -145,11 +162,12 @@ def _journal(path: Path) -> optuna.storages.JournalStorage:
     return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
 
 
-def _n_told(path: Path) -> int:
+def _told(path: Path) -> set[int]:
+    """Numbers of the trials in a journal."""
     try:
-        return len(set(_LINE.findall(path.read_bytes())))
+        return {int(number) for number in _LINE.findall(path.read_bytes())}
     except FileNotFoundError:
-        return 0
+        return set()
 
 
 class DatabaseMirror(Mirror):
@@ -170,7 +188,7 @@ class DatabaseMirror(Mirror):
         if url.startswith("postgresql://"):
             url = url.replace("://", "+pg8000://", 1)
         # Passwords are not for logs.
-        self._where = f"offline.storage: {_TOLD.sub('://', url)}"
+        self._where = f"offline.storage: {_LOGIN.sub('://', url)}"
         self._complained = False
         try:
             self._mirror = self._create(url)
@@ -192,7 +210,7 @@ class DatabaseMirror(Mirror):
 
     def _check(self, finished: Mapping[int, ParameterSet]) -> None:
         """Refuse a database that holds another study of this name."""
-        told = {t.number: t.params for t in self._mirror.get_trials(deepcopy=False)}
+        told = self._known(self._mirror)
         common = told.keys() & finished.keys()
         if told and (not common or any(told[n] != finished[n] for n in common)):
             raise StorageError(
@@ -201,10 +219,10 @@ class DatabaseMirror(Mirror):
                 f"`optuna delete-study`"
             )
 
-    def tell(self, n: int, trial: Callable[[int], Told]) -> None:
+    def tell(self, numbers: Collection[int], trial: Callable[[int], Told]) -> None:
         """See `Mirror`; a database that has gone is told with later ones, if it returns."""
         try:
-            self._add(self._mirror, n, trial)
+            self._add(self._mirror, numbers, trial)
         except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
             if not self._complained:
                 _log.warning(

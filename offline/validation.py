@@ -29,6 +29,7 @@ from adaptune.model import (
 from adaptune.model.base import complementary, mean_errors
 from adaptune.study import Study, origin
 from offline.objective import weighted
+from offline.search import owner
 
 MIN_SEQUENCES = 6
 """Fewer say too little about places they are not to advise for adapting."""
@@ -69,6 +70,9 @@ class LabelledSequence:
         Errors of the baseline, which may break limits; those of the first set when left out.
     values : ndarray of shape (n_sets,), optional
         By what the fixed set is chosen; the mean capped error when left out.
+    own : ndarray of shape (n_sets,), optional
+        Sets that were searched for on this very place, or a view of it, and on no other: who has
+        not been there does not know them.
     """
 
     name: str
@@ -78,6 +82,7 @@ class LabelledSequence:
     blocks: tuple[int, ...] | None = None
     baseline: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
+    own: NDArray[np.bool_] | None = None
 
 
 class LeftOut(NamedTuple):
@@ -290,17 +295,13 @@ def labelled_sequences(
 ) -> tuple[list[LabelledSequence], NDArray[np.float64]]:
     """The training sequences of a model, and its sets in the unit cube, from the archive.
 
-    Only of sets that were run on all sequences: what was given up has no error to be looked up.
+    Only of sets that were run on all sequences: others have no error to be looked up.
     """
     archive = Archive(study.folder / "trials")
     period = study.config.online.period
-    finished = [archive.finished(name) for name in model.sequences]
-    of_number = {
-        n: parameters
-        for n, parameters in zip(model.provenance["trials"], model.sets, strict=True)
-        if all(n in trials for trials in finished)
-    }
-    numbers = list(of_number)
+    everywhere = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
+    numbers = [model.provenance["trials"][i] for i in everywhere]
+    owners = [owner(study.config.offline, model.sequences, n) for n in numbers]
     objective = study.config.offline.objective[0]
     sequences = []
     for name in model.sequences:
@@ -319,9 +320,10 @@ def labelled_sequences(
                 tuple(frames.blocks.values()),
                 archive.read(name, 0).errors[labelled],
                 np.array(values),
+                np.array([other is not None and origin(other) == origin(name) for other in owners]),
             )
         )
-    return sequences, model.space.to_unit(list(of_number.values()))
+    return sequences, model.space.to_unit([model.sets[i] for i in everywhere])
 
 
 Maker = Callable[[Sequence[LabelledSequence], NDArray[np.float64]], Rule]
@@ -441,8 +443,13 @@ def _leave_out(
 def _comparable(
     sequence: LabelledSequence, others: Sequence[LabelledSequence], sets: NDArray[np.float64]
 ) -> tuple[LabelledSequence, list[LabelledSequence], NDArray[np.float64]]:
-    """All of it for those sets only that were run on the sequence left out: others tell nothing."""
+    """All of it for those sets only that were run on the sequence left out: others tell nothing.
+
+    Nor for those that nobody would know who has not been there.
+    """
     run = ~np.isnan(sequence.errors).any(axis=0)
+    if sequence.own is not None:
+        run &= ~sequence.own
     if run.all():
         return sequence, list(others), sets
     few = [

@@ -4,10 +4,10 @@ from adaptune.space import ParameterSpace
 from adaptune.study import OfflineConfig
 from offline.samplers.annealing import AnnealingSampler
 from offline.samplers.asked import AskedSampler
-from offline.samplers.base import Result, Sampler
+from offline.samplers.base import Sampler
 from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
 
-__all__ = ["AnnealingSampler", "Result", "Sampler", "make_sampler"]
+__all__ = ["AnnealingSampler", "Sampler", "make_sampler"]
 
 OURS: dict[str, type[Sampler]] = {
     "grid": GridSampler,

@@ -252,7 +252,12 @@ class AnnealingSampler(BaseSampler):
     def _walk(self, study: Study, trials: list[_Trial]) -> list[Chain]:
         trials.sort(key=lambda t: t[0])
         walked, numbers = self._walked, [number for number, *_ in trials]
-        if walked is None or walked[0] != study.study_name or not _extends(numbers, walked[1]):
+        if (
+            walked is None
+            or walked[0] != study.study_name
+            or not _extends(numbers, walked[1])
+            or len(walked[1]) < self.n_startup_trials  # and the chains begin at the best of them
+        ):
             walked = study.study_name, [n for n in numbers if n < self.n_startup_trials], []
             walked[2].extend(self._started(study, trials[: len(walked[1])]))
         chains = [copy.copy(chain) for chain in walked[2]]

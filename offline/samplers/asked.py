@@ -9,13 +9,21 @@ import optuna
 from adaptune.sampling import AnnealingSettings, SamplerError, optuna_sampler
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 from adaptune.study import OfflineConfig
+from offline.objective import Result
 from offline.samplers.annealing import AnnealingSampler
-from offline.samplers.base import Result, Sampler, Tried, key
+from offline.samplers.base import Sampler, Tried, key
 from offline.samplers.points import sobol_points
 from offline.storage import distribution
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
+CONSTRAINED = (
+    optuna.samplers.TPESampler,
+    optuna.samplers.GPSampler,
+    optuna.samplers.NSGAIISampler,
+    optuna.samplers.NSGAIIISampler,
+)
+"""These know of constraints."""
 FORGETFUL = ("tpe", "gp")
 """To these, a trial that they are told of is as good as one that they were asked for."""
 _ATTEMPTS = 32
@@ -44,6 +52,7 @@ class AskedSampler(Sampler):
         super().__init__(space, config)
         self._distributions = {name: _distribution(p) for name, p in space.parameters.items()}
         self._begin(0, ())
+        self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
     def _begin(self, seed: int, history: Sequence[Result]) -> None:
         self._study = optuna.create_study(
@@ -51,14 +60,15 @@ class AskedSampler(Sampler):
         )
         self._study.add_trials(
             optuna.trial.create_trial(
-                params=self._encode(parameters),
+                params=self._encode(result.parameters),
                 distributions=self._distributions,
-                values=np.atleast_1d(value).tolist(),
+                values=np.atleast_1d(result.value).tolist(),
+                constraints=_named(result.constraints),
             )
-            for parameters, value in history
+            for result in history
         )
         self._history = list(history)
-        self._values = {key(parameters): value for parameters, value in history}
+        self._known = {key(result.parameters): result for result in history}
         self._waiting: dict[str, tuple[ParameterSet, list[Any]]] = {}
 
     def _sampler(self, batch: int) -> Any:
@@ -93,8 +103,8 @@ class AskedSampler(Sampler):
 
     def _ask(self, numbers: range) -> list[ParameterSet]:
         """Sets of the next batch, the same ones until they are answered."""
-        if not self._waiting:
-            tried = Tried(parameters for parameters, _ in self._history)
+        if not self._waiting and not self._stalled():
+            tried = Tried(result.parameters for result in self._history)
             n_initial = self._n_initial(numbers)
             given = [self.space.baseline] if numbers.start == 0 else []
             given += sobol_points(
@@ -105,6 +115,13 @@ class AskedSampler(Sampler):
                 if not self._ask_once(number, first, tried):
                     break
         return [parameters for parameters, _ in self._waiting.values()]
+
+    def _stalled(self) -> bool:
+        sampler = self._study.sampler
+        if isinstance(sampler, AnnealingSampler) and sampler.stalled(self._study):
+            self.end = "all chains have stalled"
+            return True
+        return False
 
     def _n_initial(self, numbers: range) -> int:
         n = 1 if self.config.sampler == "qmc" else self.config.initial
@@ -122,8 +139,8 @@ class AskedSampler(Sampler):
             trial = self._study.ask(self._distributions)
             parameters, given = given or self._decode(trial.params), None
             name = key(parameters)
-            if name in self._values:
-                self._study.tell(trial, self._values[name])
+            if name in self._known:
+                self._tell(trial, self._known[name])
             elif name in self._waiting:
                 self._waiting[name][1].append(trial)
             else:
@@ -133,19 +150,25 @@ class AskedSampler(Sampler):
         raise AssertionError
 
     def _answer(self, results: Sequence[Result]) -> None:
-        if [parameters for parameters, _ in self._waiting.values()] != [p for p, _ in results]:
+        asked = [parameters for parameters, _ in self._waiting.values()]
+        if asked != [result.parameters for result in results]:
             raise SamplerError(
                 f"{self.config.sampler} no longer proposes what it proposed for trials "
                 f"{len(self._history)} to {len(self._history) + len(results) - 1}: is another "
                 f"version of it installed? Go back to that one, or give the study another folder "
                 f"(--folder)"
             )
-        for (_, trials), (parameters, value) in zip(self._waiting.values(), results, strict=True):
+        for (_, trials), result in zip(self._waiting.values(), results, strict=True):
             for trial in trials:
-                self._study.tell(trial, value)
-            self._values[key(parameters)] = value
+                self._tell(trial, result)
+            self._known[key(result.parameters)] = result
         self._history += results
         self._waiting = {}
+
+    def _tell(self, trial: optuna.Trial, result: Result) -> None:
+        for name, by in _named(result.constraints).items():
+            trial.set_constraint(name, by)
+        self._study.tell(trial, result.value)
 
     # Optuna takes choices for equal that Python does (1 and True), and so it is given their index.
 
@@ -165,6 +188,10 @@ class AskedSampler(Sampler):
                 value = min(max(value, p.low), p.high)
                 decoded[name] = float(value) if isinstance(p, Float) else int(value)
         return decoded
+
+
+def _named(constraints: Sequence[float]) -> dict[str, float]:
+    return {str(i): by for i, by in enumerate(constraints)}
 
 
 def _distribution(parameter: Float | Integer | Categorical) -> Any:

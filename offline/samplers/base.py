@@ -2,16 +2,15 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
 from adaptune.sampling import Grid
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.study import OfflineConfig
-from offline.objective import Value
+from offline.objective import Result, penalised
 
-Result = tuple[ParameterSet, Value]
-"""A trial's parameters, and what is to be minimised."""
 _ENUMERABLE = 4096
 _DRAWS = 1000
 
@@ -21,7 +20,8 @@ class Sampler(ABC):
 
     What is proposed depends on the seed and on the results of the batches before, and on nothing
     else: not on how many trials there will be, nor on who runs them. Trial 0 is the baseline, and
-    no set is proposed twice.
+    no set is proposed twice. Those that know nothing of constraints are told of broken limits as of
+    bad values.
 
     Parameters
     ----------
@@ -31,17 +31,23 @@ class Sampler(ABC):
         Seed, sizes and settings.
     """
 
+    constrained = False
+    """Whether it knows of constraints."""
+    end = "there is nothing else to try"
+    """Why it proposes fewer sets than it is asked for."""
+
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         self.space = space
         self.config = config
 
-    def propose(self, history: Sequence[Result]) -> list[ParameterSet]:
+    def propose(self, history: Sequence[tuple[Any, ...]]) -> list[ParameterSet]:
         """Propose the parameter sets of the next batch.
 
         Parameters
         ----------
         history
-            Results of all trials of the batches before, in their order.
+            Results of all trials of the batches before, in their order: `Result`, or tuples of its
+            first values.
 
         Returns
         -------
@@ -52,7 +58,10 @@ class Sampler(ABC):
         first = len(history)
         if first % self.config.batch:
             raise ValueError(f"batches have {self.config.batch} trials; {first} are no whole ones")
-        return self._propose(range(first, first + self.config.batch), history)
+        results = [Result(*result) for result in history]
+        if not self.constrained:
+            results = penalised(results)
+        return self._propose(range(first, first + self.config.batch), results)
 
     @abstractmethod
     def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]: ...

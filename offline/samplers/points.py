@@ -11,7 +11,8 @@ from scipy.stats import qmc
 from adaptune.sampling import Grid, GridSettings, RandomSettings, make_grid
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.study import OfflineConfig
-from offline.samplers.base import Result, Sampler, Tried
+from offline.objective import Result
+from offline.samplers.base import Sampler, Tried
 
 _SHUFFLED = 1 << 20
 
@@ -20,7 +21,7 @@ class PointSampler(Sampler):
     """Proposes a given set for every number of a trial, or another one if it was tried before."""
 
     def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]:
-        tried = Tried(parameters for parameters, _ in history)
+        tried = Tried(result.parameters for result in history)
         sets: list[ParameterSet] = []
         points = [self.space.baseline] if numbers.start == 0 else []
         points += self._points(range(numbers.start + len(points), numbers.stop))

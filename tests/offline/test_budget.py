@@ -11,7 +11,7 @@ from offline.objective import Verdict
 
 
 def verdicts(*values):
-    return [Verdict({"x": float(i)}, (value,), 0.0) for i, value in enumerate(values)]
+    return [Verdict({"x": float(i)}, (value,)) for i, value in enumerate(values)]
 
 
 @pytest.mark.parametrize(
@@ -35,14 +35,14 @@ def verdicts(*values):
 )
 def test_stops_when_the_first_budget_is_used_up(budget, errors, hours, reason):
     best = errors.index(min(errors)) if errors else 0
-    found = spent(OfflineConfig(**budget), verdicts(*errors), best, hours)
+    found = spent(OfflineConfig(**budget), verdicts(*errors), best, hours, best)
     assert (found is None) == (reason is None)
     assert reason is None or re.search(reason, found)
 
 
 def test_a_set_that_breaks_a_limit_reaches_no_target():
-    broken = Verdict({"x": 1.0}, (0.1,), 0.5)
-    assert spent(OfflineConfig(target=0.5), [broken], 0, 0.0) is None
+    broken = Verdict({"x": 1.0}, (0.1,), (0.5,))
+    assert spent(OfflineConfig(target=0.5), [broken], 0, 0.0, 0) is None
 
 
 def test_64_trials_where_nothing_else_says_when():

@@ -18,12 +18,14 @@ from adaptune.study import ConfigurationError, OfflineConfig, Study, load_study
 from offline.campaign import train
 from offline.objective import (
     SEVERITY,
+    Result,
     Verdict,
     choose_fixed,
     joined,
     judge,
     label,
     pareto_front,
+    penalised,
     told,
 )
 from offline.trial import PreparedSequence, run_trials
@@ -66,16 +68,18 @@ def test_a_sum_is_a_mean_over_sequences_and_a_limit_holds_on_each():
     verdict = judge(of, runs)
     assert verdict.parameters == {"a": 1}
     assert verdict.values == pytest.approx((0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0),))
+    assert verdict.constraints == pytest.approx((0.5,))
     assert verdict.excess == pytest.approx(0.5)
     assert judge(of, runs[:1]).feasible
+    assert judge(of, runs[:1]).constraints == pytest.approx((-0.5,))
 
 
 def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
-    verdicts = [Verdict({}, (2.0,), 0.0), Verdict({}, (1.0,), 0.1), Verdict({}, (2.0,), 0.0)]
-    assert choose_fixed(config(), verdicts) == 0
+    verdicts = [Verdict({}, (2.0,)), Verdict({}, (1.0,), (0.1,)), Verdict({}, (2.0,), (-0.1,))]
+    assert choose_fixed(config(), dict(enumerate(verdicts))) == 0
     of = config(limits={"ms_per_scan": {"max": 20}})
     with pytest.raises(AdaptuneError, match=r"none of 1 .* keeps ms_per_scan <= 20 .* 10% beyond"):
-        choose_fixed(of, verdicts[1:2])
+        choose_fixed(of, {7: verdicts[1]})
 
 
 def test_of_repeated_trials_the_surely_best_is_taken():
@@ -90,15 +94,17 @@ def test_of_repeated_trials_the_surely_best_is_taken():
     error = np.sqrt(np.var([0.2, 0.9, 1.9], ddof=1) / 3) / 2
     assert verdicts[1].margin == pytest.approx(2.1318 * error, rel=1e-4)
     assert verdicts[1].values < verdicts[0].values
-    assert choose_fixed(config(), verdicts) == 0
+    assert choose_fixed(config(), dict(enumerate(verdicts))) == 0
     assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
 
 
-def test_samplers_are_told_a_penalty():
-    history = told([Verdict({"a": 0}, (2.0,), 0.0), Verdict({"a": 1}, (1.0,), 0.5)])
-    assert history == [({"a": 0}, 2.0), ({"a": 1}, 1.0 + SEVERITY * 2.0 * 1.5)]
-    several = told([Verdict({}, (0.0, 4.0), 0.0), Verdict({}, (1.0, 1.0), 1.0)])
-    assert [value for _, value in several] == [(0.0, 4.0), (21.0, 81.0)]
+def test_samplers_are_told_of_limits():
+    history = told([Verdict({"a": 0}, (2.0,), (-0.3,)), Verdict({"a": 1}, (1.0,), (0.5,))])
+    assert history == [Result({"a": 0}, 2.0, (-0.3,)), Result({"a": 1}, 1.0, (0.5,))]
+    assert penalised(history) == [({"a": 0}, 2.0, ()), ({"a": 1}, 1.0 + SEVERITY * 2.0 * 1.5, ())]
+    several = told([Verdict({}, (0.0, 4.0)), Verdict({}, (1.0, 1.0), (1.0, -2.0))])
+    assert [result.value for result in several] == [(0.0, 4.0), (1.0, 1.0)]
+    assert [result.value for result in penalised(several)] == [(0.0, 4.0), (21.0, 81.0)]
 
 
 @given(arrays(float, st.tuples(st.integers(1, 20), st.integers(1, 3)), elements=st.integers(0, 5)))

@@ -29,7 +29,8 @@ def told(number):
         "max_correspondence_distance": rng.uniform(0.1, 5.0),
         "keyframe_interval": rng.uniform(0.5, 15.0),
     }
-    return Told(parameters, (rng.gamma(1.0),), {"one": rng.random(), "lost": number})
+    attributes = {"one": rng.random(), "lost": number}
+    return Told(parameters, (rng.gamma(1.0),), attributes, {"ms_per_scan <= 9": rng.normal()})
 
 
 def in_journal(study):
@@ -41,24 +42,33 @@ def assert_mirrors(mirror, n):
     trials = mirror.get_trials()
     assert [trial.number for trial in trials] == list(range(n))
     for trial in trials:
-        parameters, values, attributes = told(trial.number)
-        assert (trial.params, trial.values) == (parameters, list(values))
-        assert attributes.items() <= trial.user_attrs.items()
+        expected = told(trial.number)
+        assert (trial.params, trial.values) == (expected.parameters, list(expected.values))
+        assert expected.attributes.items() <= trial.user_attrs.items()
+        assert trial.constraints == expected.constraints
 
 
 def test_trials_are_told_once_and_in_order(study):
-    open_mirror(study, {}).tell(3, told)
+    open_mirror(study, {}).tell(range(3), told)
     mirror = open_mirror(study, {})
-    mirror.tell(3, told)
-    mirror.tell(5, told)
-    mirror.tell(4, told)
+    mirror.tell(range(3), told)
+    mirror.tell(range(5), told)
+    mirror.tell(range(4), told)
     assert_mirrors(in_journal(study), 5)
 
 
+def test_numbers_may_come_in_any_order(study):
+    """As where every sequence has a search of its own."""
+    open_mirror(study, {}).tell([0, 3, 1], told)
+    open_mirror(study, {}).tell([0, 3, 6, 1, 4], told)
+    numbers = [trial.user_attrs["adaptune trial"] for trial in in_journal(study).get_trials()]
+    assert numbers == [0, 3, 1, 6, 4]
+
+
 def test_a_journal_that_knows_all_is_not_replayed(study, monkeypatch):
-    open_mirror(study, {}).tell(3, told)
+    open_mirror(study, {}).tell(range(3), told)
     monkeypatch.setattr(optuna, "create_study", None)
-    open_mirror(study, {}).tell(3, None)
+    open_mirror(study, {}).tell(range(3), None)
 
 
 def cut_short(journal):
@@ -81,14 +91,14 @@ def lock(journal):
 
 @pytest.mark.parametrize("harm", [cut_short, garble, empty, Path.unlink, lock])
 def test_a_damaged_journal_is_made_anew(study, harm):
-    open_mirror(study, {}).tell(4, told)
+    open_mirror(study, {}).tell(range(4), told)
     harm(study.folder / JOURNAL)
-    open_mirror(study, {}).tell(5, told)
+    open_mirror(study, {}).tell(range(5), told)
     assert_mirrors(in_journal(study), 5)
 
 
 def test_what_is_no_number_is_a_failed_trial(study):
-    open_mirror(study, {}).tell(1, lambda n: told(n)._replace(values=(float("nan"),)))
+    open_mirror(study, {}).tell(range(1), lambda n: told(n)._replace(values=(float("nan"),)))
     (trial,) = in_journal(study).get_trials()
     assert trial.state == optuna.trial.TrialState.FAIL
 
@@ -103,9 +113,9 @@ def database():
 def test_a_database_is_told_the_same(study_file, tmp_path, database):
     _, url = database
     study = at(study_file, tmp_path, f"offline.storage={url}")
-    open_mirror(study, {}).tell(3, told)
+    open_mirror(study, {}).tell(range(3), told)
     finished = {n: told(n).parameters for n in range(3)}
-    open_mirror(study, finished).tell(5, told)
+    open_mirror(study, finished).tell(range(5), told)
     mirror = optuna.load_study(study_name="mirrored", storage=url.replace("://", "+pg8000://"))
     assert_mirrors(mirror, 5)
     for others in ({}, {0: told(7).parameters}):
@@ -117,14 +127,14 @@ def test_a_database_that_goes_is_told_later(study_file, tmp_path, database, capl
     server, url = database
     study = at(study_file, tmp_path, f"offline.storage={url}")
     mirror = open_mirror(study, {})
-    mirror.tell(1, told)
+    mirror.tell(range(1), told)
     server.stop()
-    mirror.tell(2, told)
-    mirror.tell(3, told)
+    mirror.tell(range(2), told)
+    mirror.tell(range(3), told)
     assert caplog.text.count("is not told of trials now") == 1
     server.start()
-    mirror.tell(4, told)
-    mirror.tell(5, told)
+    mirror.tell(range(4), told)
+    mirror.tell(range(5), told)
     assert_mirrors(mirror._mirror, 5)
 
 

@@ -94,6 +94,16 @@ def test_trials_that_run_at_the_same_time_step_from_the_same_place():
     assert all(abs(x - chain.params["x"]) < 0.2 for x in xs)
 
 
+@pytest.mark.parametrize("n_startup", [1, 6])
+def test_looking_for_a_stall_changes_nothing(n_startup):
+    def walked(**given):
+        return history(
+            optimize(30, AnnealingSampler(settings(**given), n_startup_trials=n_startup, seed=1))
+        )
+
+    assert walked(stall_best=1000) == walked()
+
+
 def test_stops_when_all_chains_have_stalled():
     sampler = AnnealingSampler(settings(chains=3, stall_best=5), seed=1)
     study = optuna.create_study(sampler=sampler)

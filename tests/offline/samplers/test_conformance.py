@@ -206,3 +206,64 @@ def test_searches_for_several_objectives(name):
     if name in LEARNING:
         sums = [sum(values) for _, values in history]
         assert np.mean(sums[40:]) < np.mean(sums[1:16])
+
+
+CONSTRAINED = ["tpe", "nsga2", "gp"]
+
+
+@pytest.mark.parametrize("name", [*CONSTRAINED, "annealing", "cmaes"])
+def test_keeps_limits(name):
+    """Without the limit the least gain would be best."""
+    if name == "gp":
+        pytest.importorskip("torch", reason="torch is not installed: pip install 'adaptune[gp]'")
+    space = ParameterSpace({n: SPACE.parameters[n] for n in ("distance", "gain")})
+    n_batches = 5 if name == "gp" else 10
+    config = OfflineConfig(sampler=name, batch=8, initial=16, seed=5)
+
+    def result(s):
+        return s, 2.0 + s["gain"], (-s["gain"], s["gain"] - 0.9)
+
+    sampler, history = make_sampler(space, config), []
+    for _ in range(n_batches):
+        history += [result(s) for s in sampler.propose(history)]
+    late = [s["gain"] for s, *_ in history[24:]]
+    assert np.mean([gain >= 0.0 for gain in late]) > 0.6
+    assert np.mean([0.0 <= gain < 0.45 for gain in late]) > 0.4
+    resumed = make_sampler(space, config)
+    assert resumed.propose(history[:32]) == [s for s, *_ in history[32:40]]
+    # Who knows of constraints is told the truth, others are told of a bad value.
+    trials = [t for t in sampler._study.get_trials() if t.values]
+    broken = [t for t in trials if t.params["gain"] < 0.0]
+    assert broken
+    for trial in broken:
+        gain = trial.params["gain"]
+        if name in CONSTRAINED:
+            assert trial.value == 2.0 + gain
+            assert trial.constraints == {"0": -gain, "1": gain - 0.9}
+        else:
+            assert trial.value > 2.0 + gain + 20.0
+            assert trial.constraints == {}
+
+
+@pytest.mark.parametrize("name", ["tpe", "nsga2"])
+def test_keeps_limits_with_several_objectives(name):
+    config = OfflineConfig(sampler=name, objective=["rte", "rpe"], batch=8, initial=16, seed=5)
+    sampler, history = make_sampler(SPACE, config), []
+    for _ in range(10):
+        sets = sampler.propose(history)
+        history += [(s, (2.0 + s["gain"], bowl(s)), (-s["gain"],)) for s in sets]
+    assert np.mean([s["gain"] >= 0.0 for s, *_ in history[40:]]) > 0.6
+
+
+def test_ends_when_all_chains_have_stalled():
+    settings = {"chains": 2, "stall_accepted": 4}
+    config = OfflineConfig(
+        sampler="annealing", sampler_settings=settings, batch=4, initial=4, seed=5
+    )
+    sampler, history = make_sampler(SPACE, config), []
+    while sets := sampler.propose(history):
+        history += [(s, float(len(history) + i)) for i, s in enumerate(sets)]
+        assert len(history) < 500
+    assert sampler.end == "all chains have stalled"
+    assert make_sampler(SPACE, config).propose(history) == []
+    assert len(make_sampler(SPACE, config).propose(history[:-4])) == 4

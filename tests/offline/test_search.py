@@ -1,0 +1,224 @@
+"""Sets that are searched for on one sequence alone, beside those that all share."""
+
+import csv
+import itertools
+
+import drawn
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from adaptune.archive import Archive
+from adaptune.cli import app
+from adaptune.model import ErrorModel
+from adaptune.study import ConfigurationError, load_study
+from offline.campaign import run_batches, train
+from offline.objective import choose_fixed
+from offline.search import make_stages, owner
+from offline.validation import labelled_sequences, leave_one_out
+
+NAMES = ["one", "two", "three"]
+
+
+@pytest.fixture
+def study_of(study_file, tmp_path):
+    """A study of three sequences with some settings, in an unused folder or in a given one."""
+    numbers = itertools.count()
+
+    def make(folder=None, **given):
+        given = {"trials": 11, "initial": 4, "batch": 4} | given
+        overrides = [f"offline.{key}={value}" for key, value in given.items()]
+        folder = folder or tmp_path / str(next(numbers)) / "study"
+        overrides += ["training=[one, two, three]", "test=[]"]
+        study = load_study(study_file, overrides, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        return study
+
+    return make
+
+
+def error(sequence, parameters):
+    """Every sequence has another best distance; the third is the hardest."""
+    best = {"one": 0.2, "two": 0.4, "three": 0.8}[sequence]
+    off = abs(np.log(parameters["max_correspondence_distance"] / best))
+    return (1.0 + off + 0.01 * parameters["keyframe_interval"]) * (
+        2.0 if sequence == "three" else 1.0
+    )
+
+
+def run(study):
+    pool = drawn.Drawn(error)
+    archive = Archive(study.folder / "trials")
+    verdicts = run_batches(study, archive, pool)
+    seen = {
+        n: [name for name in NAMES if n in archive.finished(name)]
+        for n in sorted(set().union(*(archive.finished(name) for name in NAMES)))
+    }
+    return verdicts, seen, archive
+
+
+def sets(archive):
+    """All parameter sets in the archive, by sequence and number."""
+    return {(name, n): s.parameters for name in NAMES for n, s in archive.finished(name).items()}
+
+
+@pytest.mark.parametrize("kind", ["shared", "own", "both"])
+def test_every_number_is_of_one_search(study_of, kind):
+    study = study_of(sets=kind)
+    finished = {name: {} for name in NAMES}
+    stages = make_stages(study, finished)
+    searches = [search for stage in stages for search in stage.searches]
+    assert len(searches) == {"shared": 1, "own": 3, "both": 4}[kind]
+    numbers = sorted(search.number(i) for search in searches for i in range(1, 20))
+    assert numbers == list(range(1, 1 + 19 * len(searches)))
+    config = study.config.offline
+    for search in searches:
+        assert search.number(0) == 0
+        alone = search.sequences[0] if len(search.sequences) == 1 else None
+        assert {owner(config, NAMES, search.number(i)) for i in range(1, 9)} == {alone}
+    assert owner(config, NAMES, 0) is None
+
+
+def test_each_sequence_searches_for_itself(study_of):
+    study = study_of(sets="own")
+    verdicts, seen, archive = run(study)
+    assert list(verdicts) == list(seen) == list(range(1 + 3 * 10))
+    best = {}
+    for name in NAMES:
+        of = archive.finished(name)
+        mine = [n for n in seen if owner(study.config.offline, NAMES, n) in (name, None)]
+        assert len(mine) == 11
+        best[name] = min(mine, key=lambda n: (of[n].mean_error, n))
+    for n, names in seen.items():
+        everywhere = n == 0 or n in best.values()
+        assert names == (NAMES if everywhere else [owner(study.config.offline, NAMES, n)])
+        assert verdicts[n].complete == everywhere
+        assert list(verdicts[n].sequences) == names
+    fixed = choose_fixed(study.config.offline, verdicts)
+    assert fixed in {0, *best.values()}
+    means = {
+        n: np.mean([archive.finished(name)[n].mean_error for name in NAMES]) for n in (0, fixed)
+    }
+    assert verdicts[fixed].values == pytest.approx((means[fixed],))
+    assert means[fixed] < means[0]
+    # The searches differ from each other, in their initial points too.
+    assert (
+        len(
+            {
+                str(archive.finished(owner(study.config.offline, NAMES, n))[n].parameters)
+                for n in range(1, 31)
+            }
+        )
+        == 30
+    )
+
+
+def test_both_make_what_each_would_make_alone(study_of):
+    of_both = sets(run(study_of(sets="both"))[2])
+    shared, own = (sets(run(study_of(sets=kind))[2]) for kind in ("shared", "own"))
+    for name in NAMES:
+        j = NAMES.index(name)
+        assert all(of_both[name, 1 + 4 * i] == shared[name, 1 + i] for i in range(10))
+        assert all(of_both[name, 2 + 4 * i + j] == own[name, 1 + 3 * i + j] for i in range(10))
+
+
+SAMPLERS = {
+    "tpe": "{}",
+    "annealing": "{chains: 1}",
+    "nsga2": "{}",
+    "cmaes": "{}",
+    "qmc": "{}",
+    "sobol": "{}",
+    "random": "{}",
+    "grid": "{grid: {max_correspondence_distance: [1, 1, 4], keyframe_interval: [1, 2, 5]}}",
+}
+
+
+@pytest.mark.parametrize(
+    ("sampler", "kind"), [("tpe", "both"), *((sampler, "own") for sampler in SAMPLERS)]
+)
+def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind):
+    given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
+    expected, _, archive = run(study_of(**given))
+    # With a smaller budget first, which has other sets run everywhere...
+    fewer = study_of(trials=6, **given)
+    run(fewer)
+    # ... and some of it lost.
+    rng = np.random.default_rng(0)
+    trials = sorted(fewer.folder.glob("trials/*/[0-9]*.npz"))
+    for path in rng.choice(trials, len(trials) // 3, replace=False):
+        path.unlink()
+    again, _, other = run(study_of(fewer.folder, **given))
+    assert again == expected
+    assert sets(archive).items() <= sets(other).items()
+
+
+def test_a_search_that_is_over_waits_for_the_others(study_of):
+    study = study_of(sets="own", target=1.2, trials=60)
+    verdicts, seen, _ = run(study)
+    n = {name: sum(owner(study.config.offline, NAMES, k) == name for k in seen) for name in NAMES}
+    # The third is never below 2.
+    assert n["three"] == 59
+    assert max(n["one"], n["two"]) < 59
+    assert list(verdicts) == list(seen)
+
+
+def test_views_search_for_themselves(study_of):
+    study = study_of(sets="own", augment="[{reverse: true}]")
+    (stage,) = make_stages(study, {name: {} for name in study.training})
+    assert [search.sequences for search in stage.searches] == [[name] for name in study.training]
+    assert len(stage.searches) == 6
+
+
+def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
+    study = study_of(sets="own")
+    verdicts, _, archive = run(study)
+    fixed = choose_fixed(study.config.offline, verdicts)
+    from offline.campaign import fit
+
+    model = fit(study, archive, verdicts, fixed)
+    assert np.isnan(model.errors).any()
+    sequences, unit = labelled_sequences(study, model)
+    complete = [n for n, v in verdicts.items() if v.complete]
+    assert len(unit) == len(complete)
+    for sequence in sequences:
+        assert [n for n, own in zip(complete, sequence.own, strict=True) if own] == [
+            n for n in complete if owner(study.config.offline, NAMES, n) == sequence.name
+        ]
+    validation = leave_one_out(sequences, unit)
+    for left_out in validation.left_out:
+        known = [
+            archive.finished(left_out.name)[n].mean_error
+            for n in complete
+            if owner(study.config.offline, NAMES, n) != left_out.name
+        ]
+        assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
+
+
+def test_from_end_to_end(study_file, tmp_path):
+    folder = tmp_path / "study"
+    given = ["--folder", str(folder)]
+    for override in ("offline.sets=own", "offline.trials=5", "sub_trajectory=3.0"):
+        given += ["-o", override]
+    for command in ("offline", "trials", "validate", "online", "compare"):
+        done = CliRunner().invoke(app, [command, str(study_file), *given])
+        assert done.exit_code == 0, done.output
+    model = ErrorModel.load(folder / "model.npz")
+    rows = list(csv.DictReader((folder / "trials.csv").open()))
+    assert len(rows) == len(model.sets) == 1 + 2 * 4
+    run_everywhere = [row for row in rows if row["mean"]]
+    assert 1 <= len(run_everywhere) <= 3
+    assert float(rows[model.fixed]["mean"]) == min(float(row["mean"]) for row in run_everywhere)
+    for s, name in enumerate(("one", "two")):
+        missing = np.isnan(model.errors[model.sequence == s])
+        assert (missing.all(axis=0) == missing.any(axis=0)).all()
+        assert missing.all(axis=0).tolist() == [row[name] == "" for row in rows]
+    before = (folder / "model.npz").read_bytes()
+    train(load_study(study_file, given[3::2], folder))
+    assert ErrorModel.load(folder / "model.npz").errors.tobytes() == model.errors.tobytes()
+    assert len(before) > 1000
+
+
+def test_pruning_needs_sets_that_are_shared(study_file):
+    with pytest.raises(ConfigurationError, match="pruning spares trials further sequences"):
+        load_study(study_file, ["offline.sets=own", "offline.pruning=halving"])
