@@ -21,7 +21,7 @@ from gain import labelled, study_of, training_courses, trials
 from adaptune.descriptor import ScaledPCA
 from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.metrics import cap, sub_trajectory_rte
-from adaptune.model import RULES, Rule, Selection, Settings, TrainingData
+from adaptune.model import RULES, Rule, Selection, TrainingData
 from adaptune.model.base import complementary
 from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
 from adaptune.sequence import Scan
@@ -87,7 +87,7 @@ def ways(paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
     def bank(size: int, asked: bool) -> Way:
         members = complementary(data.errors, data.sequence, data.fixed, size)
         few = TrainingData(data.features, data.sequence, data.errors[:, members], units[members], 0)
-        rule = RULES["paired"](Settings(n_sets=None, sharpness=settings.sharpness), 0.0).fit(few)
+        rule = RULES["paired"](settings.model_copy(update={"n_sets": None}), 0.0).fit(few)
         its = [sets[i] for i in members]
         return (
             lambda: Bank(study.odometry, its, WarmUp()),

@@ -310,11 +310,13 @@ def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) 
     to_read = [name for name in unframed if name not in {n for n, *_ in lacking}]
     tasks = [Task(name, (), (), frames=True) for name in to_read]
     for last, (name, numbers, parameters) in enumerate(lacking, 1 - len(lacking)):
+        # What all trials on a sequence share is told by the first of its tasks.
+        tells = numbers[0] if name in unframed else None
         left = numbers
         while left:
             size = math.ceil(len(left) / n_workers / (1 if last else 2))
             tasks += [
-                Task(name, tuple(n), tuple(map(parameters, n)), frames=name in unframed)
+                Task(name, tuple(n), tuple(map(parameters, n)), frames=n[0] == tells)
                 for share in range(n_workers)
                 if (n := left[share * size : (share + 1) * size])
             ]

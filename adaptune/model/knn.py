@@ -215,30 +215,6 @@ class NearestNeighbours(Rule):
         return Selection(index, float(predicted[index]), float(predicted[self.data_.fixed]))
 
 
-def nearest_frames(
-    features: NDArray[np.float64], feature: NDArray[np.float64], k: int
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The `k` frames nearest to a scan.
-
-    Parameters
-    ----------
-    features
-        Of shape (n_frames, n_features).
-    feature
-        Of shape (n_features,).
-    k
-        At most; fewer where there are fewer frames.
-
-    Returns
-    -------
-    squared : ndarray of shape (k,)
-        Squared distances, rising; of equal ones, the earlier frame comes first.
-    frames : ndarray of shape (k,)
-    """
-    squared, frames, _ = _nearest_of_groups(features, np.array([0, len(features)]), feature, k)
-    return squared, frames
-
-
 @numba.njit(cache=True)
 def _nearest_of_groups(
     X: NDArray[np.float64], bounds: NDArray[np.intp], x: NDArray[np.float64], k: int

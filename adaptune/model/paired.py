@@ -60,10 +60,16 @@ class Near(NamedTuple):
         Their mean squared distance.
     frames : list of ndarray
         Their numbers.
+    fixed : ndarray of shape (n_sequences,)
+        Mean error of the fixed set on them, in percent.
+    familiarity : float
+        Share of training that is farther from the other sequences than this scan is.
     """
 
     squared: NDArray[np.float64]
     frames: list[NDArray[np.intp]]
+    fixed: NDArray[np.float64]
+    familiarity: float
 
 
 class PairedExpectedRatio(Rule):
@@ -138,18 +144,15 @@ class PairedExpectedRatio(Rule):
             distance, nearest = _nearest(features, feature, self.settings.n_frames)
             squared.append(distance)
             frames.append(members[nearest])
-        return Near(np.array(squared), frames)
+        fixed = np.array([self.fixed_errors_[some].mean() for some in frames])
+        return Near(np.array(squared), frames, fixed, self._familiarity(min(squared)))
 
     def ratios(self, near: Near) -> NDArray[np.float64]:
         """Expected ratio of every candidate to the fixed set, of shape (n_candidates,)."""
         means = np.array([self.errors_[frames].mean(axis=0) for frames in near.frames])
-        ratio = (means + ERROR_FLOOR) / (self._fixed(near)[:, None] + ERROR_FLOOR)
+        ratio = (means + ERROR_FLOOR) / (near.fixed[:, None] + ERROR_FLOOR)
         expected = self._weights(near.squared) @ ratio
-        return np.asarray(1.0 + self._familiar(near) * (expected - 1.0))
-
-    def _fixed(self, near: Near) -> NDArray[np.float64]:
-        """Mean error of the fixed set on the near frames of each sequence."""
-        return np.array([self.fixed_errors_[frames].mean() for frames in near.frames])
+        return np.asarray(1.0 + min(1.0, near.familiarity / NOVEL) * (expected - 1.0))
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         # With the median at zero every sequence has the very same place in it.
@@ -157,15 +160,11 @@ class PairedExpectedRatio(Rule):
         weights = np.exp(-self.settings.sharpness * (squared - squared.min()) / spread)
         return np.asarray(weights / weights.sum())
 
-    def _familiar(self, near: Near) -> float:
-        """From 1, as near to training as its sequences to each other, to 0, beyond all of them."""
-        return min(1.0, self._novelty(near) / NOVEL)
-
-    def _novelty(self, near: Near) -> float:
-        """Share of training that is farther from the other sequences than this scan is."""
+    def _familiarity(self, squared: float) -> float:
+        """Share of training that is farther from the other sequences than this."""
         if not len(self.novelty_):
             return 1.0
-        below = np.searchsorted(self.novelty_, near.squared.min(), side="left")
+        below = np.searchsorted(self.novelty_, squared, side="left")
         return float(1.0 - below / len(self.novelty_))
 
     def _calibrate(self) -> NDArray[np.float64]:
@@ -190,7 +189,7 @@ class PairedExpectedRatio(Rule):
         smoothed ratio times its error; `select` tells the error itself.
         """
         near = self.near(feature)
-        fixed = self._weights(near.squared) @ self._fixed(near)
+        fixed = self._weights(near.squared) @ near.fixed
         predicted = np.full(len(self.data_.sets), np.inf)
         predicted[self.candidates_] = self.ratios(near) * fixed
         return predicted
@@ -212,12 +211,12 @@ class PairedExpectedRatio(Rule):
             if len(at) and ratio[at[0]] - ratio[best] <= self.price:
                 best = int(at[0])
         weights = self._weights(near.squared)
-        fixed = float(weights @ self._fixed(near))
+        fixed = float(weights @ near.fixed)
         return Selection(
             int(self.candidates_[best]),
             float(ratio[best] * fixed),
             fixed,
-            self._novelty(near),
+            near.familiarity,
             float(1.0 / (weights @ weights)),
         )
 

@@ -9,7 +9,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from adaptune.model import NearestNeighbours, TrainingData
 from adaptune.model.base import mean_errors
-from adaptune.model.knn import ProductKNeighborsRegressor, nearest_frames
+from adaptune.model.knn import ProductKNeighborsRegressor, _nearest_of_groups
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -114,7 +114,7 @@ def test_nearest_frames(seed, n_frames, k):
     features = rng.integers(0, 3, (n_frames, 2)).astype(float)
     feature = rng.integers(0, 3, 2).astype(float)
     want = sorted((float(((f - feature) ** 2).sum()), i) for i, f in enumerate(features))[:k]
-    squared, frames = nearest_frames(features, feature, k)
+    squared, frames, _ = _nearest_of_groups(features, np.array([0, len(features)]), feature, k)
     assert list(zip(squared.tolist(), frames.tolist(), strict=True)) == want
 
 
