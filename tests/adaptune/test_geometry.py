@@ -7,12 +7,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import (
+    count_within,
     from_quaternions,
     interpolate,
     invert,
     rectify,
     rotation_angle,
     scale,
+    squared_ranges,
     steps,
     to_quaternions,
 )
@@ -208,3 +210,12 @@ def test_a_motion_scaled_is_a_motion_repeated(seed, n):
     np.testing.assert_allclose(np.linalg.matrix_power(scale(T, 1.0 / n), n), T, atol=1e-9)
     assert scale(T, 1.0) is T
     np.testing.assert_allclose(scale(T, 0.0), np.eye(4), atol=1e-12)
+
+
+@given(seeds, st.floats(0, 50), st.floats(0, 200))
+@modest
+def test_count_within(seed, low, high):
+    points = np.random.default_rng(seed).uniform(-100, 100, (50, 3))
+    distances = np.linalg.norm(points, axis=1)
+    assert count_within(points, low, high) == ((distances > low) & (distances < high)).sum()
+    np.testing.assert_allclose(squared_ranges(points), distances**2)
