@@ -3,10 +3,11 @@
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, invert, rectify
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
@@ -202,6 +203,60 @@ class Odometry(ABC):
                     f"{nearest(name, self.space.names)}"
                 )
         return parameters
+
+
+class Anchored(Odometry):
+    """An odometry that can only begin at rest, in a frame of its own, and with a usable scan.
+
+    Its own frame is placed by the first pose that comes back. Where none comes back, the last
+    motion goes on.
+    """
+
+    @abstractmethod
+    def _usable(self, prepared: Any) -> bool:
+        """Whether it can begin with a scan."""
+
+    @abstractmethod
+    def _begin(self, prepared: Any) -> None:
+        """Make a new one for a usable scan, which it is handed next."""
+
+    @abstractmethod
+    def _hand_over(self, prepared: Any) -> Poses | None:
+        """Hand a scan over, usable or not, and return ``T_own_sensor`` if a pose comes back."""
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """See `Odometry.start`."""
+        self._T_odom_sensor = T_odom_sensor
+        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
+        self._T_odom_own: Poses | None = None
+        self._begun = False
+        self._go_on(prepared)
+
+    def register(self, prepared: Any) -> Registration:
+        """See `Odometry.register`."""
+        T_odom_previous = self._T_odom_sensor
+        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
+        registered = self._go_on(prepared)
+        if registered:
+            self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
+        return Registration(self._T_odom_sensor, registered)
+
+    def _go_on(self, prepared: Any) -> bool:
+        """Correct the predicted pose, and tell whether there was something to correct it by."""
+        if not self._begun:
+            if not self._usable(prepared):
+                return False
+            self._begin(prepared)
+            self._begun = True
+        T_own_sensor = self._hand_over(prepared)
+        if T_own_sensor is None:
+            return False
+        if self._T_odom_own is None:
+            self._T_odom_own = self._T_odom_sensor @ invert(T_own_sensor)
+        self._T_odom_sensor = self._T_odom_own @ T_own_sensor
+        return True
 
 
 def prepared_bytes(prepared: Any) -> int:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from adaptune.geometry import Poses, invert, rectify, squared_ranges
-from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
+from adaptune.geometry import Poses, invert, squared_ranges
+from adaptune.odometry.base import Anchored, BaseSettings, OdometryError
 from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value, nearest
 
@@ -131,7 +131,7 @@ with contextlib.suppress(OdometryError):
     _evalio()
 
 
-class Pipeline(Odometry):
+class Pipeline(Anchored):
     """A pipeline of evalio (Potokar and Kaess).
 
     Pipelines read their parameters only when they begin, and begin at rest. The pose is that of
@@ -201,21 +201,10 @@ class Pipeline(Odometry):
         """Points as `FIELDS` has them, and how many rows and columns they are."""
         return _cloud(scan, 4), (1, len(scan))
 
-    def start(
-        self,
-        prepared: Prepared,
-        T_odom_sensor: Poses,
-        T_previous_current: Poses | None = None,
-    ) -> None:
-        """See `Odometry.start`."""
-        self._T_odom_sensor = T_odom_sensor
-        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
-        self._pipeline: Any = None
-        if prepared.size >= MIN_POINTS:
-            self._begin(prepared)
+    def _usable(self, prepared: Prepared) -> bool:
+        return prepared.size >= MIN_POINTS
 
     def _begin(self, prepared: Prepared) -> None:
-        """Make a new pipeline, whose own frame is that of its first estimate."""
         pipelines, types, *_ = _evalio()
         self._shape = prepared.shape
         parameters = self._defaults | self.untuned | self._given
@@ -240,24 +229,12 @@ class Pipeline(Odometry):
         pipeline.set_imu_T_lidar(types.SE3.from_mat(self._T_imu_sensor))
         pipeline.initialize()
         self._pipeline = pipeline
-        self._T_odom_own: Poses | None = None
-        self._measure(prepared.imu)
-        self._add(prepared)
 
-    def register(self, prepared: Prepared) -> Registration:
-        """See `Odometry.register`."""
-        T_odom_previous = self._T_odom_sensor
-        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
-        if self._pipeline is not None:
-            self._measure(prepared.imu)
-        if prepared.size < MIN_POINTS:
-            return Registration(self._T_odom_sensor, registered=False)
-        if self._pipeline is None:
-            self._begin(prepared)
-        elif (self._needs_times and not prepared.timed) or not self._add(prepared):
-            return Registration(self._T_odom_sensor, registered=False)
-        self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
-        return Registration(self._T_odom_sensor)
+    def _hand_over(self, prepared: Prepared) -> Poses | None:
+        self._measure(prepared.imu)
+        if not self._usable(prepared) or (self._needs_times and not prepared.timed):
+            return None
+        return self._estimate(prepared)
 
     def _measure(self, imu: Imu | None) -> None:
         """Hand over what the IMU measured."""
@@ -270,16 +247,6 @@ class Pipeline(Odometry):
             self._pipeline.add_imu(
                 types.ImuMeasurement(types.Stamp.from_nsec(stamp), gyro, acceleration)
             )
-
-    def _add(self, prepared: Prepared) -> bool:
-        """Hand a scan over, and tell whether a pose came back."""
-        T_own_sensor = self._estimate(prepared)
-        if T_own_sensor is None:
-            return False
-        if self._T_odom_own is None:
-            self._T_odom_own = self._T_odom_sensor @ invert(T_own_sensor)
-        self._T_odom_sensor = self._T_odom_own @ T_own_sensor
-        return True
 
     def _estimate(self, prepared: Prepared) -> Poses | None:
         """Hand a scan over, and take the last pose that comes back."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from adaptune.geometry import Poses, count_within, invert, rectify
-from adaptune.odometry.base import BaseSettings, Odometry, OdometryError, Registration
+from adaptune.geometry import Poses, count_within
+from adaptune.odometry.base import Anchored, BaseSettings, OdometryError
 from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
 
@@ -91,7 +91,7 @@ with contextlib.suppress(OdometryError):
     _bindings()
 
 
-class RkoLio(Odometry):
+class RkoLio(Anchored):
     """RKO-LIO (Malladi et al., RA-L 2026).
 
     It reads its parameters when it begins, and begins at rest. It takes its first frame for level:
@@ -134,21 +134,10 @@ class RkoLio(Odometry):
         usable = n_in_range >= MIN_POINTS
         return Prepared(points, stamps.tolist(), begin, end, usable, scan.imu)
 
-    def start(
-        self,
-        prepared: Prepared,
-        T_odom_sensor: Poses,
-        T_previous_current: Poses | None = None,
-    ) -> None:
-        """See `Odometry.start`."""
-        self._T_odom_sensor = T_odom_sensor
-        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
-        self._lio: Any = None
-        if prepared.usable:
-            self._begin(prepared)
+    def _usable(self, prepared: Prepared) -> bool:
+        return prepared.usable
 
     def _begin(self, prepared: Prepared) -> None:
-        """Make a new one, whose own frame is the level one of its first scan."""
         bindings = _bindings()
         config = bindings._LIOConfig()
         for name, value in self.parameters.items():
@@ -165,26 +154,8 @@ class RkoLio(Odometry):
             self._T_base_sensor[:3, :3] = _levelling(up)
         self._T_base_imu = self._T_base_sensor @ T_sensor_imu
         self._early: Sequence[tuple[int, Any, Any]] = ()
-        self._add(prepared)
-        self._T_odom_own = self._T_odom_sensor @ invert(self._lio.pose() @ self._T_base_sensor)
 
-    def register(self, prepared: Prepared) -> Registration:
-        """See `Odometry.register`."""
-        T_odom_previous = self._T_odom_sensor
-        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
-        if self._lio is None:
-            if not prepared.usable:
-                return Registration(self._T_odom_sensor, registered=False)
-            self._begin(prepared)
-            return Registration(self._T_odom_sensor)
-        if not self._add(prepared):
-            return Registration(self._T_odom_sensor, registered=False)
-        self._T_odom_sensor = self._T_odom_own @ self._lio.pose() @ self._T_base_sensor
-        self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
-        return Registration(self._T_odom_sensor)
-
-    def _add(self, prepared: Prepared) -> bool:
-        """Hand over a scan and what was measured before its end, and tell whether it was used."""
+    def _hand_over(self, prepared: Prepared) -> Poses | None:
         imu = prepared.imu
         measured = [
             *self._early,
@@ -197,7 +168,7 @@ class RkoLio(Odometry):
         for stamp, acceleration, gyro in measured[: len(measured) - len(self._early)]:
             self._lio.add_imu_measurement(self._T_base_imu, acceleration, gyro, stamp)
         if not prepared.usable:
-            return False
+            return None
         bindings = _bindings()
         try:
             self._lio.register_scan(
@@ -208,8 +179,9 @@ class RkoLio(Odometry):
                 prepared.end,
             )
         except (bindings.InputError, bindings.RegistrationError):
-            return False
-        return True
+            return None
+        T_own_base: Poses = self._lio.pose()
+        return T_own_base @ self._T_base_sensor
 
 
 def _levelling(up: NDArray[np.float64]) -> NDArray[np.float64]:
