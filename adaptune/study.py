@@ -243,13 +243,14 @@ class DescriptorConfig(_Section):
     names : tuple of str
         Of the descriptors, see `adaptune.descriptor`.
     window : float
-        Seconds: the mean is taken over the selections that were made in so long a time.
+        Seconds: the mean is taken over the selections that were made in so long a time; 0 is the
+        newest scan alone.
     """
 
     names: Annotated[
         tuple[Annotated[str, AfterValidator(_known_descriptor)], ...], Field(min_length=1)
     ] = ("ndt",)
-    window: float = Field(0.0, ge=0, allow_inf_nan=False)
+    window: float = Field(3.0, ge=0, allow_inf_nan=False)
 
     @field_validator("names")
     @classmethod

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Frames
-from adaptune.descriptor import lowest_elevation
+from adaptune.descriptor import averaged, lowest_elevation
 from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
 from adaptune.simulation import Course, simulate
@@ -33,6 +33,8 @@ ODOMETRIES = ("gicp", "ndt")
 N_SETS = 16
 KINDS = ("cave", "street", "open", "garden")
 PER_KIND = 4
+WINDOW = 3
+"""Selections whose descriptors are averaged."""
 
 
 def training_courses(seed: int, length: float) -> dict[str, Course]:
@@ -127,9 +129,10 @@ def labelled(paths: list[Path]) -> tuple[list[LabelledSequence], NDArray[np.floa
         with np.load(path) as found:
             known = ~np.isnan(found["errors"]).any(axis=1)
             seconds = (found["stamps"] - found["stamps"][0])[known] // 10**9
-            descriptors = found["histograms"][known].astype(np.float32)
+            histograms = found["histograms"].astype(np.float32)
+            described = averaged(histograms, found["stamps"], WINDOW, 1.0)[known]
             name = path.stem.rsplit("-", 1)[1]
-            sequences.append(LabelledSequence(name, seconds, descriptors, found["errors"][known]))
+            sequences.append(LabelledSequence(name, seconds, described, found["errors"][known]))
             sets = found["sets"]
     return sequences, sets
 

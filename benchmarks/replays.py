@@ -12,11 +12,13 @@ where another confirms it, and else the medoid of all.
 
 import argparse
 import os
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from gain import labelled, study_of, training_courses, trials
+from gain import WINDOW, labelled, study_of, training_courses, trials
+from numpy.typing import NDArray
 
 from adaptune.descriptor import ScaledPCA
 from adaptune.descriptor.ndt import ndt_histogram
@@ -40,17 +42,18 @@ ORDERS = (
     ("open", "garden", "street"),
     ("garden", "open", "cave"),
 )
-LENGTH, WINDOW = 60.0, 25.0
+LENGTH, SUB_TRAJECTORY = 60.0, 25.0
 
 
 def asking(rule: Rule, pca: ScaledPCA, members: Sequence[int]) -> Policy:
     """A policy that asks a rule, whose sets go by these numbers."""
     current: int | None = None
+    last: deque[NDArray[np.uint32]] = deque(maxlen=WINDOW)
 
     def select(scan: Scan) -> Selection:
         nonlocal current
-        histogram = ndt_histogram(scan.points)[None].astype(np.float32)
-        selection = rule.select(pca.transform(histogram)[0], current)
+        last.append(ndt_histogram(scan.points))
+        selection = rule.select(pca.transform(np.mean(last, axis=0)[None])[0], current)
         current = selection.set_index
         return selection._replace(set_index=members[current])
 
@@ -130,7 +133,9 @@ def main() -> None:
         row = f"{' '.join(scenes):32}"
         for make, policy in driven.values():
             result = replay(scans, make(), HealthCheck(), policy, sets)
-            errors = sub_trajectory_rte(T_world_sensor, result.trajectory.T_world_sensor, WINDOW)
+            errors = sub_trajectory_rte(
+                T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY
+            )
             means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
             row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
         print(row, flush=True)

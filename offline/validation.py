@@ -39,12 +39,7 @@ SAFE = 1.02
 """The same for its settings, which are chosen on few sequences."""
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
-SETTINGS = tuple(
-    Settings(n_sets=n_sets, width=width, sharpness=sharpness)
-    for n_sets in (2, 5)
-    for width in (0.12, 0.05)
-    for sharpness in (6.0, 12.0, 24.0)
-)
+SETTINGS = tuple(Settings(sharpness=sharpness) for sharpness in (6.0, 12.0, 24.0, 48.0))
 """What `tune` chooses from; of equally good ones the first."""
 
 
@@ -499,12 +494,13 @@ def _tried(
     data, pca = training_data(others, sets)
     rule = PairedExpectedRatio(settings[0]).fit(data)
     first, period = _periods(sequence)
-    near = [rule.near(x) for x in pca.transform(sequence.descriptors[first])]
+    near = rule.near(pca.transform(sequence.descriptors[first]), rule.known_errors_)
     capped = cap(sequence.errors)
     logs = []
     for some in settings:
         rule.configure(some)
-        chosen = np.array([rule.choose(frames).set_index for frames in near])
+        best, *_ = rule.best(near._replace(errors=near.errors @ rule.kernel_))
+        chosen = rule.candidates_[best]
         errors = capped[np.arange(len(capped)), chosen[period]]
         logs.append(float(np.log(errors.mean() / capped[:, data.fixed].mean())))
     return logs

@@ -153,7 +153,9 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         components, scales = [], []
         for begin, end in zip([0, *ends[:-1]], ends, strict=True):
             block = X[:, begin:end]
-            pca = PCA(min(self.n_components, *block.shape), svd_solver="full")
+            # Many scans take a tenth of the time by their covariance; few have none.
+            solver = "covariance_eigh" if len(block) > block.shape[1] else "full"
+            pca = PCA(min(self.n_components, *block.shape), svd_solver=solver)
             deviations = pca.fit_transform(block).std(axis=0)
             self.mean_[begin:end] = pca.mean_
             components.append(np.zeros((len(deviations), X.shape[1])))

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +136,16 @@ class Selection(NamedTuple):
 
 
 class Rule(ABC):
-    """A way to choose a parameter set for a scan."""
+    """A way to choose a parameter set for a scan.
+
+    Attributes
+    ----------
+    cautious : bool
+        Whether the fixed set is to be kept where scans come from another sensor than in training;
+        class attribute.
+    """
+
+    cautious: ClassVar[bool] = False
 
     @abstractmethod
     def fit(self, data: TrainingData) -> Self:

@@ -4,14 +4,8 @@ from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    PositiveFloat,
-    PositiveInt,
-)
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from scipy.spatial.distance import cdist
 
 from adaptune.metrics import FAILURE, cap
 from adaptune.model.base import Rule, Selection, TrainingData, complementary
@@ -40,36 +34,39 @@ class Settings(BaseModel):
         Nearest frames of each sequence.
     threshold : float
         Logarithm of the ratio that a set must stay below to be taken.
+    caution : float
+        How many standard errors, by how much the sequences differ, are added to a ratio first.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    n_sets: PositiveInt | None = 2
+    n_sets: PositiveInt | None = 3
     sharpness: NonNegativeFloat = 6.0
     width: PositiveFloat = 0.12
     n_frames: PositiveInt = 300
     threshold: Annotated[float, Field(le=0.0)] = -0.1
+    caution: NonNegativeFloat = 0.5
 
 
 class Near(NamedTuple):
-    """The frames of each training sequence that are nearest to a scan.
+    """What is known of the training frames that are nearest to some scans.
 
     Attributes
     ----------
-    squared : ndarray of shape (n_sequences,)
-        Their mean squared distance.
-    frames : list of ndarray
-        Their numbers.
-    fixed : ndarray of shape (n_sequences,)
-        Mean error of the fixed set on them, in percent.
-    familiarity : float
-        Share of training that is farther from the other sequences than this scan is.
+    squared : ndarray of shape (n_scans, n_sequences)
+        Mean squared distance of those of each sequence.
+    errors : ndarray of shape (n_scans, n_sequences, n_candidates)
+        Mean error of every candidate on them, in percent, mixed with its neighbours'.
+    fixed : ndarray of shape (n_scans, n_sequences)
+        Mean error of the fixed set on them.
+    familiarity : ndarray of shape (n_scans,)
+        Share of training that is farther from the other sequences than each scan is.
     """
 
     squared: NDArray[np.float64]
-    frames: list[NDArray[np.intp]]
+    errors: NDArray[np.float64]
     fixed: NDArray[np.float64]
-    familiarity: float
+    familiarity: NDArray[np.float64]
 
 
 class PairedExpectedRatio(Rule):
@@ -94,6 +91,8 @@ class PairedExpectedRatio(Rule):
         What a switch must promise besides, as a share of the fixed set's error.
     """
 
+    cautious = True
+
     def __init__(self, settings: Settings | None = None, price: float = 0.0):
         self.settings = settings or Settings()
         self.price = price
@@ -102,6 +101,10 @@ class PairedExpectedRatio(Rule):
         """See `Rule.fit`."""
         self.data_ = data
         self.fixed_errors_ = cap(data.errors[:, data.fixed])
+        # Where a set was not run, the fixed one's error makes it neither better nor worse.
+        fixed = self.fixed_errors_[:, None].astype(np.float32)
+        errors = np.minimum(data.errors, np.float32(FAILURE))
+        self.known_errors_ = np.where(np.isnan(errors), fixed, errors)
         self.sequences_ = [np.flatnonzero(data.sequence == s) for s in np.unique(data.sequence)]
         self.features_ = [data.features[members] for members in self.sequences_]
         self.novelty_ = self._calibrate()
@@ -109,7 +112,7 @@ class PairedExpectedRatio(Rule):
         return self
 
     def configure(self, settings: Settings) -> Self:
-        """Change the settings of a fitted rule, but for `n_frames`, which `near` rests on."""
+        """Change the settings of a fitted rule, but for `n_frames`, which its novelty rests on."""
         before, self.settings = self.settings, settings
         if (settings.n_sets, settings.width) != (before.n_sets, before.width):
             self._mix()
@@ -118,69 +121,90 @@ class PairedExpectedRatio(Rule):
     def _mix(self) -> None:
         """Choose the candidates, and mix each one's errors with its neighbours'."""
         data, settings = self.data_, self.settings
-        n_sets = len(data.sets) if settings.n_sets is None else settings.n_sets
         self.candidates_ = np.arange(len(data.sets))
-        if n_sets < len(data.sets):
-            chosen = complementary(data.errors, data.sequence, data.fixed, n_sets)
+        if settings.n_sets is not None and settings.n_sets < len(data.sets):
+            chosen = complementary(data.errors, data.sequence, data.fixed, settings.n_sets)
             self.candidates_ = np.array(chosen)
-        candidates = data.sets[self.candidates_]
-        squared = ((candidates[:, None, :] - data.sets[None, :, :]) ** 2).sum(axis=2)
+        squared = ((data.sets[:, None] - data.sets[self.candidates_]) ** 2).sum(axis=2)
         kernel = np.exp(-0.5 * squared / settings.width**2)
-        kernel = (kernel / kernel.sum(axis=1, keepdims=True)).astype(np.float32).T
+        self.kernel_ = (kernel / kernel.sum(axis=0)).astype(np.float32)
         # A ratio of means is linear in its numerator, so neighbouring sets can be mixed before.
-        errors = np.minimum(data.errors, np.float32(FAILURE))
-        known = ~np.isnan(errors)
-        if known.all():
-            self.errors_ = (errors @ kernel).astype(np.float64)
-        else:
-            missing = 1.0 - known.astype(np.float32) @ kernel
-            self.errors_ = np.where(known, errors, np.float32(0.0)) @ kernel
-            self.errors_ = self.errors_ + missing * self.fixed_errors_[:, None]
+        self.errors_ = self.known_errors_ @ self.kernel_
 
-    def near(self, feature: NDArray[np.float64]) -> Near:
-        """The training frames nearest to a scan of shape (n_features,)."""
-        squared, frames = [], []
-        for members, features in zip(self.sequences_, self.features_, strict=True):
-            distance, nearest = _nearest(features, feature, self.settings.n_frames)
-            squared.append(distance)
-            frames.append(members[nearest])
-        fixed = np.array([self.fixed_errors_[some].mean() for some in frames])
-        return Near(np.array(squared), frames, fixed, self._familiarity(min(squared)))
+    def near(
+        self, features: NDArray[np.float64], errors: NDArray[np.float32] | None = None
+    ) -> Near:
+        """What the training frames nearest to scans say.
 
-    def ratios(self, near: Near) -> NDArray[np.float64]:
-        """Expected ratio of every candidate to the fixed set, of shape (n_candidates,)."""
-        means = np.array([self.errors_[frames].mean(axis=0) for frames in near.frames])
-        ratio = (means + ERROR_FLOOR) / (near.fixed[:, None] + ERROR_FLOOR)
-        expected = self._weights(near.squared) @ ratio
-        return np.asarray(1.0 + min(1.0, near.familiarity / NOVEL) * (expected - 1.0))
+        Parameters
+        ----------
+        features
+            Of shape (n_scans, n_features).
+        errors
+            What to take means of, of shape (n_frames, n); the candidates' mixed errors when left
+            out. `known_errors_` serve any later settings: their means times `kernel_` are those.
+        """
+        errors = self.errors_ if errors is None else errors
+        shape = len(features), len(self.sequences_)
+        squared, fixed = np.empty(shape), np.empty(shape)
+        means = np.empty((*shape, errors.shape[1]))
+        for s, (members, of_sequence) in enumerate(
+            zip(self.sequences_, self.features_, strict=True)
+        ):
+            squared[:, s], nearest = _nearest(of_sequence, features, self.settings.n_frames)
+            frames = members[nearest]
+            means[:, s] = errors[frames].mean(axis=1, dtype=np.float64)
+            fixed[:, s] = self.fixed_errors_[frames].mean(axis=1)
+        return Near(squared, means, fixed, self._familiarity(squared.min(axis=1)))
+
+    def ratios(self, near: Near) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Ratio of every candidate's error to the fixed set's.
+
+        Returns
+        -------
+        expected, cautious : ndarray of shape (n_scans, n_candidates)
+            What is expected, and the same with `caution` standard errors added.
+        """
+        ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
+        weights = self._weights(near.squared)
+        expected = np.einsum("qs,qsc->qc", weights, ratio)
+        variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
+        error = np.sqrt(variance * (weights**2).sum(axis=1)[:, None])
+        trust = np.minimum(1.0, near.familiarity / NOVEL)[:, None]
+        expected = 1.0 + trust * (expected - 1.0)
+        return expected, expected + trust * self.settings.caution * error
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         # With the median at zero every sequence has the very same place in it.
-        spread = float(np.median(squared)) or 1.0
-        weights = np.exp(-self.settings.sharpness * (squared - squared.min()) / spread)
-        return np.asarray(weights / weights.sum())
+        spread = np.median(squared, axis=1, keepdims=True)
+        spread[spread == 0.0] = 1.0
+        least = squared.min(axis=1, keepdims=True)
+        weights = np.exp(-self.settings.sharpness * (squared - least) / spread)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
-    def _familiarity(self, squared: float) -> float:
-        """Share of training that is farther from the other sequences than this."""
+    def _familiarity(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Share of training that is farther from the other sequences than these."""
         if not len(self.novelty_):
-            return 1.0
+            return np.ones(len(squared))
         below = np.searchsorted(self.novelty_, squared, side="left")
-        return float(1.0 - below / len(self.novelty_))
+        return np.asarray(1.0 - below / len(self.novelty_))
 
     def _calibrate(self) -> NDArray[np.float64]:
         """Sorted distances of training frames from the other sequences, as many of each."""
         if len(self.sequences_) < 2:
             return np.empty(0)
-        distances = []
+        some = [features[:: max(1, len(features) // _QUANTILES)] for features in self.features_]
+        number = np.repeat(np.arange(len(some)), [len(features) for features in some])
+        queries = np.concatenate(some)
+        squared = np.full(len(queries), np.inf)
         for s, features in enumerate(self.features_):
-            some = features[:: max(1, len(features) // _QUANTILES)]
-            others = self.features_[:s] + self.features_[s + 1 :]
-            n = self.settings.n_frames
-            near = [[_nearest(o, x, n)[0] for o in others] for x in some]
-            distances.append(
-                np.quantile(np.min(near, axis=1), (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
-            )
-        return np.sort(np.concatenate(distances))
+            others = number != s
+            found, _ = _nearest(features, queries[others], self.settings.n_frames)
+            squared[others] = np.minimum(squared[others], found)
+        at = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+        return np.sort(
+            np.concatenate([np.quantile(squared[number == s], at) for s in range(len(some))])
+        )
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`.
@@ -188,46 +212,52 @@ class PairedExpectedRatio(Rule):
         Sets that are not chosen among have an infinite error. For the fixed set too this is the
         smoothed ratio times its error; `select` tells the error itself.
         """
-        near = self.near(feature)
-        fixed = self._weights(near.squared) @ near.fixed
+        near = self.near(feature[None])
         predicted = np.full(len(self.data_.sets), np.inf)
-        predicted[self.candidates_] = self.ratios(near) * fixed
+        expected, _ = self.ratios(near)
+        predicted[self.candidates_] = expected[0] * self._expected_fixed(near)
         return predicted
+
+    def _expected_fixed(self, near: Near) -> float:
+        """Error of the fixed set at one scan."""
+        return float(self._weights(near.squared)[0] @ near.fixed[0])
+
+    def best(
+        self, near: Near
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+        """Number of the best candidate for each scan, of shape (n_scans,), and `ratios`."""
+        expected, cautious = self.ratios(near)
+        # Neither smoothing nor caution is for the one that all are compared with.
+        fixed = int(np.flatnonzero(self.candidates_ == self.data_.fixed)[0])
+        expected[:, fixed] = cautious[:, fixed] = 1.0
+        worth = np.log(cautious.min(axis=1)) < self.settings.threshold
+        return np.where(worth, cautious.argmin(axis=1), fixed), expected, cautious
 
     def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
         """See `Rule.select`."""
-        return self.choose(self.near(feature), current)
-
-    def choose(self, near: Near, current: int | None = None) -> Selection:
-        """Choose a set by the frames near to a scan."""
-        ratio = self.ratios(near)
-        # Smoothing is not for the one that all are compared with.
-        ratio = np.where(self.candidates_ == self.data_.fixed, 1.0, ratio)
-        best = int(np.argmin(ratio))
-        if not np.log(ratio[best]) < self.settings.threshold:
-            best = int(np.flatnonzero(self.candidates_ == self.data_.fixed)[0])
+        near = self.near(feature[None])
+        (best,), (expected,), (cautious,) = self.best(near)
         if self.price and current is not None:
             at = np.flatnonzero(self.candidates_ == current)
-            if len(at) and ratio[at[0]] - ratio[best] <= self.price:
-                best = int(at[0])
-        weights = self._weights(near.squared)
-        fixed = float(weights @ near.fixed)
+            if len(at) and cautious[at[0]] - cautious[best] <= self.price:
+                best = at[0]
+        fixed = self._expected_fixed(near)
+        weights = self._weights(near.squared)[0]
         return Selection(
             int(self.candidates_[best]),
-            float(ratio[best] * fixed),
+            float(expected[best]) * fixed,
             fixed,
-            near.familiarity,
+            float(near.familiarity[0]),
             float(1.0 / (weights @ weights)),
         )
 
 
 def _nearest(
-    features: NDArray[np.float64], feature: NDArray[np.float64], n: int
-) -> tuple[float, NDArray[np.intp]]:
-    """Mean squared distance of the `n` frames nearest to a scan, and their numbers in any order."""
-    apart = features - feature
-    squared = np.einsum("ij,ij->i", apart, apart)
+    features: NDArray[np.float64], queries: NDArray[np.float64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Mean squared distance of the `n` frames nearest to each scan, and their numbers."""
+    squared = cdist(queries, features, "sqeuclidean")
     if n >= len(features):
-        return float(squared.mean()), np.arange(len(features))
-    nearest = np.argpartition(squared, n - 1)[:n]
-    return float(squared[nearest].mean()), nearest
+        return squared.mean(axis=1), np.tile(np.arange(len(features)), (len(queries), 1))
+    nearest = np.argpartition(squared, n - 1, axis=1)[:, :n]
+    return np.take_along_axis(squared, nearest, axis=1).mean(axis=1), nearest

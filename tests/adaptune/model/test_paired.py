@@ -64,26 +64,27 @@ def plain_familiarity(data, distance, m):
     return sum(f >= distance for f in far) / len(far)
 
 
-def plain_ratios(data, feature, m, h, tau):
-    """Expected ratio of every set, and the fixed set's expected error, in plain loops."""
+def plain_ratios(data, feature, m, h, tau, c):
+    """Of every set the expected ratio and the cautious one, and the fixed set's expected error."""
     names = sorted(set(data.sequence.tolist()))
     distances, means, fixed = plain_evidence(data, feature, m, names)
     ratios = [[(y + 0.02) / (f + 0.02) for y in of] for of, f in zip(means, fixed, strict=True)]
     middle = statistics.median(distances)
     weights = [math.exp(-tau * (a - min(distances)) / middle) for a in distances]
     weights = [w / sum(weights) for w in weights]
-    n_sets = len(data.sets)
-    mixed = [sum(w * r[j] for w, r in zip(weights, ratios, strict=True)) for j in range(n_sets)]
     familiar = min(1.0, plain_familiarity(data, min(distances), m) / 0.1)
-    smooth = []
-    for j in range(n_sets):
-        kernel = [
-            math.exp(-0.5 * math.dist(data.sets[j], data.sets[l]) ** 2 / h**2)
-            for l in range(n_sets)  # noqa: E741
+    expected, cautious = [], []
+    for of_set in data.sets:
+        kernel = [math.exp(-0.5 * math.dist(of_set, other) ** 2 / h**2) for other in data.sets]
+        smooth = [
+            sum(k * r for k, r in zip(kernel, of, strict=True)) / sum(kernel) for of in ratios
         ]
-        ratio = sum(k * r for k, r in zip(kernel, mixed, strict=True)) / sum(kernel)
-        smooth.append(1.0 + familiar * (ratio - 1.0))
-    return smooth, sum(w * f for w, f in zip(weights, fixed, strict=True))
+        mean = sum(w * r for w, r in zip(weights, smooth, strict=True))
+        variance = sum(w * (r - mean) ** 2 for w, r in zip(weights, smooth, strict=True))
+        error = math.sqrt(variance * sum(w * w for w in weights))
+        expected.append(1.0 + familiar * (mean - 1.0))
+        cautious.append(1.0 + familiar * (mean + c * error - 1.0))
+    return expected, cautious, sum(w * f for w, f in zip(weights, fixed, strict=True))
 
 
 @modest
@@ -92,22 +93,48 @@ def plain_ratios(data, feature, m, h, tau):
     st.integers(4, 60),
     st.integers(1, 8),
     st.integers(1, 4),
-    st.sampled_from([(30, 0.12, 3.0), (5, 0.5, 1.0), (1, 0.01, 10.0)]),
+    st.sampled_from([(30, 0.12, 3.0, 0.5), (5, 0.5, 1.0, 2.0), (1, 0.01, 10.0, 0.0)]),
 )
 def test_it_follows_its_definition(seed, n_frames, n_sets, n_sequences, constants):
     data = random_data(seed, n_frames, n_sets, n_sequences)
-    m, h, tau = constants
-    rule = PairedExpectedRatio(Settings(n_sets=None, n_frames=m, width=h, sharpness=tau)).fit(data)
+    m, h, tau, c = constants
+    settings = Settings(n_sets=None, n_frames=m, width=h, sharpness=tau, caution=c)
+    rule = PairedExpectedRatio(settings).fit(data)
     for feature in np.random.default_rng(seed).normal(size=(3, 3)):
-        ratio, fixed = plain_ratios(data, feature, *constants)
-        np.testing.assert_allclose(rule.predict(feature), np.multiply(ratio, fixed), rtol=1e-6)
-        ratio[data.fixed] = 1.0
-        best = int(np.argmin(ratio))
+        expected, cautious, fixed = plain_ratios(data, feature, *constants)
+        np.testing.assert_allclose(rule.predict(feature), np.multiply(expected, fixed), rtol=1e-5)
+        expected[data.fixed] = cautious[data.fixed] = 1.0
+        best = int(np.argmin(cautious))
         selection = rule.select(feature)
         assert selection.predicted_fixed == pytest.approx(fixed, rel=1e-6)
-        chosen = best if math.log(ratio[best]) < -0.1 else data.fixed
+        chosen = best if math.log(cautious[best]) < -0.1 else data.fixed
         assert selection.set_index == chosen
-        assert selection.predicted_error == pytest.approx(ratio[chosen] * fixed, rel=1e-6)
+        assert selection.predicted_error == pytest.approx(expected[chosen] * fixed, rel=1e-5)
+
+
+def test_scans_are_told_apart_however_many_come_at_once():
+    data = random_data(3, 60, 5)
+    rule = PairedExpectedRatio(Settings(n_frames=7)).fit(data)
+    features = np.random.default_rng(4).normal(size=(6, 3))
+    best, *_ = rule.best(rule.near(features))
+    raw = rule.near(features, rule.known_errors_)
+    mixed, *_ = rule.best(raw._replace(errors=raw.errors @ rule.kernel_))
+    assert rule.candidates_[best].tolist() == [rule.select(x).set_index for x in features]
+    assert rule.candidates_[mixed].tolist() == rule.candidates_[best].tolist()
+
+
+def test_sequences_that_differ_are_less_believed():
+    n = 30
+    errors = np.ones((2 * n, 2), np.float32)
+    errors[:n, 1], errors[n:, 1] = 0.3, 1.3
+    data = TrainingData(
+        np.zeros((2 * n, 2)), np.repeat([0, 1], n), errors, np.array([[0.0, 0.0], [1.0, 1.0]]), 0
+    )
+    # 0.8 is expected, but with a standard error of 0.35.
+    careless = PairedExpectedRatio(Settings(caution=0.0)).fit(data).select(np.zeros(2))
+    assert careless.set_index == 1
+    assert careless.predicted_error == pytest.approx(0.8, abs=0.01)
+    assert PairedExpectedRatio(Settings(caution=0.5)).fit(data).select(np.zeros(2)).set_index == 0
 
 
 @modest
@@ -124,7 +151,7 @@ def test_it_chooses_among_complementary_sets(seed, n_frames, n_sets, n_sequences
 
 
 def test_its_constants():
-    assert tuple(Settings().model_dump().values()) == (2, 6.0, 0.12, 300, -0.1)
+    assert tuple(Settings().model_dump().values()) == (3, 6.0, 0.12, 300, -0.1, 0.5)
     assert next(iter(RULES)) == "paired"
     assert isinstance(RULES["paired"](Settings(), 0.0), PairedExpectedRatio)
 
