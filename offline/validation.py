@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 from adaptune import report
 from adaptune.archive import Archive
@@ -35,8 +36,6 @@ MIN_SEQUENCES = 6
 """Fewer say too little about places they are not to advise for adapting."""
 NO_WORSE = 1.05
 """A rule may not have more than this much of the fixed set's error on any sequence left out."""
-SAFE = 1.02
-"""The same for its settings, which are chosen on few sequences."""
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
 SETTINGS = tuple(Settings(sharpness=sharpness) for sharpness in (6.0, 12.0, 24.0, 48.0))
@@ -463,7 +462,7 @@ def _periods(sequence: LabelledSequence) -> tuple[NDArray[np.intp], NDArray[np.i
 def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Settings:
     """Choose the settings of the paired rule, leaving each of these sequences out in turn.
 
-    Of the settings with which it was nowhere worse than the fixed set by more than `SAFE`, those
+    Of the settings with which it was nowhere worse than `NO_WORSE` times the fixed set, those
     with the least geometric mean; where there are none, those with which it always takes the fixed
     set. Of fewer than `MIN_SEQUENCES` sequences nothing is concluded: the usual settings.
 
@@ -477,8 +476,10 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
     folds = _folds(sequences)
     if len(folds) < MIN_SEQUENCES:
         return Settings()
-    logs = np.array([_tried(sequence, others, sets, SETTINGS) for sequence, others in folds])
-    means = np.where(logs.max(axis=0) <= np.log(SAFE), logs.mean(axis=0), np.inf)
+    # The matrices are small: more threads would mostly wait for each other.
+    with threadpool_limits(1, "blas"):
+        logs = np.array([_tried(sequence, others, sets, SETTINGS) for sequence, others in folds])
+    means = np.where(logs.max(axis=0) <= np.log(NO_WORSE), logs.mean(axis=0), np.inf)
     best = int(np.argmin(means))
     return SETTINGS[best] if means[best] < 0.0 else Settings(n_sets=1)
 

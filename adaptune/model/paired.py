@@ -14,7 +14,7 @@ ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
 NOVEL = 0.1
 """What is farther from all training than this share of it is from the rest counts less and less."""
-_QUANTILES = 25
+_QUANTILES = 10
 """By which each training sequence tells how far its frames are from the other sequences."""
 
 

@@ -58,9 +58,9 @@ def plain_familiarity(data, distance, m):
     for s in names:
         own = [x for x, of in zip(data.features, data.sequence, strict=True) if of == s]
         others = [o for o in names if o != s]
-        some = own[:: max(1, len(own) // 25)]
+        some = own[:: max(1, len(own) // 10)]
         nearest = [min(plain_evidence(data, x, m, others)[0]) for x in some]
-        far.extend(np.quantile(nearest, [(q + 0.5) / 25 for q in range(25)]))
+        far.extend(np.quantile(nearest, [(q + 0.5) / 10 for q in range(10)]))
     return sum(f >= distance for f in far) / len(far)
 
 
