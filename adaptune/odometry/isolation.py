@@ -104,6 +104,11 @@ class Isolated:
         self._limits = limits
         self._stream: BinaryIO | None = None
 
+    @property
+    def _called(self) -> str:
+        """What it goes by where something is told of it."""
+        return str(self.name)
+
     def prepare(self, scan: Scan) -> Scan:
         """See `Odometry.prepare`; the other process prepares."""
         return scan
@@ -149,19 +154,22 @@ class Isolated:
             return Registration(np.full((4, 4), np.nan), registered=False)
         try:
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
-            stamp, registered = answer.header["stamp"], bool(answer.header["registered"])
-        except KeyError as error:
-            self._fault(f"it gave an answer without {error}")
+            late, registered = answer.header["stamp"] - self._asked, answer.header["registered"]
+            cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
+        except (KeyError, TypeError, ValueError) as error:
+            lacking = isinstance(error, KeyError)
+            told = f"without {error}" if lacking else f"of other types ({error})"
+            self._fault(f"it gave an answer {told}")
             return Registration(np.full((4, 4), np.nan), registered=False)
         what = nonsense(T_odom_sensor)
-        if stamp != self._asked:
-            what = f"of another time, {1e-9 * (stamp - self._asked):+.3f} s from the scan's"
+        if late:
+            what = f"of another time, {1e-9 * late:+.3f} s from the scan's"
         if what is not None:
             self._fault(f"it gave a pose {what}")
             return Registration(np.full((4, 4), np.nan), registered=False)
-        self.cpu = self._cpu_before + answer.header.get("cpu", 0.0)
-        self.memory = max(self.memory, answer.header.get("memory", 0.0))
-        return Registration(T_odom_sensor.copy(), registered)
+        self.cpu = self._cpu_before + cpu
+        self.memory = max(self.memory, memory)
+        return Registration(T_odom_sensor.copy(), bool(registered))
 
     def configure(self, parameters: ParameterSet) -> None:
         """See `Odometry.configure`."""
@@ -209,7 +217,7 @@ class Isolated:
             self._fault(str(answer.header.get("message")))
             return None
         if answer.header.get("type") == "refused":
-            raise OdometryError(f"{self.name}: {answer.header.get('message')}")
+            raise OdometryError(f"{self._called}: {answer.header.get('message')}")
         return answer
 
     def _connect(self) -> BinaryIO:
@@ -224,9 +232,9 @@ class Isolated:
     def _fault(self, what: str) -> None:
         self.close()
         self.faults.append(what)
-        _log.warning("%s with %s: %s", self.name, self.parameters, what)
+        _log.warning("%s with %s: %s", self._called, self.parameters, what)
         if len(self.faults) == MOST_FAULTS:
-            _log.warning("%s: that was fault number %d, giving up", self.name, MOST_FAULTS)
+            _log.warning("%s: that was fault number %d, giving up", self._called, MOST_FAULTS)
 
 
 def nonsense(T_odom_sensor: Poses) -> str | None:

@@ -99,6 +99,10 @@ class Process(Isolated):
         self._program: subprocess.Popen[bytes] | None = None
         self._written: Any = None
 
+    @property
+    def _called(self) -> str:
+        return self._reach.command[0] if self._reach.command else str(self._reach.address)
+
     @staticmethod
     def describe(settings: Settings) -> Description:
         """What the program says of itself.

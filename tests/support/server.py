@@ -51,6 +51,8 @@ def main(fault="none"):
                 go_wrong(fault, writer)
                 stamp -= 200_000_000 if fault == "backwards" else 0
             answer = {"type": "pose", "stamp": stamp, "registered": True}
+            if n == 3 and fault == "types":
+                answer["stamp"] = "now"
             send(writer, answer, None if n == 3 and fault == "no pose" else pose)
         else:
             if kind == "start":

@@ -52,11 +52,12 @@ FAULTS = {
     "words": r"the stream holds no message of adaptune's.*: about to go wrong",
     "backwards": r"a pose of another time, -0\.200 s from the scan's",
     "no pose": "an answer without 'pose'",
+    "types": "an answer of other types",
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_told_and_another_start_goes_on(fault):
+def test_faults_are_told_and_another_start_goes_on(fault, caplog):
     box = Process({}, program(fault), Limits(seconds=0.5 if fault == "hang" else 20.0))
     box.start(scan(0), np.eye(4))
     for i in (1, 2):
@@ -65,6 +66,7 @@ def test_faults_are_told_and_another_start_goes_on(fault):
         assert np.isnan(box.register(scan(i)).T_odom_sensor).all()
     (told,) = box.faults
     assert re.search(FAULTS[fault], told), told
+    assert f"{sys.executable} with {{}}: {told}" in caplog.messages
     box.start(scan(5), np.eye(4))
     assert box.register(scan(6)).T_odom_sensor[0, 3] == 1.0
 
