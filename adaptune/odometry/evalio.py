@@ -17,7 +17,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses, invert, squared_ranges
-from adaptune.odometry.base import Anchored, BaseSettings, OdometryError
+from adaptune.odometry.base import Anchored, BaseSettings, Description, OdometryError
 from adaptune.sequence import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value, nearest
 
@@ -163,6 +163,19 @@ class Pipeline(Anchored):
         given = {name: self._typed(name, v) for name, v in (parameters or {}).items()}
         self.parameters |= {name: v for name, v in kept.items() if name in self.space.names} | given
         self._given = kept | self.parameters
+
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
+        """See `Odometry.describe`.
+
+        Raises
+        ------
+        OdometryError
+            If the settings hold what is no parameter of the pipeline, or a value of another type.
+        """
+        if settings is not None and settings.parameters:
+            cls(settings=settings)
+        return super().describe(settings)
 
     def _typed(self, name: str, value: Value) -> Value:
         """A value in the type that the pipeline insists on: 1 is no float to it."""

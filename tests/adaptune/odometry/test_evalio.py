@@ -145,6 +145,13 @@ def test_parameters_that_do_not_exist_or_fit(given, message):
         MadIcp(settings=MadIcp.settings_type(parameters=given))
 
 
+def test_what_is_not_tuned_is_checked_before_anything_runs():
+    cls = box_class("mad_icp")
+    assert cls.describe(cls.settings_type(parameters={"num_keyframes": 8})).space == cls.space
+    with pytest.raises(OdometryError, match=r"parameters\.b_maxx: mad has no such parameter"):
+        cls.describe(cls.settings_type(parameters={"b_maxx": 0.2}))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_tuned_is_the_pipelines_own(name):
     cls: type[Pipeline] = box_class(name)
