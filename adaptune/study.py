@@ -896,7 +896,10 @@ def _check_switching(config: StudyConfig, found: Description, problems: list[_Pr
     if found.whole and "rules" in online.model_fields_set and online.rules:
         what = "a command runs whole recordings: it cannot adapt on the way; leave this out"
         problems.append((("online", "rules"), what))
-    if online.switching.mechanism == "live" and not found.live:
+    if found.whole and online.switching.mechanism != "auto":
+        what = "a command runs whole recordings: it cannot change its parameters; leave this out"
+        problems.append((("online", "switching", "mechanism"), what))
+    elif online.switching.mechanism == "live" and not found.live:
         problems.append(
             (
                 ("online", "switching", "mechanism"),
@@ -960,6 +963,8 @@ def _validated(
                 message = f"unknown key; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
             elif detail["type"] == "missing":
                 message = "this key is missing"
+            elif detail["type"] == "tuple_type":
+                message = f"give a list, not {json.dumps(detail['input'], default=str)}"
             elif (
                 not isinstance(detail["input"], dict | list) and "Value error" not in detail["msg"]
             ):

@@ -307,8 +307,11 @@ class Command:
                 f"last at {_seconds(given.stamps, known)}"
             )
         if failure is not None:
-            self._fault(failure + (f": {words}" if words else ""))
-        _check_frame(T_own_sensor, given.T_ref_sensor)
+            self._fault(failure, words)
+        try:
+            _check_frame(T_own_sensor, given.T_ref_sensor)
+        except OdometryError as error:
+            raise OdometryError(self._told(str(error), words)) from error
         return T_own_sensor
 
     def _command(self, given: Material, output: Path, folder: Path) -> list[str]:
@@ -371,9 +374,15 @@ class Command:
             poses = poses @ to_pose(self.settings.extrinsic)
         return _at(Trajectory(stamps_own, poses), stamps)
 
-    def _fault(self, what: str) -> None:
+    def _told(self, what: str, words: str) -> str:
+        """What went wrong, of which program, and the last lines that it wrote."""
+        told = f"{self.settings.command[0]}, with {self.parameters}: {what}"
+        return f"{told}: {words}" if words else told
+
+    def _fault(self, what: str, words: str) -> None:
         if self._strict:
-            raise OdometryError(f"{self.settings.command[0]}, with {self.parameters}: {what}")
+            raise OdometryError(self._told(what, words))
+        what = f"{what}: {words}" if words else what
         self.faults.append(what)
         _log.warning("%s with %s: %s", self.settings.command[0], self.parameters, what)
 

@@ -167,7 +167,9 @@ def test_a_program_that_stamps_the_end_of_a_scan(make):
 
 
 def test_another_frame(make):
-    with pytest.raises(OdometryError, match=r"another frame: turned by 120 degrees.*extrinsic"):
+    with pytest.raises(
+        OdometryError, match=r"another frame: turned by 120 degrees.*extrinsic.*: read"
+    ):
         run(make("camera"))
     lidar = "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]"
     trial, sequence = run(make("camera", f"odometry.settings.extrinsic={lidar}"))
@@ -298,7 +300,9 @@ def test_the_whole_way(make):
         ("odometry.settings.format=tumm", "odometry.settings.format: Input should be"),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
         ("online.rules=[paired]", "online.rules: a command runs whole recordings"),
-        ("online.switching.mechanism=live", "command cannot change its parameters between scans"),
+        ("online.switching.mechanism=live", "a command runs whole recordings: it cannot change"),
+        ("online.switching.mechanism=bank", "a command runs whole recordings: it cannot change"),
+        ("odometry.settings.command=sh", 'settings.command: give a list, not "sh"'),
     ],
 )
 def test_mistakes_in_the_study(make, override, words):
