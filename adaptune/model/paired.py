@@ -222,9 +222,7 @@ class PairedExpectedRatio(Rule):
         """Error of the fixed set at one scan."""
         return float(self._weights(near.squared)[0] @ near.fixed[0])
 
-    def best(
-        self, near: Near
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    def best(self, near: Near) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
         """Number of the best candidate for each scan, of shape (n_scans,), and `ratios`."""
         expected, cautious = self.ratios(near)
         # Neither smoothing nor caution is for the one that all are compared with.
