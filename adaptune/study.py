@@ -307,7 +307,7 @@ class SwitchingConfig(_Section):
     full_rate: float | None = Field(None, ge=0, allow_inf_nan=False)
     stride: int | None = Field(None, ge=1)
     beside: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
-    size: int = Field(3, ge=2, le=4)
+    size: int = Field(2, ge=2, le=4)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0)] | dict[str, Value], ...] | None,
         Field(min_length=2, max_length=4),

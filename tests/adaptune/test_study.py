@@ -31,11 +31,11 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
     monkeypatch.setattr("adaptune.study.available", lambda: 4)
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for given, mechanism in (
-        ("online.switching.memory=12", "bank"),
-        ("online.switching.memory=11", "hand_over"),
+        ("online.switching.memory=8", "bank"),
+        ("online.switching.memory=7", "hand_over"),
         ("online.switching.cores=1", "hand_over"),
         ("online.switching.size=4", "bank"),
-        ("isolation.memory=6", "hand_over"),
+        ("isolation.memory=9", "hand_over"),
     ):
         assert load_study(study_file, [*stiff, given]).mechanism == mechanism
 
