@@ -64,6 +64,7 @@ app = typer.Typer(
         "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
         "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
         "    adaptune validate configs/demo.yaml    # would adapting pay elsewhere?\n\n"
+        "    adaptune switching configs/demo.yaml   # what a change on the way costs\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive"
     ),
