@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,10 @@ Progress = Callable[[str, int, int], None]
 RESAMPLES = 2000
 MIN_BLOCKS = 10
 """Independent pieces of a drive below which an interval would only seem to say something."""
+SCANT = 1.5
+"""Training sequences below which a selection rests on hardly more than one."""
+
+_log = logging.getLogger(__name__)
 
 
 class ComparisonError(AdaptuneError):
@@ -103,9 +108,24 @@ def run_replays(
             if not made_here:
                 _write_reference(folder, sequence.reference(), result.trajectory)
             write_replay(folder / mode, result, about)
+            _warn_of_scant_evidence(what, [c.selection for c in result.choices], model.fixed)
             made_here += 1
         made += made_here
     return made
+
+
+def _warn_of_scant_evidence(what: str, selections: Sequence[Selection], fixed: int) -> None:
+    left = [s for s in selections if s.set_index != fixed]
+    few = sum(s.sequences < SCANT for s in left)
+    if few:
+        _log.warning(
+            "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
+            "one training sequence (selections.csv tells which); more sequences would show "
+            "whether they hold",
+            what,
+            few,
+            len(left),
+        )
 
 
 def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, Policy | None]:

@@ -1,14 +1,22 @@
 import csv
 import json
+import math
 
 import numpy as np
 import pytest
 
-from adaptune.model import ErrorModel, portfolio
+from adaptune.model import ErrorModel, Selection, portfolio
 from adaptune.study import ConfigurationError, load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.campaign import train
-from online.comparison import ComparisonError, bank_sets, bootstrap, compare, run_replays
+from online.comparison import (
+    ComparisonError,
+    _warn_of_scant_evidence,
+    bank_sets,
+    bootstrap,
+    compare,
+    run_replays,
+)
 
 MODES = ["baseline", "fixed", "paired", "paper"]
 
@@ -218,3 +226,13 @@ def test_replays_of_another_setting_are_refused(replayed, study_file):
     other = load_study(study_file, ["online.period=2"], replayed.folder)
     with pytest.raises(ComparisonError, match="was replayed with another period"):
         compare(other)
+
+
+def test_selections_that_rest_on_one_sequence_are_told_of(caplog):
+    def selection(index, sequences):
+        return Selection(index, 0.5, 1.0, 1.0, sequences)
+
+    _warn_of_scant_evidence("a", [selection(0, 1.0), selection(1, 3.0), selection(1, math.nan)], 0)
+    assert not caplog.messages
+    _warn_of_scant_evidence("b", [selection(0, 1.0), selection(1, 1.2), selection(1, 3.0)], 0)
+    assert caplog.messages[0].startswith("b: 1 of 2 selections of another set")
