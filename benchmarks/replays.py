@@ -90,7 +90,8 @@ def ways(paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
     def bank(size: int, asked: bool) -> Way:
         members = complementary(data.errors, data.sequence, data.fixed, size)
         few = TrainingData(data.features, data.sequence, data.errors[:, members], units[members], 0)
-        rule = RULES["paired"](settings.model_copy(update={"n_sets": None}), 0.0).fit(few)
+        free = {} if settings.n_sets == 1 else {"n_sets": None}
+        rule = RULES["paired"](settings.model_copy(update=free), 0.0).fit(few)
         its = [sets[i] for i in members]
         return (
             lambda: Bank(study.odometry, its, WarmUp()),

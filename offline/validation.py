@@ -118,10 +118,13 @@ class Validation:
 
     def __post_init__(self) -> None:
         modes = list(self.left_out[0].errors)
-        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out])
-        self.ratios = {
-            mode: np.array([s.errors[mode].mean() for s in self.left_out]) / fixed for mode in modes
+        # Where the fixed set has no error at all, there is nothing to divide by.
+        least = np.finfo(np.float64).tiny
+        means = {
+            mode: np.maximum([s.errors[mode].mean() for s in self.left_out], least)
+            for mode in modes
         }
+        self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
 
     def summary(self, mode: str) -> dict[str, float]:
         """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.

@@ -223,7 +223,10 @@ class PairedExpectedRatio(Rule):
         return float(self._weights(near.squared)[0] @ near.fixed[0])
 
     def best(self, near: Near) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-        """Number of the best candidate for each scan, of shape (n_scans,), and `ratios`."""
+        """Number of the best candidate for each scan, of shape (n_scans,), and `ratios`.
+
+        Those of the fixed set are 1.
+        """
         expected, cautious = self.ratios(near)
         # Neither smoothing nor caution is for the one that all are compared with.
         fixed = int(np.flatnonzero(self.candidates_ == self.data_.fixed)[0])
@@ -235,7 +238,8 @@ class PairedExpectedRatio(Rule):
         """See `Rule.select`."""
         near = self.near(feature[None])
         (best,), (expected,), (cautious,) = self.best(near)
-        if self.price and current is not None:
+        # What takes a set back in a place unlike all training need not pay.
+        if self.price and current is not None and near.familiarity[0] >= NOVEL:
             at = np.flatnonzero(self.candidates_ == current)
             if len(at) and cautious[at[0]] - cautious[best] <= self.price:
                 best = at[0]

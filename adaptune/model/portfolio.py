@@ -13,6 +13,14 @@ def portfolio(model: ErrorModel, size: int) -> list[int]:
 
 def restrict(model: ErrorModel, chosen: list[int]) -> ErrorModel:
     """Make a model of some of the sets only, the first of which counts as the fixed one."""
+    # They were chosen already, unless the fixed one is always to be taken.
+    paired = model.paired
+    if paired.n_sets != 1:
+        paired = paired.model_copy(update={"n_sets": None})
     return replace(
-        model, sets=[model.sets[i] for i in chosen], errors=model.errors[:, chosen], fixed=0
+        model,
+        sets=[model.sets[i] for i in chosen],
+        errors=model.errors[:, chosen],
+        fixed=0,
+        paired=paired,
     )

@@ -2,6 +2,7 @@
 
 import math
 import statistics
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -306,6 +307,16 @@ def test_a_switch_must_pay():
     assert cheap.select(np.zeros(2), current=0).set_index == 1
     # A set that is not among those chosen from is left whatever it costs.
     assert rule.select(np.zeros(2), current=7).set_index == 1
+
+
+def test_in_a_place_unlike_all_training_going_back_costs_nothing():
+    data = random_data(1, 60, 5)
+    data.errors[:, 0], data.errors[:, 1:] = 0.5, 1.0
+    data = replace(data, fixed=1, sets=np.arange(5.0)[:, None])
+    rule = PairedExpectedRatio(price=0.2).fit(data)
+    at_home = data.features.mean(axis=0)
+    assert rule.select(at_home, current=1).set_index == 0
+    assert rule.select(np.full(3, 1e6), current=0).set_index == 1
 
 
 def test_it_says_how_many_sequences_it_rests_on():

@@ -1,6 +1,8 @@
+from dataclasses import replace
+
 import numpy as np
 
-from adaptune.model import ErrorModel, portfolio, restrict
+from adaptune.model import ErrorModel, Settings, portfolio, restrict
 from adaptune.space import Float, ParameterSpace
 
 
@@ -54,3 +56,7 @@ def test_a_model_of_some_sets():
     assert few.sets == [{"x": 1.0}, {"x": 2.0}]
     assert few.fixed == 0
     np.testing.assert_array_equal(few.errors, [[2.0, 3.0], [5.0, np.inf]])
+    # All of them may be chosen, unless nothing but the fixed one is to be.
+    assert few.paired.n_sets is None
+    kept = replace(of, paired=Settings(n_sets=1))
+    assert restrict(kept, [1, 2]).paired.n_sets == 1
