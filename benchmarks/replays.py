@@ -25,6 +25,7 @@ from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, Rule, Selection, TrainingData
 from adaptune.model.base import complementary
+from adaptune.model.paired import ERROR_FLOOR
 from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
 from adaptune.sequence import Scan
 from adaptune.simulation import Course, simulate
@@ -63,7 +64,7 @@ def asking(rule: Rule, pca: ScaledPCA, members: Sequence[int]) -> Policy:
 def geometric(data: TrainingData) -> int:
     """The set with the least geometric mean of the sequences' errors."""
     of = [cap(data.errors[data.sequence == s]).mean(axis=0) for s in np.unique(data.sequence)]
-    return int(np.argmin(np.log(np.array(of) + 0.02).mean(axis=0)))
+    return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
 
 
 Way = tuple[Callable[[], Box], Policy | None]

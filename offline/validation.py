@@ -28,6 +28,7 @@ from adaptune.model import (
     TrainingData,
 )
 from adaptune.model.base import complementary, mean_errors
+from adaptune.model.paired import ERROR_FLOOR
 from adaptune.study import Study, origin
 from offline.objective import weighted
 from offline.search import owner
@@ -245,7 +246,10 @@ def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArra
     rule = next(iter(RULES))
     familiarity = np.concatenate([s.familiarity for s in validation.left_out])
     ratio = np.concatenate(
-        [(s.errors[rule] + 0.02) / (s.errors["fixed"] + 0.02) for s in validation.left_out]
+        [
+            (s.errors[rule] + ERROR_FLOOR) / (s.errors["fixed"] + ERROR_FLOOR)
+            for s in validation.left_out
+        ]
     )
     return familiarity, ratio
 

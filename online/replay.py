@@ -114,7 +114,7 @@ def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
         last.append(describe(scan))
         mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
-        if fitted.cautious and foreign(scan):
+        if fitted.gated and foreign(scan):
             fixed = selection.predicted_fixed
             selection = Selection(model.fixed, fixed, fixed, 0.0)
         current = selection.set_index

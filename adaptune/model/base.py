@@ -140,12 +140,12 @@ class Rule(ABC):
 
     Attributes
     ----------
-    cautious : bool
+    gated : bool
         Whether the fixed set is to be kept where scans come from another sensor than in training;
         class attribute.
     """
 
-    cautious: ClassVar[bool] = False
+    gated: ClassVar[bool] = False
 
     @abstractmethod
     def fit(self, data: TrainingData) -> Self:

@@ -69,6 +69,22 @@ class Near(NamedTuple):
     familiarity: NDArray[np.float64]
 
 
+class Ratios(NamedTuple):
+    """Ratios of errors to the fixed set's.
+
+    Attributes
+    ----------
+    expected, cautious : ndarray of shape (n_scans, n_candidates)
+        What is expected, and the same with `caution` standard errors added.
+    weights : ndarray of shape (n_scans, n_sequences)
+        Of the training sequences, adding up to 1.
+    """
+
+    expected: NDArray[np.float64]
+    cautious: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
 class PairedExpectedRatio(Rule):
     """Compare every set with the fixed one on the same frames, and choose on the expected ratio.
 
@@ -91,7 +107,7 @@ class PairedExpectedRatio(Rule):
         What a switch must promise besides, as a share of the fixed set's error.
     """
 
-    cautious = True
+    gated = True
 
     def __init__(self, settings: Settings | None = None, price: float = 0.0):
         self.settings = settings or Settings()
@@ -157,14 +173,8 @@ class PairedExpectedRatio(Rule):
             fixed[:, s] = self.fixed_errors_[frames].mean(axis=1)
         return Near(squared, means, fixed, self._familiarity(squared.min(axis=1)))
 
-    def ratios(self, near: Near) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Ratio of every candidate's error to the fixed set's.
-
-        Returns
-        -------
-        expected, cautious : ndarray of shape (n_scans, n_candidates)
-            What is expected, and the same with `caution` standard errors added.
-        """
+    def ratios(self, near: Near) -> Ratios:
+        """Ratio of every candidate's error to the fixed set's."""
         ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
         weights = self._weights(near.squared)
         expected = np.einsum("qs,qsc->qc", weights, ratio)
@@ -172,7 +182,7 @@ class PairedExpectedRatio(Rule):
         error = np.sqrt(variance * (weights**2).sum(axis=1)[:, None])
         trust = np.minimum(1.0, near.familiarity / NOVEL)[:, None]
         expected = 1.0 + trust * (expected - 1.0)
-        return expected, expected + trust * self.settings.caution * error
+        return Ratios(expected, expected + trust * self.settings.caution * error, weights)
 
     def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         # With the median at zero every sequence has the very same place in it.
@@ -214,37 +224,34 @@ class PairedExpectedRatio(Rule):
         """
         near = self.near(feature[None])
         predicted = np.full(len(self.data_.sets), np.inf)
-        expected, _ = self.ratios(near)
-        predicted[self.candidates_] = expected[0] * self._expected_fixed(near)
+        expected, _, weights = self.ratios(near)
+        predicted[self.candidates_] = expected[0] * float(weights[0] @ near.fixed[0])
         return predicted
 
-    def _expected_fixed(self, near: Near) -> float:
-        """Error of the fixed set at one scan."""
-        return float(self._weights(near.squared)[0] @ near.fixed[0])
-
-    def best(self, near: Near) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    def best(self, near: Near) -> tuple[NDArray[np.intp], Ratios]:
         """Number of the best candidate for each scan, of shape (n_scans,), and `ratios`.
 
         Those of the fixed set are 1.
         """
-        expected, cautious = self.ratios(near)
+        ratios = self.ratios(near)
+        expected, cautious, _ = ratios
         # Neither smoothing nor caution is for the one that all are compared with.
         fixed = int(np.flatnonzero(self.candidates_ == self.data_.fixed)[0])
         expected[:, fixed] = cautious[:, fixed] = 1.0
         worth = np.log(cautious.min(axis=1)) < self.settings.threshold
-        return np.where(worth, cautious.argmin(axis=1), fixed), expected, cautious
+        return np.where(worth, cautious.argmin(axis=1), fixed), ratios
 
     def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
         """See `Rule.select`."""
         near = self.near(feature[None])
-        (best,), (expected,), (cautious,) = self.best(near)
+        (best,), ratios = self.best(near)
+        (expected,), (cautious,), (weights,) = ratios
         # What takes a set back in a place unlike all training need not pay.
         if self.price and current is not None and near.familiarity[0] >= NOVEL:
             at = np.flatnonzero(self.candidates_ == current)
             if len(at) and cautious[at[0]] - cautious[best] <= self.price:
                 best = at[0]
-        fixed = self._expected_fixed(near)
-        weights = self._weights(near.squared)[0]
+        fixed = float(weights @ near.fixed[0])
         return Selection(
             int(self.candidates_[best]),
             float(expected[best]) * fixed,
