@@ -34,6 +34,7 @@ from offline.validation import (
     LabelledSequence,
     Maker,
     Validation,
+    learning_curve,
     leave_one_out,
     tune,
 )
@@ -198,6 +199,12 @@ def ablate(paths: list[Path]) -> None:
     print_summary(validation, [mode for mode in validation.ratios if mode != "baseline"])
 
 
+def curve(paths: list[Path]) -> None:
+    """Print what fewer training sequences would gain."""
+    for row in learning_curve(*labelled(paths)):
+        print(" ".join(f"{key} {value:.3g}" for key, value in row.items()), flush=True)
+
+
 def print_summary(validation: Validation, modes: Iterable[str]) -> None:
     """Print the ratios to the fixed set's error."""
     print("geometric, arithmetic, worst ratio to the fixed set's error, sequences above 1.05")
@@ -220,7 +227,9 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[6, 7])
     parser.add_argument("--length", type=float, default=120.0, help="metres of a course")
     parser.add_argument("--odometries", nargs="+", default=ODOMETRIES, choices=ODOMETRIES)
-    parser.add_argument("--ablate", action="store_true", help="without one thing after the other")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--ablate", action="store_true", help="without one thing after the other")
+    what.add_argument("--curve", action="store_true", help="with fewer training sequences")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     # Open3D's NDT differs in its last bits from run to run on more than one core.
@@ -228,7 +237,7 @@ def main() -> None:
     for seed, odometry in itertools.product(arguments.seeds, arguments.odometries):
         courses = training_courses(seed, arguments.length)
         paths = trials(arguments.folder, odometry, courses, seed)
-        (ablate if arguments.ablate else validate)(paths)
+        (ablate if arguments.ablate else curve if arguments.curve else validate)(paths)
 
 
 if __name__ == "__main__":
