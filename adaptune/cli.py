@@ -351,7 +351,9 @@ def validate(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",
             rows,
-            "Oracles know the errors: the best set of the sequence, and of every period.",
+            "Oracles know the errors: the best set of the sequence, and of every period. "
+            "Intervals: on a sequence, of a block bootstrap over time, where it is long enough; "
+            "of the geometric mean, Student's over the sequences.",
         )
     )
     known = ", ".join(f"{ratio:.2f}" for ratio in validation.portfolio())

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, rotation_angle, steps
 
+RESAMPLES = 2000
+MIN_BLOCKS = 10
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
@@ -204,3 +206,56 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
     NaN, for what is not known, stays.
     """
     return np.minimum(errors.astype(np.float64), FAILURE)
+
+
+def bootstrap(
+    errors: NDArray[np.float64], fixed: NDArray[np.float64], block: int, seed: int = 0
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """95 % intervals of the mean error, and of its ratio to the fixed set's.
+
+    A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
+    share most of their sub-trajectories and are drawn together. It speaks of one drive, not of
+    other places.
+
+    Parameters
+    ----------
+    errors, fixed
+        Percent, of the same frames, of shape (n,).
+    block
+        Frames drawn together.
+    seed
+        Of the resampling.
+
+    Returns
+    -------
+    tuple, or None
+        The ends of both; None if there are fewer than `MIN_BLOCKS` blocks, which tell nothing.
+    """
+    n = len(errors)
+    if n < MIN_BLOCKS * block:
+        return None
+    n_blocks = -(-n // block)
+    starts = np.random.default_rng(seed).integers(0, n - block + 1, (RESAMPLES, n_blocks))
+    means = []
+    for values in (errors, fixed):
+        sums = np.concatenate([[0.0], np.cumsum(values)])
+        means.append((sums[starts + block] - sums[starts]).sum(axis=1) / (n_blocks * block))
+    ratios = means[0] / np.maximum(means[1], 1e-12)
+    low, high = np.percentile(means[0], [2.5, 97.5])
+    ratio_low, ratio_high = np.percentile(ratios, [2.5, 97.5])
+    return (float(low), float(high)), (float(ratio_low), float(ratio_high))
+
+
+def span(T_ref_sensor: Poses, length: float) -> int:
+    """Frames that a sub-trajectory takes, within which errors share their windows.
+
+    Parameters
+    ----------
+    T_ref_sensor
+        Reference poses of shape (n, 4, 4); NaN where there is none.
+    length
+        Metres. Of a shorter path, all of it.
+    """
+    ends = window_ends(T_ref_sensor, length)
+    starts = np.flatnonzero(ends >= 0)
+    return int(np.median(ends[starts] - starts)) if len(starts) else max(1, len(ends))

@@ -48,7 +48,7 @@ from adaptune.sampling import NAMES, SETTINGS, SINGLE, SamplerError, check_sampl
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
 from adaptune.sequence.config import ViewConfig, check_sequence, expand
-from adaptune.sequence.views import WithImu
+from adaptune.sequence.views import OF_VIEW, WithImu, origin
 from adaptune.simulation import Course, as_sequence
 from adaptune.space import (
     Categorical,
@@ -62,15 +62,6 @@ from adaptune.space import (
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 """Becomes a file's name."""
-
-
-OF_VIEW = "+"
-"""Between the name of a sequence and that of a view of it; in no name that a user gives."""
-
-
-def origin(name: str) -> str:
-    """Name of the sequence that a training sequence is, or is a view of."""
-    return name.partition(OF_VIEW)[0]
 
 
 class ConfigurationError(AdaptuneError):

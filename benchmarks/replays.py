@@ -13,7 +13,8 @@ where another confirms it, and else the medoid of all.
 import argparse
 import os
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +47,8 @@ ORDERS = (
 LENGTH, SUB_TRAJECTORY = 60.0, 25.0
 
 
-def asking(rule: Rule, pca: ScaledPCA, members: Sequence[int]) -> Policy:
-    """A policy that asks a rule, whose sets go by these numbers."""
+def asking(rule: Rule, pca: ScaledPCA) -> Policy:
+    """A policy that asks a rule."""
     current: int | None = None
     last: deque[NDArray[np.uint32]] = deque(maxlen=WINDOW)
 
@@ -56,7 +57,7 @@ def asking(rule: Rule, pca: ScaledPCA, members: Sequence[int]) -> Policy:
         last.append(ndt_histogram(scan.points))
         selection = rule.select(pca.transform(np.mean(last, axis=0)[None])[0], current)
         current = selection.set_index
-        return selection._replace(set_index=members[current])
+        return selection
 
     return select
 
@@ -79,25 +80,19 @@ def ways(paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
     print(f"settings of the paired rule: {settings}")
     study = study_of("gicp")
     sets = study.space.from_unit(units)
-    everything = range(len(units))
 
     def alone(number: int | None) -> Way:
         return lambda: study.odometry(None if number is None else sets[number]), None
 
     def live(name: str) -> Way:
         rule = RULES[name](settings, 0.0).fit(data)
-        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca, everything)
+        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca)
 
     def bank(size: int, asked: bool) -> Way:
         members = complementary(data.errors, data.sequence, data.fixed, size)
-        few = TrainingData(data.features, data.sequence, data.errors[:, members], units[members], 0)
-        free = {} if settings.n_sets == 1 else {"n_sets": None}
-        rule = RULES["paired"](settings.model_copy(update=free), 0.0).fit(few)
+        rule = RULES["paired"](settings, 0.0).fit(replace(data, candidates=members))
         its = [sets[i] for i in members]
-        return (
-            lambda: Bank(study.odometry, its, WarmUp()),
-            asking(rule, pca, members) if asked else None,
-        )
+        return lambda: Bank(study.odometry, its, WarmUp()), asking(rule, pca) if asked else None
 
     return sets, {
         "baseline": alone(None),

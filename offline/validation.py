@@ -18,7 +18,7 @@ from adaptune import report
 from adaptune.archive import Archive
 from adaptune.descriptor import ScaledPCA, averaged
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import cap
+from adaptune.metrics import bootstrap, cap, span
 from adaptune.model import (
     RULES,
     ErrorModel,
@@ -29,7 +29,8 @@ from adaptune.model import (
 )
 from adaptune.model.base import complementary, mean_errors
 from adaptune.model.paired import ERROR_FLOOR
-from adaptune.study import Study, origin
+from adaptune.sequence.views import origin, places
+from adaptune.study import Study
 from offline.objective import weighted
 from offline.search import owner
 
@@ -39,7 +40,7 @@ NO_WORSE = 1.05
 """A rule may not have more than this much of the fixed set's error on any sequence left out."""
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
-SETTINGS = tuple(Settings(sharpness=sharpness) for sharpness in (6.0, 12.0, 24.0, 48.0))
+SHARPNESS = (6.0, 12.0, 24.0, 48.0)
 """What `tune` chooses from; of equally good ones the first."""
 
 
@@ -68,6 +69,8 @@ class LabelledSequence:
     own : ndarray of shape (n_sets,), optional
         Sets that were searched for on this very place, or a view of it, and on no other: who has
         not been there does not know them.
+    block : int
+        Frames that a sub-trajectory takes.
     """
 
     name: str
@@ -78,6 +81,7 @@ class LabelledSequence:
     baseline: NDArray[np.float64] | None = None
     values: NDArray[np.float64] | None = None
     own: NDArray[np.bool_] | None = None
+    block: int = 1
 
 
 class LeftOut(NamedTuple):
@@ -94,6 +98,8 @@ class LeftOut(NamedTuple):
         See `Selection`; NaN without a rule that tells it.
     portfolio : ndarray of shape (MOST_SETS,)
         Mean error in percent if of 1, 2, ... complementary sets the best were always known.
+    block : int
+        Frames that a sub-trajectory takes.
     """
 
     name: str
@@ -101,6 +107,15 @@ class LeftOut(NamedTuple):
     adapted: dict[str, float]
     familiarity: NDArray[np.float64]
     portfolio: NDArray[np.float64]
+    block: int = 1
+
+    def interval(self, mode: str) -> tuple[float, float] | None:
+        """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
+
+        It speaks of this drive, and tells nothing of other places.
+        """
+        intervals = bootstrap(self.errors[mode], self.errors["fixed"], self.block)
+        return intervals and intervals[1]
 
 
 @dataclass
@@ -213,13 +228,17 @@ def validate(
         sequences, sets, progress=lambda i, n: progress("sequences left out", i, n)
     )
     rows: list[dict[str, Any]] = []
+    default = next(iter(RULES))
     for i, sequence in enumerate(validation.left_out):
         rows.append({"left out": sequence.name, "fixed [%]": sequence.errors["fixed"].mean()})
         rows[-1] |= {m: float(r[i]) for m, r in validation.ratios.items() if m != "fixed"}
+        rows[-1] |= {f"{default}, 95 %": _ends(sequence.interval(default))}
+    summaries = {m: validation.summary(m) for m in validation.ratios if m != "fixed"}
     for key in ("geometric", "arithmetic", "worst"):
-        row: dict[str, Any] = {"left out": f"{key}", "fixed [%]": None}
-        row |= {m: validation.summary(m)[key] for m in validation.ratios if m != "fixed"}
-        rows.append(row)
+        row: dict[str, Any] = {"left out": key, "fixed [%]": None}
+        rows.append(row | {m: summary[key] for m, summary in summaries.items()})
+        low, high = (summaries[default][end] for end in ("low", "high"))
+        rows[-1] |= {f"{default}, 95 %": _ends((low, high) if key == "geometric" else None)}
     report.write_rows(study.folder, "validation", rows)
     learning = []
     if curve:
@@ -239,6 +258,10 @@ def validate(
     found = {rule: validation.summary(rule) for rule in RULES}
     replace(model, validation=found).save(study.folder / "model.npz")
     return validation, rows
+
+
+def _ends(interval: tuple[float, float] | None) -> str | None:
+    return interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
 
 
 def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -322,6 +345,7 @@ def labelled_sequences(
                 archive.read(name, 0).errors[labelled],
                 np.array(values),
                 np.array([other is not None and origin(other) == origin(name) for other in owners]),
+                span(frames.T_ref_sensor, study.config.sub_trajectory),
             )
         )
     return sequences, model.space.to_unit([model.sets[i] for i in everywhere])
@@ -398,7 +422,7 @@ def training_data(
     """What rules learn from these sequences, and how to describe a scan for them."""
     descriptors = np.concatenate([s.descriptors for s in sequences])
     errors = np.concatenate([s.errors for s in sequences])
-    number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
+    number = np.repeat(places([s.name for s in sequences]), [len(s.errors) for s in sequences])
     pca = ScaledPCA(blocks=sequences[0].blocks).fit(descriptors)
     values = [
         mean_errors(s.errors, np.zeros(len(s.errors), np.intp)) if s.values is None else s.values
@@ -438,7 +462,7 @@ def _leave_out(
     few = complementary(data.errors, data.sequence, data.fixed, MOST_SETS)
     least = np.minimum.accumulate(of_periods[:, few], axis=1)[period].mean(axis=0)
     portfolio = least[np.minimum(np.arange(MOST_SETS), len(few) - 1)]
-    return LeftOut(sequence.name, errors, adapted, familiarity[period], portfolio)
+    return LeftOut(sequence.name, errors, adapted, familiarity[period], portfolio, sequence.block)
 
 
 def _comparable(
@@ -485,29 +509,26 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
         return Settings()
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
-        logs = np.array([_tried(sequence, others, sets, SETTINGS) for sequence, others in folds])
+        logs = np.array([_tried(sequence, others, sets) for sequence, others in folds])
     means = np.where(logs.max(axis=0) <= np.log(NO_WORSE), logs.mean(axis=0), np.inf)
     best = int(np.argmin(means))
-    return SETTINGS[best] if means[best] < 0.0 else Settings(n_sets=1)
+    return Settings(sharpness=SHARPNESS[best]) if means[best] < 0.0 else Settings(n_sets=1)
 
 
 def _tried(
-    sequence: LabelledSequence,
-    others: Sequence[LabelledSequence],
-    sets: NDArray[np.float64],
-    settings: Sequence[Settings],
+    sequence: LabelledSequence, others: Sequence[LabelledSequence], sets: NDArray[np.float64]
 ) -> list[float]:
-    """With each of the settings, logarithm of the ratio to the fixed set's error."""
+    """With each of `SHARPNESS`, logarithm of the ratio to the fixed set's error."""
     sequence, others, sets = _comparable(sequence, others, sets)
     data, pca = training_data(others, sets)
-    rule = PairedExpectedRatio(settings[0]).fit(data)
+    rule = PairedExpectedRatio().fit(data)
     first, period = _periods(sequence)
-    near = rule.near(pca.transform(sequence.descriptors[first]), rule.known_errors_)
+    near = rule.near(pca.transform(sequence.descriptors[first]))
     capped = cap(sequence.errors)
     logs = []
-    for some in settings:
-        rule.configure(some)
-        best, *_ = rule.best(near._replace(errors=near.errors @ rule.kernel_))
+    for sharpness in SHARPNESS:
+        rule.settings = Settings(sharpness=sharpness)
+        best, _ = rule.best(near)
         chosen = rule.candidates_[best]
         errors = capped[np.arange(len(capped)), chosen[period]]
         logs.append(float(np.log(errors.mean() / capped[:, data.fixed].mean())))

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from adaptune import report
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import KittiError, kitti_error, sub_trajectory_rte, window_ends
-from adaptune.model import ErrorModel, Selection, portfolio, restrict
+from adaptune.metrics import KittiError, bootstrap, kitti_error, span, sub_trajectory_rte
+from adaptune.model import ErrorModel, Selection
 from adaptune.odometry import Bank, Box, HandOver
 from adaptune.report import Track
-from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
@@ -26,8 +25,6 @@ from online.replay import Policy, adaptive, replay, write_replay
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
 
-RESAMPLES = 2000
-MIN_BLOCKS = 10
 """Independent pieces of a drive below which an interval would only seem to say something."""
 SCANT = 1.5
 """Training sequences below which a selection rests on hardly more than one."""
@@ -152,13 +149,7 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
         box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
         return box, adaptive(model, mode, study.price())
     members, sets = bank_sets(study, model)
-    select = adaptive(restrict(model, members), mode)
-
-    def policy(scan: Scan) -> Selection:
-        selection = select(scan)
-        return selection._replace(set_index=members[selection.set_index])
-
-    return Bank(study.odometry, sets, study.warm_up), policy
+    return Bank(study.odometry, sets, study.warm_up), adaptive(model, mode, members=members)
 
 
 def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[ParameterSet]]:
@@ -171,7 +162,7 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
     """
     given = study.config.online.switching.sets
     if given is None:
-        members = portfolio(model, study.config.online.switching.size)
+        members = model.portfolio(study.config.online.switching.size)
         return members, [model.sets[i] for i in members]
     members = []
     for i, named in enumerate(given):
@@ -181,6 +172,11 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
                 f"online.switching.sets.{i}: is none of the {len(model.sets)} parameter sets that "
                 f"were tried, so nothing is known of its errors; name the number of a trial, or "
                 f"the parameters of one (trials.csv lists them)"
+            )
+        if np.isnan(model.errors[:, number]).any():
+            raise ComparisonError(
+                f"online.switching.sets.{i}: was not run on every training sequence, so it cannot "
+                f"be compared with the others; name another (trials.csv tells which were)"
             )
         members.append(number)
     return members, [model.sets[i] for i in members]
@@ -305,7 +301,10 @@ def compare(study: Study) -> list[dict[str, Any]]:
         folder = study.folder / "replays" / name
         tracks = {mode: _track(folder, mode, study) for mode in modes(study)}
         errors = {mode: track.errors for mode, track in tracks.items()}
-        block = _block(folder, study, errors["fixed"])
+        # Without a reference there are no errors to be drawn.
+        path = folder / "reference.tum"
+        length = study.config.sub_trajectory
+        block = span(read_tum(path).T_world_sensor, length) if path.exists() else 1
         for mode, track in tracks.items():
             summary = _summary(folder / mode)
             row = _row(name, mode, track, errors["fixed"], block, summary, _kitti(folder, mode))
@@ -423,16 +422,6 @@ def _numbers(values: Sequence[str]) -> list[Any]:
         return list(values)
 
 
-def _block(folder: Path, study: Study, errors: NDArray[np.float64]) -> int:
-    """Frames that a sub-trajectory takes: errors nearer to each other share their windows."""
-    if not (folder / "reference.tum").exists():
-        return 1
-    reference = read_tum(folder / "reference.tum")
-    ends = window_ends(reference.T_world_sensor, study.config.sub_trajectory)
-    starts = np.flatnonzero(ends >= 0)
-    return int(np.median(ends[starts] - starts)) if len(starts) else max(1, len(errors))
-
-
 def _row(
     name: str,
     mode: str,
@@ -445,8 +434,9 @@ def _row(
     known = np.isfinite(track.errors) & np.isfinite(fixed)
     mean = low = high = ratio = ratio_low = ratio_high = None
     if known.any():
-        mean, ratio, intervals = bootstrap(track.errors[known], fixed[known], block)
-        if known.sum() >= MIN_BLOCKS * block:
+        mean = float(track.errors[known].mean())
+        ratio = mean / max(float(fixed[known].mean()), 1e-12)
+        if intervals := bootstrap(track.errors[known], fixed[known], block):
             (low, high), (ratio_low, ratio_high) = intervals
     switches = 0
     if len(track.choice_seconds) > 1:
@@ -471,42 +461,6 @@ def _row(
         "_kitti_percent": kitti.translation,
         "_kitti_deg_per_m": kitti.rotation,
     }
-
-
-def bootstrap(
-    errors: NDArray[np.float64], fixed: NDArray[np.float64], block: int, seed: int = 0
-) -> tuple[float, float, tuple[tuple[float, float], tuple[float, float]]]:
-    """Mean error, its ratio to the fixed set's, and the 95 % intervals of both.
-
-    A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
-    share most of their sub-trajectories and are drawn together. It speaks of one drive, not of
-    other places.
-
-    Parameters
-    ----------
-    errors, fixed
-        Percent, of the same frames, of shape (n,).
-    block
-        Frames drawn together.
-    seed
-        Of the resampling.
-    """
-    n = len(errors)
-    block = min(block, n)
-    n_blocks = -(-n // block)
-    starts = np.random.default_rng(seed).integers(0, n - block + 1, (RESAMPLES, n_blocks))
-    means = []
-    for values in (errors, fixed):
-        sums = np.concatenate([[0.0], np.cumsum(values)])
-        means.append((sums[starts + block] - sums[starts]).sum(axis=1) / (n_blocks * block))
-    ratios = means[0] / np.maximum(means[1], 1e-12)
-    low, high = np.percentile(means[0], [2.5, 97.5])
-    ratio_low, ratio_high = np.percentile(ratios, [2.5, 97.5])
-    return (
-        float(errors.mean()),
-        float(errors.mean() / max(fixed.mean(), 1e-12)),
-        ((float(low), float(high)), (float(ratio_low), float(ratio_high))),
-    )
 
 
 def _pooled(rows: list[dict[str, Any]], ratios: dict[str, list[float]]) -> list[dict[str, Any]]:

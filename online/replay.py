@@ -82,7 +82,9 @@ class Replay:
     unhealthy: dict[str, int]
 
 
-def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
+def adaptive(
+    model: ErrorModel, rule: str, price: float = 0.0, members: list[int] | None = None
+) -> Policy:
     """A policy that asks an error model.
 
     By the paired rule, scans of a sensor or mount that was not trained with, see
@@ -96,9 +98,13 @@ def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
         One of `adaptune.model.RULES`.
     price
         What a switch must promise, as a share of the fixed set's error.
+    members
+        The sets to choose among, the first of which counts as the fixed one; all, and the model's
+        fixed one, when left out.
     """
     pca = model.pca()
-    fitted = RULES[rule](model.paired, price).fit(model.training_data(pca))
+    data = model.training_data(pca, members)
+    fitted = RULES[rule](model.paired, price).fit(data)
     describe = Describer(model.blocks)
     if describe.blocks != model.blocks:
         raise DescriptorError(
@@ -116,7 +122,7 @@ def adaptive(model: ErrorModel, rule: str, price: float = 0.0) -> Policy:
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
         if fitted.gated and foreign(scan):
             fixed = selection.predicted_fixed
-            selection = Selection(model.fixed, fixed, fixed, 0.0)
+            selection = Selection(data.fixed, fixed, fixed, 0.0)
         current = selection.set_index
         return selection
 

@@ -20,7 +20,8 @@ class TrainingData:
     features : ndarray of shape (n_frames, n_features)
         What the scan of each frame looks like, scaled.
     sequence : ndarray of shape (n_frames,)
-        Number of the sequence that each frame belongs to.
+        Number of the sequence that each frame belongs to; that of a view of it is the same, for it
+        is the same place.
     errors : ndarray of shape (n_frames, n_sets)
         Sub-trajectory RTE in percent, infinite where the track was lost, NaN where the set was
         never run: usually on all frames of a sequence, or on none. Frames without a
@@ -29,6 +30,8 @@ class TrainingData:
         The parameter sets in the unit cube.
     fixed : int
         The one set that is best over all sequences.
+    candidates : list of int, optional
+        The sets to choose among, the fixed one among them; all when left out.
     """
 
     features: NDArray[np.float64]
@@ -36,6 +39,7 @@ class TrainingData:
     errors: NDArray[np.float32]
     sets: NDArray[np.float64]
     fixed: int
+    candidates: list[int] | None = None
 
 
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -153,7 +157,7 @@ class Rule(ABC):
 
     @abstractmethod
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predict the error of every set for one scan.
+        """Predict the error of every set for one scan, infinite of those not chosen among.
 
         Parameters
         ----------

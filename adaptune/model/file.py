@@ -18,8 +18,9 @@ from adaptune.archive import compact
 from adaptune.descriptor import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
-from adaptune.model.base import TrainingData
+from adaptune.model.base import TrainingData, complementary
 from adaptune.model.paired import Settings
+from adaptune.sequence.views import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
 FORMAT = 2
@@ -122,15 +123,29 @@ class ErrorModel:
         """Principal components of the training frames' descriptors."""
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
 
-    def training_data(self, pca: ScaledPCA) -> TrainingData:
-        """What selection rules learn from."""
+    def training_data(self, pca: ScaledPCA, members: list[int] | None = None) -> TrainingData:
+        """What selection rules learn from.
+
+        Parameters
+        ----------
+        pca
+            Of `pca`.
+        members
+            Sets to choose among, the first of which counts as the fixed one; all, and the fixed
+            one, when left out.
+        """
         return TrainingData(
             pca.transform(self.descriptors),
-            self.sequence,
+            places(self.sequences)[self.sequence],
             self.errors,
             self.space.to_unit(self.sets),
-            self.fixed,
+            members[0] if members else self.fixed,
+            members,
         )
+
+    def portfolio(self, size: int) -> list[int]:
+        """Choose complementary sets, the fixed one first; see `complementary`."""
+        return complementary(self.errors, places(self.sequences)[self.sequence], self.fixed, size)
 
     def is_foreign(self, elevation: float) -> bool:
         """Whether scans whose lowest points lie there come from no sensor of the training's.

@@ -202,7 +202,12 @@ class NearestNeighbours(Rule):
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`."""
-        return self.regressor_.predict_one(feature)
+        predicted = self.regressor_.predict_one(feature)
+        if self.data_.candidates is None:
+            return predicted
+        some = np.full_like(predicted, np.inf)
+        some[self.data_.candidates] = predicted[self.data_.candidates]
+        return some
 
     def select(
         self,

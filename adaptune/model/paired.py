@@ -24,8 +24,8 @@ class Settings(BaseModel):
     Attributes
     ----------
     n_sets : int, optional
-        It chooses among so many complementary sets, the fixed one first; among all if None. With
-        one it always takes the fixed set.
+        It chooses among so many complementary sets, the fixed one first; among all if None, and
+        among those that the data names if it does. With one it always takes the fixed set.
     sharpness : float
         How fast a sequence's weight falls with the distance of its nearest frames.
     width : float
@@ -102,7 +102,8 @@ class PairedExpectedRatio(Rule):
     Parameters
     ----------
     settings
-        `tune` in `offline.validation` chooses them on the training sequences.
+        `tune` in `offline.validation` chooses them on the training sequences. Of a fitted rule,
+        `sharpness`, `threshold` and `caution` may be changed.
     price
         What a switch must promise besides, as a share of the fixed set's error.
     """
@@ -117,59 +118,55 @@ class PairedExpectedRatio(Rule):
         """See `Rule.fit`."""
         self.data_ = data
         self.fixed_errors_ = cap(data.errors[:, data.fixed])
-        # Where a set was not run, the fixed one's error makes it neither better nor worse.
-        fixed = self.fixed_errors_[:, None].astype(np.float32)
-        errors = np.minimum(data.errors, np.float32(FAILURE))
-        self.known_errors_ = np.where(np.isnan(errors), fixed, errors)
+        self.candidates_ = self._candidates()
+        self.errors_ = self._mixed()
         self.sequences_ = [np.flatnonzero(data.sequence == s) for s in np.unique(data.sequence)]
         self.features_ = [data.features[members] for members in self.sequences_]
         self.novelty_ = self._calibrate()
-        self._mix()
         return self
 
-    def configure(self, settings: Settings) -> Self:
-        """Change the settings of a fitted rule, but for `n_frames`, which its novelty rests on."""
-        before, self.settings = self.settings, settings
-        if (settings.n_sets, settings.width) != (before.n_sets, before.width):
-            self._mix()
-        return self
+    def _candidates(self) -> NDArray[np.intp]:
+        """Numbers of the sets to choose among."""
+        data, n_sets = self.data_, self.settings.n_sets
+        if n_sets == 1:
+            return np.array([data.fixed])
+        if data.candidates is not None:
+            return np.array(data.candidates)
+        if n_sets is None or n_sets >= len(data.sets):
+            return np.arange(len(data.sets))
+        return np.array(complementary(data.errors, data.sequence, data.fixed, n_sets))
 
-    def _mix(self) -> None:
-        """Choose the candidates, and mix each one's errors with its neighbours'."""
-        data, settings = self.data_, self.settings
-        self.candidates_ = np.arange(len(data.sets))
-        if settings.n_sets is not None and settings.n_sets < len(data.sets):
-            chosen = complementary(data.errors, data.sequence, data.fixed, settings.n_sets)
-            self.candidates_ = np.array(chosen)
+    def _mixed(self) -> NDArray[np.float32]:
+        """Error of every candidate on every frame, mixed with its neighbours'.
+
+        Before ratios are taken, for a ratio of means is linear in its numerator.
+        """
+        data = self.data_
         squared = ((data.sets[:, None] - data.sets[self.candidates_]) ** 2).sum(axis=2)
-        kernel = np.exp(-0.5 * squared / settings.width**2)
-        self.kernel_ = (kernel / kernel.sum(axis=0)).astype(np.float32)
-        # A ratio of means is linear in its numerator, so neighbouring sets can be mixed before.
-        self.errors_ = self.known_errors_ @ self.kernel_
+        kernel = np.exp(-0.5 * squared / self.settings.width**2)
+        kernel /= kernel.sum(axis=0)
+        errors = np.minimum(data.errors, np.float32(FAILURE))
+        # Where a set was not run, the fixed one's error makes it neither better nor worse.
+        fixed = self.fixed_errors_[:, None].astype(np.float32)
+        return np.asarray(np.where(np.isnan(errors), fixed, errors) @ kernel.astype(np.float32))
 
-    def near(
-        self, features: NDArray[np.float64], errors: NDArray[np.float32] | None = None
-    ) -> Near:
+    def near(self, features: NDArray[np.float64]) -> Near:
         """What the training frames nearest to scans say.
 
         Parameters
         ----------
         features
             Of shape (n_scans, n_features).
-        errors
-            What to take means of, of shape (n_frames, n); the candidates' mixed errors when left
-            out. `known_errors_` serve any later settings: their means times `kernel_` are those.
         """
-        errors = self.errors_ if errors is None else errors
         shape = len(features), len(self.sequences_)
         squared, fixed = np.empty(shape), np.empty(shape)
-        means = np.empty((*shape, errors.shape[1]))
+        means = np.empty((*shape, len(self.candidates_)))
         for s, (members, of_sequence) in enumerate(
             zip(self.sequences_, self.features_, strict=True)
         ):
             squared[:, s], nearest = _nearest(of_sequence, features, self.settings.n_frames)
             frames = members[nearest]
-            means[:, s] = errors[frames].mean(axis=1, dtype=np.float64)
+            means[:, s] = self.errors_[frames].mean(axis=1, dtype=np.float64)
             fixed[:, s] = self.fixed_errors_[frames].mean(axis=1)
         return Near(squared, means, fixed, self._familiarity(squared.min(axis=1)))
 
@@ -219,8 +216,8 @@ class PairedExpectedRatio(Rule):
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`.
 
-        Sets that are not chosen among have an infinite error. For the fixed set too this is the
-        smoothed ratio times its error; `select` tells the error itself.
+        For the fixed set too this is the smoothed ratio times its error; `select` tells the error
+        itself.
         """
         near = self.near(feature[None])
         predicted = np.full(len(self.data_.sets), np.inf)

@@ -9,7 +9,6 @@ from adaptune.model.base import Rule
 from adaptune.study import load_study
 from offline.campaign import train
 from offline.validation import (
-    SETTINGS,
     LabelledSequence,
     LeftOut,
     Validation,
@@ -123,10 +122,18 @@ def test_verdicts(ratios, verdict):
     assert Validation(left_out).verdict("rule").startswith(verdict)
 
 
+def test_intervals_over_time():
+    fixed = 1.0 + np.arange(400) % 2
+    errors = {"fixed": fixed, "rule": 0.5 * fixed}
+    left_out = LeftOut("a", errors, {}, np.ones(400), np.ones(6), block=40)
+    assert left_out.interval("rule") == pytest.approx((0.5, 0.5))
+    assert left_out._replace(block=41).interval("rule") is None
+
+
 def test_settings_are_chosen_on_the_sequences_at_hand():
     sequences = two_kinds(np.random.default_rng(0))
     # Set 2 everywhere, 0 in one kind of place and 4 in the other.
-    assert tune(sequences, SETS) == SETTINGS[0]
+    assert tune(sequences, SETS) == Settings(sharpness=6.0)
     # Where nothing is to be gained anywhere, nothing is tried.
     same = [replace(s, errors=np.ones_like(s.errors)) for s in sequences]
     assert tune(same, SETS) == Settings(n_sets=1)
@@ -202,4 +209,9 @@ def test_validates_a_study(study_file, tmp_path):
     validation, rows = validate(study, curve=False)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
+    # Four sub-trajectories tell nothing; a dozen would.
+    assert rows[0]["paired, 95 %"] is None
+    summary = validation.summary("paired")
+    assert rows[2]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert validation.left_out[0].block > 1
     assert (study.folder / "validation.csv").exists()

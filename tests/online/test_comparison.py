@@ -1,11 +1,12 @@
 import csv
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from adaptune.model import ErrorModel, Selection, portfolio
+from adaptune.model import ErrorModel, Selection
 from adaptune.study import ConfigurationError, load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.campaign import train
@@ -13,7 +14,6 @@ from online.comparison import (
     ComparisonError,
     _warn_of_scant_evidence,
     bank_sets,
-    bootstrap,
     compare,
     run_replays,
 )
@@ -80,7 +80,7 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
     assert about["switching"]["warm_up"]["seconds"] == 0.5
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
-    members = portfolio(model, 3) if mechanism == "bank" else range(len(model.sets))
+    members = model.portfolio(2) if mechanism == "bank" else range(len(model.sets))
     for row in rows:
         # The numbers are those of the model, not of the bank.
         assert int(row["set"]) in members
@@ -97,6 +97,10 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
     values = "{" + ", ".join(f"{k}: {v!r}" for k, v in model.sets[4].items()) + "}"
     named = load_study(study_file, [bank, f"online.switching.sets=[{values}, 1]"], trained.folder)
     assert bank_sets(named, model)[0] == [4, 1]
+    errors = model.errors.copy()
+    errors[:3, 4] = np.nan
+    with pytest.raises(ComparisonError, match=r"switching\.sets\.0: was not run on every"):
+        bank_sets(named, replace(model, errors=errors))
     for unknown in ("[0, 10]", "[{keyframe_interval: 1.2345}, 0]"):
         study = load_study(study_file, [bank, f"online.switching.sets={unknown}"], trained.folder)
         with pytest.raises(ComparisonError, match=r"switching\.sets\..: is none of the 10"):
@@ -176,29 +180,6 @@ def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
 
 def read_tum_of(study, study_file):
     return load_study(study_file, [], study.folder).sequence("three").reference()
-
-
-def test_bootstrap_covers_the_mean_of_correlated_errors():
-    rng = np.random.default_rng(0)
-    covered = {1: 0, 40: 0}
-    for _ in range(60):
-        noise = rng.normal(size=640)
-        errors = 1.0 + np.convolve(noise, np.ones(40) / 40, mode="valid")
-        for block in covered:
-            _, _, ((low, high), _) = bootstrap(errors, errors, block)
-            covered[block] += low <= 1.0 <= high
-    # Neighbouring errors share their windows: drawn one by one they seem far too certain.
-    assert covered[40] >= 48
-    assert covered[1] <= 30
-
-
-def test_bootstrap_of_a_ratio_is_paired():
-    rng = np.random.default_rng(1)
-    fixed = rng.lognormal(size=500)
-    mean, ratio, ((low, high), (ratio_low, ratio_high)) = bootstrap(0.5 * fixed, fixed, 20)
-    assert mean == pytest.approx(0.5 * fixed.mean())
-    assert (ratio, ratio_low, ratio_high) == pytest.approx((0.5, 0.5, 0.5))
-    assert low < mean < high
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,18 @@ def test_knows_the_sensors_of_its_training():
     assert not model.is_foreign(0.0)  # where nothing is known, nothing is said
 
 
+def test_views_are_of_one_place():
+    model = dataclasses.replace(random_model(), sequences=["b", "b+mirrored"])
+    data = model.training_data(model.pca())
+    assert not data.sequence.any()
+    assert (data.fixed, data.candidates) == (2, None)
+    data = model.training_data(model.pca(), [4, 1])
+    assert (data.fixed, data.candidates) == (4, [4, 1])
+    apart = random_model()
+    assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
+    assert apart.portfolio(3)[0] == 2
+
+
 def assert_same(a, b):
     for field in dataclasses.fields(ErrorModel):
         x, y = getattr(a, field.name), getattr(b, field.name)

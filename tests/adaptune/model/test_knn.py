@@ -1,5 +1,7 @@
 """The published selection."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -73,6 +75,17 @@ def test_the_least_prediction_is_chosen(seed):
     selection = rule.select(feature)
     assert selection[:3] == (predicted.argmin(), predicted.min(), predicted[data.fixed])
     assert isinstance(selection.set_index, int)
+
+
+def test_it_chooses_among_those_named_on_the_evidence_of_all():
+    data = random_data(2, 25, 9)
+    named = [data.fixed, (data.fixed + 4) % 9]
+    of_all = NearestNeighbours().fit(data).predict(np.zeros(4))
+    rule = NearestNeighbours().fit(dataclasses.replace(data, candidates=named))
+    predicted = rule.predict(np.zeros(4))
+    np.testing.assert_array_equal(predicted[named], of_all[named])
+    assert np.isinf(np.delete(predicted, named)).all()
+    assert rule.select(np.zeros(4)).set_index == min(named, key=lambda j: of_all[j])
 
 
 def test_a_lost_track_counts_as_30():

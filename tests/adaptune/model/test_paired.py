@@ -118,10 +118,7 @@ def test_scans_are_told_apart_however_many_come_at_once():
     rule = PairedExpectedRatio(Settings(n_frames=7)).fit(data)
     features = np.random.default_rng(4).normal(size=(6, 3))
     best, *_ = rule.best(rule.near(features))
-    raw = rule.near(features, rule.known_errors_)
-    mixed, *_ = rule.best(raw._replace(errors=raw.errors @ rule.kernel_))
     assert rule.candidates_[best].tolist() == [rule.select(x).set_index for x in features]
-    assert rule.candidates_[mixed].tolist() == rule.candidates_[best].tolist()
 
 
 def test_sequences_that_differ_are_less_believed():
@@ -148,7 +145,24 @@ def test_it_chooses_among_complementary_sets(seed, n_frames, n_sets, n_sequences
     assert np.isfinite(predicted[few]).all()
     assert np.isinf(np.delete(predicted, few)).all()
     assert rule.select(np.zeros(3)).set_index in few
-    assert rule.configure(Settings(n_sets=1)).select(np.zeros(3)).set_index == data.fixed
+    fixed = PairedExpectedRatio(Settings(n_sets=1)).fit(data)
+    assert fixed.select(np.zeros(3)).set_index == data.fixed
+
+
+@modest
+@given(seeds, st.integers(10, 60), st.integers(3, 8))
+def test_it_chooses_among_those_named_on_the_evidence_of_all(seed, n_frames, n_sets):
+    data = random_data(seed, n_frames, n_sets)
+    named = [data.fixed, (data.fixed + 2) % n_sets]
+    of_all = PairedExpectedRatio(Settings(n_sets=None)).fit(data).predict(np.zeros(3))
+    few = PairedExpectedRatio(Settings()).fit(replace(data, candidates=named))
+    predicted = few.predict(np.zeros(3))
+    # Sets beside them are still heeded.
+    np.testing.assert_allclose(predicted[named], of_all[named], rtol=1e-5)
+    assert np.isinf(np.delete(predicted, named)).all()
+    assert few.select(np.zeros(3)).set_index in named
+    fixed = PairedExpectedRatio(Settings(n_sets=1)).fit(replace(data, candidates=named))
+    assert fixed.select(np.zeros(3)).set_index == data.fixed
 
 
 def test_its_constants():

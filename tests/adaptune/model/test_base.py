@@ -1,0 +1,32 @@
+import numpy as np
+
+from adaptune.model.base import complementary
+
+
+def chosen(errors, sequence, size):
+    return complementary(np.array(errors, np.float32), np.array(sequence), 0, size)
+
+
+def test_the_next_set_is_good_where_those_before_are_not():
+    errors = [
+        # fixed, as good elsewhere, good where fixed is bad, a little better everywhere
+        [1.0, 1.0, 9.0, 0.9],
+        [1.0, 1.0, 9.0, 0.9],
+        [8.0, 8.0, 1.0, 7.5],
+        [np.inf, np.inf, 1.0, np.inf],
+    ]
+    sequence = [0, 0, 0, 1]
+    assert chosen(errors, sequence, 2) == [0, 2]
+    assert chosen(errors, sequence, 3) == [0, 2, 3]
+    # The second one adds nothing at all.
+    assert chosen(errors, sequence, 4) == [0, 2, 3]
+
+
+def test_sequences_weigh_the_same_however_long():
+    errors = [[5.0, 4.0, 5.0]] * 9 + [[5.0, 5.0, 3.0]]
+    assert chosen(errors, [0] * 9 + [1], 2) == [0, 2]
+
+
+def test_a_failure_counts_as_much_as_everywhere():
+    errors = [[40.0, 31.0, 40.0], [5.0, 5.0, 4.5]]
+    assert chosen(errors, [0, 1], 2) == [0, 2]
