@@ -1,7 +1,7 @@
 """What selection gains on simulated sequences that were left out.
 
     python benchmarks/gain.py runs/gain --seeds 6 7    # hours on one core; resumes
-    python benchmarks/gain.py runs/gain --seeds 6 --odometries gicp --ablate
+    python benchmarks/gain.py runs/gain --seeds 6 --odometries gicp --ablate | --curve | ...
 
 Each seed is another world: 24 sequences (4 caves, 4 streets, 4 open, 4 gardens, of 120 m each, and
 8 mixed ones of three scenes, each 0.4 times as long) on which keyframe GICP and NDT run the same
@@ -13,18 +13,28 @@ was worked out on GICP with seeds 0, 4 and 5, and no others.
 import argparse
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Frames
-from adaptune.descriptor import averaged, lowest_elevation
+from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
 from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
-from adaptune.model import PairedExpectedRatio, Rule, Settings
+from adaptune.model import (
+    RULES,
+    PairedExpectedRatio,
+    Rule,
+    Selection,
+    Settings,
+    TrainingData,
+)
+from adaptune.model.thinning import covering
 from adaptune.simulation import Course, simulate
 from adaptune.study import Study, StudyConfig
 from offline.samplers import make_sampler
@@ -45,6 +55,8 @@ KINDS = ("cave", "street", "open", "garden")
 PER_KIND = 4
 WINDOW = 3
 """Selections whose descriptors are averaged."""
+PERIOD = 10
+"""Scans from one selection to the next."""
 
 
 def training_courses(seed: int, length: float) -> dict[str, Course]:
@@ -54,7 +66,7 @@ def training_courses(seed: int, length: float) -> dict[str, Course]:
         for k, kind in enumerate(KINDS)
         for i in range(PER_KIND)
     }
-    orders = (
+    orders: tuple[tuple[str, ...], ...] = (
         ("cave", "open", "street"),
         ("street", "garden", "cave"),
         ("open", "cave", "garden"),
@@ -155,6 +167,104 @@ def validate(paths: list[Path]) -> None:
     print(f"if the best of 1, 2, ... complementary sets were known: {known}", flush=True)
 
 
+def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
+    """Describe a scan each second by every descriptor, and tell where it is kept."""
+    paths = []
+    for name, course in courses.items():
+        path = folder / f"descriptors-{seed}-{course.length:.0f}-{name}.npz"
+        paths.append(path)
+        if path.exists():
+            continue
+        scans = list(simulate(course))[::PERIOD]
+        of = {d: np.array([descriptor(d)(s) for s in scans], np.float32) for d in DESCRIPTORS}
+        with replacing(path) as beside, beside.open("wb") as file:
+            np.savez_compressed(file, **of)  # type: ignore[arg-type]
+        print(f"{name} is described", flush=True)
+    return paths
+
+
+def by_descriptor(paths: list[Path], described: list[Path]) -> None:
+    """Leave each sequence out in turn, scans being described in one way after the other.
+
+    As if a scan looked in between as it did at the last full second, in every way the same.
+    """
+    of_ndt, sets = labelled(paths)
+    for names in (*((name,) for name in DESCRIPTORS), ("ndt", "ring_heights")):
+        sequences = []
+        for sequence, path, file in zip(of_ndt, paths, described, strict=True):
+            with np.load(path) as found, np.load(file) as its:
+                known = ~np.isnan(found["errors"]).any(axis=1)
+                stamps = found["stamps"]
+                blocks = [its[name][np.arange(len(stamps)) // PERIOD] for name in names]
+            of_frames = averaged(np.hstack(blocks), stamps, WINDOW, 1.0)[known]
+            lengths = tuple(block.shape[1] for block in blocks)
+            sequences.append(replace(sequence, descriptors=of_frames, blocks=lengths))
+        print(f"by {' and '.join(names)}: ", end="")
+        print_summary(leave_one_out(sequences, sets), RULES)
+
+
+class OfLess(Rule):
+    """A rule that is fitted on less than there is."""
+
+    def __init__(self, rule: Rule, less: Callable[[TrainingData], TrainingData]):
+        self.rule, self.less = rule, less
+
+    def fit(self, data: TrainingData) -> Self:
+        """See `Rule.fit`."""
+        self.rule.fit(self.less(data))
+        return self
+
+    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Rule.predict`."""
+        return self.rule.predict(feature)
+
+    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
+        """See `Rule.select`."""
+        return self.rule.select(feature, current)
+
+
+def thinned(data: TrainingData, share: float) -> TrainingData:
+    """Keep a share of the frames."""
+    kept = covering(data.features, data.sequence, round(share * len(data.sequence)))
+    return replace(
+        data,
+        features=data.features[kept],
+        sequence=data.sequence[kept],
+        errors=data.errors[kept],
+    )
+
+
+def with_gaps(data: TrainingData, share: float) -> TrainingData:
+    """Keep a share of the pairs of a sequence and a set, and the fixed set everywhere."""
+    errors, rng = data.errors.copy(), np.random.default_rng(0)
+    for s in np.unique(data.sequence):
+        never = rng.random(len(data.sets)) >= share
+        never[data.fixed] = False
+        errors[np.ix_(data.sequence == s, never)] = np.nan
+    return replace(data, errors=errors)
+
+
+def less(paths: list[Path]) -> None:
+    """Leave each sequence out in turn, with less known of the others."""
+
+    def maker(name: str, take: Callable[[TrainingData], TrainingData]) -> Maker:
+        def make(others: Sequence[LabelledSequence], sets: Any) -> Rule:
+            settings = tune(others, sets) if name == "paired" else Settings()
+            return OfLess(RULES[name](settings, 0.0), take)
+
+        return make
+
+    takes: dict[str, Callable[[TrainingData], TrainingData]] = {"all": lambda data: data}
+    for share in (0.5, 0.25, 0.1):
+        takes[f"{share:.0%} of the frames"] = partial(thinned, share=share)
+    for share in (0.75, 0.5, 0.25):
+        takes[f"{share:.0%} of the pairs"] = partial(with_gaps, share=share)
+    makers = {
+        f"{rule}, {what}": maker(rule, take) for rule in RULES for what, take in takes.items()
+    }
+    print_summary(leave_one_out(*labelled(paths), makers), makers)
+
+
 class Unafraid(PairedExpectedRatio):
     """One that takes any place for familiar."""
 
@@ -211,7 +321,7 @@ def print_summary(validation: Validation, modes: Iterable[str]) -> None:
     for mode in modes:
         s = validation.summary(mode)
         print(
-            f"{mode:22}{s['geometric']:8.3f}{s['arithmetic']:8.3f}{s['worst']:8.2f}"
+            f"{mode:30}{s['geometric']:8.3f}{s['arithmetic']:8.3f}{s['worst']:8.2f}"
             f"{(validation.ratios[mode] > NO_WORSE).sum():4d}"
             f"   (95 % {s['low']:.2f}-{s['high']:.2f})",
             flush=True,
@@ -230,6 +340,8 @@ def main() -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--ablate", action="store_true", help="without one thing after the other")
     what.add_argument("--curve", action="store_true", help="with fewer training sequences")
+    what.add_argument("--less", action="store_true", help="with fewer frames, or runs")
+    what.add_argument("--descriptors", action="store_true", help="with other descriptors")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     # Open3D's NDT differs in its last bits from run to run on more than one core.
@@ -237,7 +349,16 @@ def main() -> None:
     for seed, odometry in itertools.product(arguments.seeds, arguments.odometries):
         courses = training_courses(seed, arguments.length)
         paths = trials(arguments.folder, odometry, courses, seed)
-        (ablate if arguments.ablate else curve if arguments.curve else validate)(paths)
+        if arguments.descriptors:
+            by_descriptor(paths, describe(arguments.folder, courses, seed))
+        elif arguments.less:
+            less(paths)
+        elif arguments.curve:
+            curve(paths)
+        elif arguments.ablate:
+            ablate(paths)
+        else:
+            validate(paths)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """How much of the work pruning saves, and what it loses, on simulated studies.
 
-    python benchmarks/pruning.py [--seeds 0 1 2] [--trials 64] [--length 40] [--folder FOLDER]
+    python benchmarks/pruning.py [--seeds 0 1 2] [--each 3] [--trials 64] [--length 40]
+    python benchmarks/pruning.py --scenes cave open street --each 2
 
-For each seed, two caves, two open grounds and two streets are simulated, and all sets of a Sobol
+For each seed, three caves, open grounds, streets and gardens are simulated, and all sets of a Sobol
 sequence are run on all of them, once. Every rule is then given the results it asks for: the same
 trials, so that what differs is the rule. Printed are the scans that it has registered and the RTE
 of its fixed set, as ratios to those of the study without pruning. The limits are 0.5 and 1.02.
@@ -53,19 +54,19 @@ class Recorded:
         return [(0, Result(trials, frames))]
 
 
-def study_file(folder: Path, seed: int, trials: int, length: float) -> Path:
-    """Write a study of six courses."""
-    scenes = [(scene, i) for scene in ("cave", "open", "street") for i in range(2)]
+def study_file(folder: Path, seed: int, given: argparse.Namespace) -> Path:
+    """Write a study of as many courses of each scene."""
     courses = {
-        f"{scene}_{i}": {"scenes": [scene], "length": length, "seed": 10 * seed + i}
-        for scene, i in scenes
+        f"{scene}_{i}": {"scenes": [scene], "length": given.length, "seed": 10 * seed + i}
+        for scene in given.scenes
+        for i in range(given.each)
     }
     study = {
         "odometry": {"name": "gicp", "settings": {"downsampling": 0.5}},
         "courses": courses,
         "training": list(courses),
         "sub_trajectory": 10.0,
-        "offline": {"sampler": "sobol", "trials": trials, "batch": max(4, trials // 8)},
+        "offline": {"sampler": "sobol", "trials": given.trials, "batch": max(4, given.trials // 8)},
     }
     path = folder / f"pruning_{seed}.yaml"
     path.write_text(yaml.dump(study))
@@ -85,6 +86,8 @@ def main() -> None:
     """Measure everything."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--scenes", nargs="+", default=["cave", "open", "street", "garden"])
+    parser.add_argument("--each", type=int, default=3, help="courses of each scene")
     parser.add_argument("--trials", type=int, default=64)
     parser.add_argument("--length", type=float, default=40.0)
     parser.add_argument("--folder", type=Path, help="to keep the full studies in")
@@ -93,7 +96,7 @@ def main() -> None:
         folder = given.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for seed in given.seeds:
-            path = study_file(folder, seed, given.trials, given.length)
+            path = study_file(folder, seed, given)
             full = load_study(path, [], folder / f"full_{seed}")
             for name, course in full.config.courses.items():
                 if not full.recording(name).exists():

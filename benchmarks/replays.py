@@ -3,7 +3,7 @@
     python benchmarks/replays.py runs/gain --seed 6    # after benchmarks/gain.py --seeds 6
 
 Rules are fitted on the 24 sequences of `benchmarks/gain.py`, and eight mixed courses of other
-worlds are replayed with keyframe GICP, each with the health check. Printed are the mean of
+worlds are replayed with keyframe GICP (or NDT), each with the health check. Printed are the mean of
 min(RTE, 30 %) over 25 m, in brackets how often the odometry was started anew, and ratios to the
 fixed set's error. The rivals: the defaults; the set that is fixed by the geometric mean of the
 training sequences' errors; a bank that nobody asks for a set, which takes the fixed set's motion
@@ -16,9 +16,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from gain import WINDOW, labelled, study_of, training_courses, trials
+from gain import ODOMETRIES, WINDOW, labelled, study_of, training_courses, trials
 from numpy.typing import NDArray
 
 from adaptune.descriptor import ScaledPCA
@@ -50,7 +51,7 @@ LENGTH, SUB_TRAJECTORY = 60.0, 25.0
 def asking(rule: Rule, pca: ScaledPCA) -> Policy:
     """A policy that asks a rule."""
     current: int | None = None
-    last: deque[NDArray[np.uint32]] = deque(maxlen=WINDOW)
+    last: deque[NDArray[Any]] = deque(maxlen=WINDOW)
 
     def select(scan: Scan) -> Selection:
         nonlocal current
@@ -72,13 +73,13 @@ Way = tuple[Callable[[], Box], Policy | None]
 """What is driven, and what chooses its parameters."""
 
 
-def ways(paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
+def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
     """The sets that were tried, and all ways to drive, by name."""
     sequences, units = labelled(paths)
     data, pca = training_data(sequences, units)
     settings = tune(sequences, units)
     print(f"settings of the paired rule: {settings}")
-    study = study_of("gicp")
+    study = study_of(odometry)
     sets = study.space.from_unit(units)
 
     def alone(number: int | None) -> Way:
@@ -115,11 +116,16 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=6)
+    parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
+    parser.add_argument("--modes", nargs="+", help="to drive, besides fixed; all if left out")
     parser.add_argument("--length", type=float, default=120.0, help="of the training courses")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
     courses = training_courses(arguments.seed, arguments.length)
-    sets, driven = ways(trials(arguments.folder, "gicp", courses, arguments.seed))
+    odometry, modes = arguments.odometry, arguments.modes
+    sets, driven = ways(odometry, trials(arguments.folder, odometry, courses, arguments.seed))
+    if modes:
+        driven = {name: way for name, way in driven.items() if name == "fixed" or name in modes}
     print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in driven))
     means: list[list[float]] = []
     for i, scenes in enumerate(ORDERS):
@@ -136,12 +142,12 @@ def main() -> None:
             means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
             row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
         print(row, flush=True)
-    table = np.array(means)
-    ratio = table / table[:, [list(driven).index("fixed")]]
+    table, fixed = np.array(means), list(driven).index("fixed")
+    ratio = table / table[:, [fixed]]
     for what, values in (
         ("arithmetic mean", table.mean(axis=0)),
         ("geometric mean", np.exp(np.log(table).mean(axis=0))),
-        ("ratio of arithmetic means", table.mean(axis=0) / table.mean(axis=0)[1]),
+        ("ratio of arithmetic means", table.mean(axis=0) / table[:, fixed].mean()),
         ("geometric mean ratio", np.exp(np.log(ratio).mean(axis=0))),
         ("worst ratio", ratio.max(axis=0)),
     ):

@@ -27,24 +27,37 @@ def thin(model: ErrorModel, max_frames: int) -> ErrorModel:
     max_frames
         How many to keep, over all sequences.
     """
-    n_frames = len(model.sequence)
-    if n_frames <= max_frames:
+    if len(model.sequence) <= max_frames:
         return model
-    features = model.pca().transform(model.descriptors)
-    kept = []
-    for s in np.unique(model.sequence):
-        members = np.flatnonzero(model.sequence == s)
-        share = max(1, max_frames * len(members) // n_frames)
-        kept.append(members[np.sort(_cover(features[members], share))])
-    frames = np.concatenate(kept)
-    # In their order, for what follows may ask for it.
-    frames.sort()
+    frames = covering(model.pca().transform(model.descriptors), model.sequence, max_frames)
     return replace(
         model,
         descriptors=model.descriptors[frames],
         sequence=model.sequence[frames],
         errors=model.errors[frames],
     )
+
+
+def covering(
+    features: NDArray[np.float64], sequence: NDArray[np.intp], max_frames: int
+) -> NDArray[np.intp]:
+    """Numbers of the frames that `thin` keeps, rising.
+
+    Parameters
+    ----------
+    features
+        What each frame looks like, of shape (n_frames, n_features).
+    sequence
+        Number of each frame's sequence, of shape (n_frames,).
+    max_frames
+        How many to keep, of `n_frames` at most.
+    """
+    kept = []
+    for s in np.unique(sequence):
+        members = np.flatnonzero(sequence == s)
+        share = max(1, max_frames * len(members) // len(sequence))
+        kept.append(members[_cover(features[members], share)])
+    return np.sort(np.concatenate(kept))
 
 
 @numba.njit(cache=True)
