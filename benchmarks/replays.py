@@ -22,8 +22,8 @@ import numpy as np
 from gain import ODOMETRIES, WINDOW, labelled, study_of, training_courses, trials
 from numpy.typing import NDArray
 
-from adaptune.descriptor import ScaledPCA
 from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, Rule, Selection, TrainingData
 from adaptune.model.base import complementary

@@ -16,7 +16,8 @@ from threadpoolctl import threadpool_limits
 
 from adaptune import report
 from adaptune.archive import Archive
-from adaptune.descriptor import ScaledPCA, averaged
+from adaptune.descriptor import averaged
+from adaptune.descriptor.pca import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap, span
 from adaptune.model import (

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from adaptune import __version__
 from adaptune.archive import compact
-from adaptune.descriptor import ScaledPCA
+from adaptune.descriptor.pca import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.model.base import TrainingData, complementary

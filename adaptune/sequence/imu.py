@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from adaptune import geometry
 from adaptune.geometry import Poses
@@ -147,6 +146,8 @@ def _correlation(
     a: NDArray[np.float64], b: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Pearson's coefficient of the overlap of `a`, moved to start at each sample of `b`."""
+    from scipy.signal import correlate
+
     lags = np.arange(-(len(a) - 1), len(b))
     ones_a, ones_b = np.ones_like(a), np.ones_like(b)
 

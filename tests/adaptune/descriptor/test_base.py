@@ -11,7 +11,6 @@ from adaptune.descriptor import (
     DESCRIPTORS,
     Describer,
     DescriptorError,
-    ScaledPCA,
     averaged,
     descriptor,
     lowest_elevation,
@@ -115,20 +114,6 @@ def test_names_that_do_not_do(name, message):
 def test_arrays_that_do_not_do(name, message):
     with pytest.raises(DescriptorError, match=message):
         Describer([name])(turns.turn(0))
-
-
-def test_each_block_has_components_of_its_own():
-    rng = np.random.default_rng(0)
-    a, b = rng.gamma(1.0, 100.0, (40, 20)), rng.normal(size=(40, 3))
-    both = ScaledPCA(n_components=5, blocks=(20, 3)).fit(np.hstack([a, b]))
-    fresh = np.hstack([a, b])[:7] + 0.1
-    want = [ScaledPCA(n_components=5).fit(x) for x in (a, b)]
-    assert both.components_.shape == (8, 23)
-    np.testing.assert_allclose(
-        both.transform(fresh),
-        np.hstack([want[0].transform(fresh[:, :20]), want[1].transform(fresh[:, 20:])]),
-        atol=1e-9,
-    )
 
 
 def test_averages_are_of_what_a_selector_has_seen():

@@ -5,11 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.base import clone
-from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 
-from adaptune.descriptor import ScaledPCA
 from adaptune.descriptor.ndt import NdtHistogram, ndt_histogram
+from adaptune.descriptor.pca import ScaledPCA
 
 modest = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -263,47 +262,6 @@ def test_histograms_of_many_scans():
     histograms = NdtHistogram().fit_transform(scans)
     np.testing.assert_array_equal(histograms, [ndt_histogram(points) for points in scans])
     assert NdtHistogram().transform(iter(())).shape == (0, 90)
-
-
-def counts(seed, n=60):
-    """Histograms of a random mixture of places, of shape (n, 90)."""
-    rng = np.random.default_rng(seed)
-    places = rng.gamma(0.3, 40.0, (4, 90))
-    return rng.poisson(rng.dirichlet(np.ones(4), n) @ places).astype(float)
-
-
-def test_components_are_those_of_sklearn_divided_by_one_number():
-    X = counts(0)
-    scaled = ScaledPCA().fit(X)
-    want = PCA(10, svd_solver="full").fit(X)
-    deviations = want.transform(X).std(axis=0)
-    np.testing.assert_allclose(scaled.scale_, deviations.mean())
-    fresh = counts(1, 20)
-    np.testing.assert_allclose(scaled.transform(fresh), want.transform(fresh) / deviations.mean())
-    assert scaled.transform(X).std(axis=0).mean() == pytest.approx(1.0)
-
-
-def test_the_unit_of_the_counts_does_not_matter():
-    X = counts(2)
-    near, far = ScaledPCA().fit(X), ScaledPCA().fit(7.0 * X)
-    np.testing.assert_allclose(near.transform(X), far.transform(7.0 * X), atol=1e-9)
-
-
-@pytest.mark.parametrize(("n", "components"), [(60, 10), (10, 10), (7, 7), (2, 2), (1, 1)])
-@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-def test_few_scans_have_few_components(n, components):
-    X = counts(3, n)
-    transformed = ScaledPCA().fit_transform(X)
-    assert transformed.shape == (n, components)
-    assert np.isfinite(transformed).all()
-
-
-@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-def test_scans_that_are_all_the_same():
-    X = np.tile(counts(4, 1), (8, 1))
-    scaled = ScaledPCA().fit(X)
-    np.testing.assert_allclose(scaled.transform(X), 0.0, atol=1e-9)
-    assert np.abs(scaled.transform(X + 1.0)).max() < 100
 
 
 def test_they_are_sklearn_estimators():
