@@ -45,6 +45,10 @@ SHARPNESS = (6.0, 12.0, 24.0, 48.0)
 """What `tune` chooses from; of equally good ones the first."""
 
 
+Interval = tuple[float, float] | None
+"""The ends, where they can be told."""
+
+
 class ValidationError(AdaptuneError):
     """A study that cannot be validated."""
 
@@ -110,7 +114,7 @@ class LeftOut(NamedTuple):
     portfolio: NDArray[np.float64]
     block: int = 1
 
-    def interval(self, mode: str) -> tuple[float, float] | None:
+    def interval(self, mode: str) -> Interval:
         """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
 
         It speaks of this drive, and tells nothing of other places.
@@ -228,18 +232,7 @@ def validate(
     validation = leave_one_out(
         sequences, sets, progress=lambda i, n: progress("sequences left out", i, n)
     )
-    rows: list[dict[str, Any]] = []
-    default = next(iter(RULES))
-    for i, sequence in enumerate(validation.left_out):
-        rows.append({"left out": sequence.name, "fixed [%]": sequence.errors["fixed"].mean()})
-        rows[-1] |= {m: float(r[i]) for m, r in validation.ratios.items() if m != "fixed"}
-        rows[-1] |= {f"{default}, 95 %": _ends(sequence.interval(default))}
-    summaries = {m: validation.summary(m) for m in validation.ratios if m != "fixed"}
-    for key in ("geometric", "arithmetic", "worst"):
-        row: dict[str, Any] = {"left out": key, "fixed [%]": None}
-        rows.append(row | {m: summary[key] for m, summary in summaries.items()})
-        low, high = (summaries[default][end] for end in ("low", "high"))
-        rows[-1] |= {f"{default}, 95 %": _ends((low, high) if key == "geometric" else None)}
+    rows = _rows(validation)
     report.write_rows(study.folder, "validation", rows)
     learning = []
     if curve:
@@ -261,8 +254,29 @@ def validate(
     return validation, rows
 
 
-def _ends(interval: tuple[float, float] | None) -> str | None:
-    return interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
+def _rows(validation: Validation) -> list[dict[str, Any]]:
+    """Ratios to the fixed set's error; beside the default rule's their intervals."""
+    default = next(iter(RULES))
+    modes = [mode for mode in validation.ratios if mode != "fixed"]
+    rows: list[dict[str, Any]] = []
+
+    def add(name: str, fixed: float | None, of: dict[str, float], interval: Interval) -> None:
+        rows.append({"left out": name, "fixed [%]": fixed})
+        for mode in modes:
+            rows[-1][mode] = of[mode]
+            if mode == default:
+                ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
+                rows[-1][f"{mode}, 95 %"] = ends
+
+    for i, sequence in enumerate(validation.left_out):
+        of = {mode: float(validation.ratios[mode][i]) for mode in modes}
+        add(sequence.name, sequence.errors["fixed"].mean(), of, sequence.interval(default))
+    summaries = {mode: validation.summary(mode) for mode in modes}
+    for key in ("geometric", "arithmetic", "worst"):
+        ends = summaries[default]["low"], summaries[default]["high"]
+        of = {mode: summaries[mode][key] for mode in modes}
+        add(key, None, of, ends if key == "geometric" else None)
+    return rows
 
 
 def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
