@@ -232,6 +232,7 @@ def draw_validation(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     figure = Figure(figsize=(13, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -250,7 +251,10 @@ def draw_validation(
             )
     by_sequence.set_xticks(at, sequences, rotation=60, ha="right")
     by_sequence.set_yscale("log")
-    by_sequence.legend(fontsize="small")
+    by_sequence.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    by_sequence.yaxis.set_major_formatter("{x:g}")
+    by_sequence.yaxis.set_minor_formatter("")
+    by_sequence.legend(fontsize="small", ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     known = ~np.isnan(familiarity)
     if known.any():
         order = np.argsort(familiarity[known], kind="stable")
