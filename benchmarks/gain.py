@@ -34,7 +34,7 @@ from adaptune.model import (
     Settings,
     TrainingData,
 )
-from adaptune.model.thinning import covering
+from adaptune.model.base import complementary
 from adaptune.simulation import Course, simulate
 from adaptune.study import Study, StudyConfig
 from offline.samplers import make_sampler
@@ -223,9 +223,9 @@ class OfLess(Rule):
         return self.rule.select(feature, current)
 
 
-def thinned(data: TrainingData, share: float) -> TrainingData:
-    """Keep a share of the frames."""
-    kept = covering(data.features, data.sequence, round(share * len(data.sequence)))
+def thinned(data: TrainingData, every: int) -> TrainingData:
+    """Keep some of the frames."""
+    kept = slice(None, None, every)
     return replace(
         data,
         features=data.features[kept],
@@ -235,13 +235,17 @@ def thinned(data: TrainingData, share: float) -> TrainingData:
 
 
 def with_gaps(data: TrainingData, share: float) -> TrainingData:
-    """Keep a share of the pairs of a sequence and a set, and the fixed set everywhere."""
+    """Keep a share of the pairs of a sequence and a set, the fixed set everywhere.
+
+    And let the same sets be chosen as without gaps, which is not done otherwise.
+    """
     errors, rng = data.errors.copy(), np.random.default_rng(0)
     for s in np.unique(data.sequence):
         never = rng.random(len(data.sets)) >= share
         never[data.fixed] = False
         errors[np.ix_(data.sequence == s, never)] = np.nan
-    return replace(data, errors=errors)
+    candidates = complementary(data.errors, data.sequence, data.fixed, 3)
+    return replace(data, errors=errors, candidates=candidates)
 
 
 def less(paths: list[Path]) -> None:
@@ -255,8 +259,8 @@ def less(paths: list[Path]) -> None:
         return make
 
     takes: dict[str, Callable[[TrainingData], TrainingData]] = {"all": lambda data: data}
-    for share in (0.5, 0.25, 0.1):
-        takes[f"{share:.0%} of the frames"] = partial(thinned, share=share)
+    for every in (2, 4, 10):
+        takes[f"one frame in {every}"] = partial(thinned, every=every)
     for share in (0.75, 0.5, 0.25):
         takes[f"{share:.0%} of the pairs"] = partial(with_gaps, share=share)
     makers = {

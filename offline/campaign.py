@@ -13,7 +13,7 @@ from adaptune.archive import Archive
 from adaptune.cores import available
 from adaptune.descriptor import averaged
 from adaptune.files import write_text
-from adaptune.model import ErrorModel, thin
+from adaptune.model import ErrorModel
 from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
@@ -479,4 +479,4 @@ def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: 
         ),
     )
     max_frames = study.config.offline.max_frames
-    return model if max_frames is None else thin(model, max_frames)
+    return model if max_frames is None else model.thinned(max_frames)

@@ -6,7 +6,6 @@ from adaptune.model.base import Rule, Selection, TrainingData
 from adaptune.model.file import ErrorModel, ModelError
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 from adaptune.model.paired import PairedExpectedRatio, Settings
-from adaptune.model.thinning import thin
 
 RULES: dict[str, Callable[[Settings, float], Rule]] = {
     "paired": PairedExpectedRatio,
@@ -28,5 +27,4 @@ __all__ = [
     "Selection",
     "Settings",
     "TrainingData",
-    "thin",
 ]

@@ -85,8 +85,8 @@ def complementary(
     Parameters
     ----------
     errors
-        Percent, of shape (n_frames, n_sets); NaN where a set was never run, where it lowers
-        nothing.
+        Percent, of shape (n_frames, n_sets); NaN where a set was never run. One that was not run
+        on every sequence is not chosen.
     sequence
         Number of each frame's sequence, of shape (n_frames,).
     fixed
@@ -99,9 +99,10 @@ def complementary(
     list of int
         Numbers of the sets, the fixed one first.
     """
-    capped = np.where(np.isnan(errors), np.inf, cap(errors))
+    everywhere = np.isfinite(mean_errors(errors, sequence))
+    capped = np.where(np.isnan(errors) | ~everywhere, np.inf, cap(errors))
     chosen = [fixed]
-    least = capped[:, fixed]
+    least = cap(errors[:, fixed])
     while len(chosen) < size:
         means = mean_errors(np.minimum(capped, least[:, None]), sequence)
         best = int(np.argmin(means))

@@ -5,7 +5,7 @@ import io
 import json
 import math
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -146,6 +146,34 @@ class ErrorModel:
     def portfolio(self, size: int) -> list[int]:
         """Choose complementary sets, the fixed one first; see `complementary`."""
         return complementary(self.errors, places(self.sequences)[self.sequence], self.fixed, size)
+
+    def thinned(self, max_frames: int) -> Self:
+        """Keep fewer frames, so that a selection costs less.
+
+        Of each sequence its share, at least one, as far from each other in time: so mean errors
+        stay what they are. (Frames that cover what all of them look like would be rare ones.)
+
+        Parameters
+        ----------
+        max_frames
+            How many to keep, over all sequences.
+        """
+        n_frames = len(self.sequence)
+        if n_frames <= max_frames:
+            return self
+        kept = []
+        for s in np.unique(self.sequence):
+            members = np.flatnonzero(self.sequence == s)
+            share = max(1, max_frames * len(members) // n_frames)
+            kept.append(members[(2 * np.arange(share) + 1) * len(members) // (2 * share)])
+        # In their order, for what follows may ask for it.
+        frames = np.sort(np.concatenate(kept))
+        return replace(
+            self,
+            descriptors=self.descriptors[frames],
+            sequence=self.sequence[frames],
+            errors=self.errors[frames],
+        )
 
     def is_foreign(self, elevation: float) -> bool:
         """Whether scans whose lowest points lie there come from no sensor of the training's.

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFlo
 from scipy.spatial.distance import cdist
 
 from adaptune.metrics import FAILURE, cap
-from adaptune.model.base import Rule, Selection, TrainingData, complementary
+from adaptune.model.base import Rule, Selection, TrainingData, complementary, mean_errors
 
 ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
@@ -94,10 +94,12 @@ class PairedExpectedRatio(Rule):
     the fixed one. A rare failure weighs as much as it costs, and what makes a sequence hard for
     all sets cancels out.
 
-    A sequence that has not seen a set, nor one close to it, says nothing for it: its ratio
-    counts as 1. The farther a scan is from all training sequences, compared with how far these
-    are from each other, the more is every ratio drawn to 1, and beyond all of them the fixed set
-    is taken.
+    It chooses among sets that were run everywhere, unless others are named; the rest are heeded as
+    neighbours. A sequence that has not seen a set, nor one close to it, says nothing for it: its
+    ratio counts as 1.
+
+    The farther a scan is from all training sequences, compared with how far these are from each
+    other, the more is every ratio drawn to 1, and beyond all of them the fixed set is taken.
 
     Parameters
     ----------
@@ -132,8 +134,9 @@ class PairedExpectedRatio(Rule):
             return np.array([data.fixed])
         if data.candidates is not None:
             return np.array(data.candidates)
-        if n_sets is None or n_sets >= len(data.sets):
-            return np.arange(len(data.sets))
+        if n_sets is None:
+            everywhere = np.isfinite(mean_errors(data.errors, data.sequence))
+            return np.union1d(np.flatnonzero(everywhere), data.fixed)
         return np.array(complementary(data.errors, data.sequence, data.fixed, n_sets))
 
     def _mixed(self) -> NDArray[np.float32]:

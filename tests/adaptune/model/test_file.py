@@ -63,6 +63,29 @@ def test_views_are_of_one_place():
     assert apart.portfolio(3)[0] == 2
 
 
+@given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 70))
+def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
+    model = dataclasses.replace(
+        random_model(n_frames=n + m),
+        sequence=np.repeat([0, 1], [n, m]),
+        errors=np.tile(np.arange(n + m, dtype=np.float32)[:, None], 6),
+    )
+    few = model.thinned(most)
+    few.check()
+    kept = few.errors[:, 0].astype(int)
+    np.testing.assert_array_equal(few.sequence, model.sequence[kept])
+    np.testing.assert_array_equal(few.descriptors, model.descriptors[kept])
+    if most >= n + m:
+        assert few is model
+        return
+    for s, length in enumerate((n, m)):
+        share = max(1, most * length // (n + m))
+        own = kept[few.sequence == s] - s * n
+        assert len(own) == share
+        gaps = np.diff([-own[0] - 1, *own, 2 * length - own[-1]])
+        assert gaps.max() - gaps.min() <= 2
+
+
 def assert_same(a, b):
     for field in dataclasses.fields(ErrorModel):
         x, y = getattr(a, field.name), getattr(b, field.name)

@@ -270,6 +270,8 @@ def test_a_sequence_says_nothing_of_sets_it_has_not_seen():
         0,
     )
     rule = PairedExpectedRatio(Settings(n_sets=None)).fit(data)
+    assert rule.candidates_.tolist() == [0, 2]
+    rule = PairedExpectedRatio().fit(replace(data, candidates=[0, 1, 2]))
     # Half of the evidence, of 0.52 / 1.02, and half of 1; against 0.62 / 1.02 on all of it.
     np.testing.assert_allclose(
         rule.predict(np.zeros(2)), [1.0, 0.5 * (0.52 / 1.02 + 1.0), 0.62 / 1.02], rtol=1e-6
@@ -284,7 +286,8 @@ def test_evidence_on_a_near_set_counts():
     errors[:n, 2], errors[n:, 2] = np.nan, 0.5
     sets = np.array([[0.0, 0.0], [0.5, 0.5], [0.5, 0.51]])
     data = TrainingData(np.zeros((2 * n, 2)), np.repeat([0, 1], n), errors, sets, 0)
-    predicted = PairedExpectedRatio(Settings(n_sets=None)).fit(data).predict(np.zeros(2))
+    rule = PairedExpectedRatio().fit(replace(data, candidates=[0, 1, 2]))
+    predicted = rule.predict(np.zeros(2))
     # Smoothing halves what is known of each, and takes the other sequence's half from its twin.
     assert predicted[1] == pytest.approx(0.5 * (0.52 / 1.02 + 1.0), rel=0.01)
 
