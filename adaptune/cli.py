@@ -28,7 +28,8 @@ import adaptune
 from adaptune.errors import AdaptuneError
 from adaptune.study import load_study
 
-console = Console()
+# Tables that are piped are wrapped for nobody, unless COLUMNS says how wide they may be.
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200)
 errors = Console(stderr=True)
 
 
@@ -264,6 +265,9 @@ def offline(
     )
     console.print(f"Baseline: {_short(loaded.space.baseline)}", highlight=False)
     console.print(f"Fixed: {_short(model.sets[model.fixed])}", highlight=False)
+    if len(loaded.config.offline.objective) > 1:
+        front = loaded.folder / "pareto"
+        console.print(f"The sets that no other one beats in all: {front}.*", highlight=False)
     if model.paired.n_sets == 1:
         console.print(
             "On the training sequences left out in turn adapting did not pay: `paired` will always "

@@ -234,19 +234,8 @@ class Grid:
 
 
 def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]]) -> Grid:
-    """Make a grid from its settings, which have no mistakes.
-
-    Raises
-    ------
-    SamplerError
-    """
-    axes = {}
-    for name, parameter in space.parameters.items():
-        try:
-            axes[name] = _axis(parameter, grid.get(name))
-        except ValueError as error:
-            raise SamplerError(f"grid.{name}: {error}") from error
-    return Grid(axes)
+    """Make a grid from its settings, which have no mistakes."""
+    return Grid({name: _axis(p, grid.get(name)) for name, p in space.parameters.items()})
 
 
 def _axis(parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None) -> Axis:
@@ -449,12 +438,16 @@ def _check_grid(
             help_ = nearest(name, space.names)
             yield ("grid", name), f"no parameter {name!r} is tuned: {help_}"
             return
-    try:
-        grid = make_grid(space, axes)
-    except SamplerError as error:
-        path, _, message = str(error).partition(": ")
-        yield tuple(path.split(".", 1)), message
+    wrong = False
+    for name, parameter in space.parameters.items():
+        try:
+            _axis(parameter, axes.get(name))
+        except ValueError as error:
+            wrong = True
+            yield ("grid", name), str(error)
+    if wrong:
         return
+    grid = make_grid(space, axes)
     if sampler == "grid" and not budgeted and grid.size > MAX_GRID:
         yield (
             ("grid",),

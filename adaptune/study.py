@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, Self, TypeVar
+from typing import IO, Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -96,7 +96,15 @@ _Weighted = Annotated[
 def _weighted(given: Any) -> Any:
     """A metric or a weighted sum of metrics, or several of them, all as weighted sums."""
     objectives = given if isinstance(given, list | tuple) else [given]
-    return tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
+    metrics = get_args(Metric)
+    for one in objectives:
+        for metric in [one] if isinstance(one, str) else one if isinstance(one, dict) else []:
+            if metric not in metrics:
+                raise ValueError(f"there is no metric {metric!r}: {nearest(str(metric), metrics)}")
+    weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
+    if any(weights in weighted[:i] for i, weights in enumerate(weighted)):
+        raise ValueError("names an objective twice")
+    return weighted
 
 
 class Limit(_Section):
@@ -620,10 +628,17 @@ class Study:
         Raises
         ------
         ConfigurationError
-            If another process is at work in it, or it is another study's (see `check`).
+            If it cannot be made, another process is at work in it, or it is another study's (see
+            `check`).
         """
         self.check()
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigurationError(
+                f"{self.folder}: the study's folder cannot be made ({error.strerror}); name "
+                f"another with --folder"
+            ) from error
         if str(self.folder) not in _locks:
             lock = (self.folder / ".lock").open("w")
             try:

@@ -24,6 +24,8 @@ _OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
+_COLUMN = {"rte": "mean", "ms_per_scan": "ms"}
+"""What columns are called in a study's objectives."""
 _CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
 
 
@@ -47,16 +49,19 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         Number, parameters, mean error in percent (None before the trial is finished on all
         sequences), the mean on each sequence, how often it lost track, how often its process
         ended and how often the health check would have spoken on all of them, and its other
-        metrics.
+        metrics (None where a sequence is too short for one).
     """
     finished = {name: archive.finished(name) for name in names}
+    # A dictionary keeps their order.
+    known = {m: None for of in finished.values() for trial in of.values() for m in trial.metrics}
+    metrics = [metric for metric in known if metric != "rte"]
     return [
-        _row(number, {name: finished[name].get(number) for name in names})
+        _row(number, {name: finished[name].get(number) for name in names}, metrics)
         for number in sorted(set().union(*finished.values()))
     ]
 
 
-def _row(number: int, trials: Mapping[str, Summary | None]) -> Row:
+def _row(number: int, trials: Mapping[str, Summary | None], metrics: Sequence[str]) -> Row:
     there = [trial for trial in trials.values() if trial is not None]
     whole = len(there) == len(trials)
     row: Row = {"trial": number, **there[0].parameters}
@@ -64,8 +69,10 @@ def _row(number: int, trials: Mapping[str, Summary | None]) -> Row:
     row |= {name: trial and trial.mean_error for name, trial in trials.items()}
     row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
     row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
-    metrics = [m for m in there[0].metrics if m != "rte"]
-    return row | {m: float(np.mean([t.metrics[m] for t in there])) for m in metrics}
+    for metric in metrics:
+        values = [t.metrics[metric] for t in there if metric in t.metrics]
+        row[metric] = float(np.mean(values)) if len(values) == len(there) else None
+    return row
 
 
 def select(
@@ -100,6 +107,7 @@ def select(
                 f"'mean < 1'"
             )
         column, sign, text = match.groups()
+        column = _COLUMN.get(column, column)
         try:
             value = yaml.scalar(text)
         except yaml.YamlError as error:
@@ -108,6 +116,7 @@ def select(
         chosen = [row for row in chosen if _meets(row[column], sign, value, condition)]
     if sort is not None:
         column = sort.removeprefix("-")
+        column = _COLUMN.get(column, column)
         _check_column(chosen, column, f"--sort {sort}")
         known = [row for row in chosen if row[column] is not None]
         unknown = [row for row in chosen if row[column] is None]

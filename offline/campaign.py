@@ -86,6 +86,8 @@ def train(
     archive = Archive(study.folder / "trials")
     archive.tidy()
     n_workers = config.workers or available()
+    where = f"on {cluster}" if cluster else f"{n_workers} worker{'s' if n_workers > 1 else ''}"
+    _log.info("trials run %s; each sequence is prepared before its first one", where)
     with Cluster(study, cluster) if cluster else Workers(study, n_workers) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
@@ -374,7 +376,7 @@ class _Tally:
         remarks += [self.best] if self.best else []
         remarks += [f"{self._failed} lost track or failed"] if self._failed else []
         total = sum(search.total() for search in self._searches)
-        self._progress("trials", self._done, total, ", ".join(remarks))
+        self._progress("runs", self._done, total, ", ".join(remarks))
 
 
 def _best(config: OfflineConfig, stage: Stage) -> str:

@@ -90,7 +90,10 @@ class Cluster:
         try:
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise ClusterError(f"--cluster {address}: cannot be reached ({error})") from error
+            raise ClusterError(
+                f"--cluster {address}: cannot be reached ({error}); start a scheduler there "
+                f"(`dask scheduler`), or leave --cluster out"
+            ) from error
         try:
             found = self.workers()
         except ClusterError:

@@ -101,7 +101,7 @@ def exceeded(constraints: Sequence[float]) -> float:
 def trajectory_metrics(
     frames: Frames, T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]
 ) -> dict[str, float]:
-    """Those metrics that are of the trajectory as a whole.
+    """Those metrics that are of the trajectory as a whole; KITTI's where it is long enough.
 
     Parameters
     ----------
@@ -114,8 +114,9 @@ def trajectory_metrics(
     """
     T_ref_sensor, T = frames.T_ref_sensor, joined(T_odom_sensor, lost_steps)
     with np.errstate(over="ignore", invalid="ignore"):
+        kitti = kitti_error(T_ref_sensor, T)
         found = {
-            "kitti": kitti_error(T_ref_sensor, T).translation,
+            **({"kitti": kitti.translation} if kitti.lengths else {}),
             "rpe": relative_error(T_ref_sensor, T),
             "ape": absolute_error(T_ref_sensor, T) if np.abs(T).max() < 1e100 else np.inf,
         }
@@ -238,8 +239,9 @@ def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
         limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
         raise AdaptuneError(
             f"offline.limits: none of {len(complete)} parameter sets keeps {limits} on every "
-            f"sequence; nearest comes trial {nearest}, {verdicts[nearest].excess:.0%} beyond: "
-            f"loosen the limits, widen the ranges of the parameters, or run more trials"
+            f"sequence; nearest comes trial {nearest}, {verdicts[nearest].excess:.0%} beyond "
+            f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the "
+            f"parameters, or run more trials"
         )
     return min(feasible, key=lambda n: verdicts[n].values[0] + verdicts[n].margin)
 

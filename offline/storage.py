@@ -204,7 +204,8 @@ class DatabaseMirror(Mirror):
             ) from error
         except sqlalchemy.exc.SQLAlchemyError as error:
             raise StorageError(
-                f"{self._where}: cannot be reached ({_first_line(error)})"
+                f"{self._where}: cannot be reached ({_first_line(error)}); start it, or leave the "
+                f"key out: a file in the study's folder does without a server"
             ) from error
         self._check(finished)
 

@@ -109,7 +109,15 @@ def test_reads_a_study(study_file, tmp_path):
         ),
         ("offline.sampler_settings.seed=1", ["sampler_settings.seed", "offline.seed"]),
         ("offline.sampler_settings=7", ["offline.sampler_settings"]),
+        (
+            "offline={sampler: grid, sampler_settings: {grid: "
+            "{max_correspondence_distance: [1, 5, 0], keyframe_interval: [1, 0, 3]}}}",
+            ["grid.max_correspondence_distance", "grid.keyframe_interval"],
+        ),
         ("offline={sampler: annealing, objective: [rte, rpe]}", ["annealing knows one objective"]),
+        ("offline.objective=rtee", ["offline.objective: there is no metric 'rtee'", "'rte'"]),
+        ("offline.objective={rte: 1, appe: 1}", ["there is no metric 'appe'", "'ape'"]),
+        ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
         ("offline.hours=0", ["offline.hours", "not 0"]),
         ("offline.stagnation=0", ["offline.stagnation", "not 0"]),
         ("offline.target=-1", ["offline.target", "not -1"]),
@@ -273,6 +281,13 @@ def test_refuses_what_is_no_study(tmp_path, text, words):
 
 def test_names_a_missing_file(tmp_path):
     assert "no such file" in failure(tmp_path / "a.yaml")
+
+
+def test_a_folder_that_cannot_be_made(study_file, tmp_path):
+    (tmp_path / "file").write_text("")
+    study = load_study(study_file, [], tmp_path / "file/x")
+    with pytest.raises(ConfigurationError, match=r"file/x: the study's folder .*--folder"):
+        study.open()
 
 
 def test_folder_goes_on_only_with_the_same_study(study_file, tmp_path):

@@ -1,5 +1,7 @@
 """The table of trials."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -46,6 +48,21 @@ def test_there_is_a_row_for_every_trial(archive):
     assert table[1]["mean"] is None
     assert table[3]["kernel"] == "Huber"
     assert rows(Archive(archive.folder / "none"), ["cave"]) == []
+
+
+def test_a_metric_that_not_all_have_is_not_told(archive):
+    trial = archive.read("cave", 3)
+    archive.write("cave", 4, replace(trial, metrics={"rpe": 0.5, "kitti": 2.0}))
+    of = {row["trial"]: row for row in rows(archive, ["cave", "street"])}
+    assert (of[4]["rpe"], of[4]["kitti"]) == (0.5, 2.0)
+    assert of[0]["kitti"] is None
+    archive.write("street", 4, replace(trial, metrics={"rpe": 1.5}))
+    (row,) = [row for row in rows(archive, ["cave", "street"]) if row["trial"] == 4]
+    assert (row["rpe"], row["kitti"]) == (1.0, None)
+
+
+def test_columns_go_by_what_objectives_call_them_too():
+    assert select(TABLE, ["rte < 1.5"], "rte") == select(TABLE, ["mean < 1.5"], "mean")
 
 
 TABLE = [

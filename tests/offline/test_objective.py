@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adaptune.archive import Archive, Summary
+from adaptune.archive import Archive, Frames, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import steps
 from adaptune.odometry import Registration
@@ -27,6 +27,7 @@ from offline.objective import (
     pareto_front,
     penalised,
     told,
+    trajectory_metrics,
 )
 from offline.trial import PreparedSequence, run_trials
 
@@ -215,6 +216,16 @@ def test_kittis_error_needs_its_length(study_file, tmp_path):
         AdaptuneError, match=r"(one|two): its path holds no sub-trajectory of 100 m"
     ):
         train(study)
+
+
+@pytest.mark.parametrize(("metres", "told"), [(99.0, False), (120.0, True)])
+def test_kittis_error_is_told_where_it_is_known(metres, told):
+    T = np.tile(np.eye(4), (61, 1, 1))
+    T[:, 0, 3] = np.linspace(0.0, metres, 61)
+    frames = Frames(np.arange(61), T, np.zeros((61, 1), np.float32), {"ndt": 1}, np.zeros(61))
+    metrics = trajectory_metrics(frames, T, {})
+    assert set(metrics) == {"rpe", "ape"} | ({"kitti"} if told else set())
+    assert max(metrics.values()) < 1e-9
 
 
 def test_memory_is_that_of_a_process_of_its_own(study_file, tmp_path):
