@@ -45,6 +45,7 @@ THESIS = {
     "gicp": [],
     "evalio_kiss_icp": [
         "odometry.settings={}",
+        "isolation.seconds=100",
         "odometry.parameters={voxel_size: {}, initial_threshold: {}}",
     ],
 }
