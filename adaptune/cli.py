@@ -305,7 +305,7 @@ def trials(
 ) -> None:
     """List the study's finished trials, also while it runs.
 
-    Columns are the trial's number, its parameters, its mean RTE in percent over all training
+    Columns are the trial's number, its parameters, its `mean` RTE in percent over all training
     sequences and on each of them, how often it lost track, how often its process ended, how often
     the health check would have spoken, and its other metrics.
     """
