@@ -153,7 +153,7 @@ class Validation:
         The interval is Student's, of the logarithms: it speaks of other sequences like these.
         """
         logs = np.log(self.ratios[mode])
-        margin = stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs)
+        margin = _margin(logs)
         low, high = logs.mean() - margin, logs.mean() + margin
         mean, fixed = (
             np.mean([s.errors[m].mean() for s in self.left_out]) for m in (mode, "fixed")
@@ -195,6 +195,11 @@ class Validation:
         if s["high"] >= 1.0:
             return f"Nothing shows that `{rule}` pays, nor that it harms: {ratio}."
         return f"Adapt by `{rule}`: {ratio}, and on none more than {s['worst']:.2f} times."
+
+
+def _margin(logs: NDArray[np.float64]) -> float:
+    """Half of the 95 % interval of the mean, Student's."""
+    return float(stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs))
 
 
 def validate(
@@ -509,8 +514,9 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
     """Choose the settings of the paired rule, leaving each of these sequences out in turn.
 
     Of the settings with which it was nowhere worse than `NO_WORSE` times the fixed set, those
-    with the least geometric mean; where there are none, those with which it always takes the fixed
-    set. Of fewer than `MIN_SEQUENCES` sequences nothing is concluded: the usual settings.
+    with the least geometric mean, if its 95 % interval lies below 1; if not, or where there are
+    none, those with which it always takes the fixed set. Of fewer than `MIN_SEQUENCES` sequences
+    nothing is concluded: the usual settings.
 
     Parameters
     ----------
@@ -527,7 +533,8 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
         logs = np.array([_tried(sequence, others, sets) for sequence, others in folds])
     means = np.where(logs.max(axis=0) <= np.log(NO_WORSE), logs.mean(axis=0), np.inf)
     best = int(np.argmin(means))
-    return Settings(sharpness=SHARPNESS[best]) if means[best] < 0.0 else Settings(n_sets=1)
+    pays = means[best] + _margin(logs[:, best]) < 0.0
+    return Settings(sharpness=SHARPNESS[best]) if pays else Settings(n_sets=1)
 
 
 def _tried(

@@ -146,6 +146,19 @@ def test_settings_are_chosen_on_the_sequences_at_hand():
     assert tune(sequences[:5], SETS) == Settings()
 
 
+def test_a_gain_that_may_be_chance_is_none():
+    def places(gains):
+        rng = np.random.default_rng(0)
+        one, other = [2.0, 2.0, 1.0, 2.0, 2.0], [2.0, 2.0, 1.0, 2.0, 0.4]
+        return [sequence(f"one{i}", one, 0, rng) for i in range(6)] + [
+            sequence(f"other{i}", other, 1, rng) for i in range(gains)
+        ]
+
+    # Where two of eight gain, the interval of the mean holds 1; not so with six of twelve.
+    assert tune(places(2), SETS) == Settings(n_sets=1)
+    assert tune(places(6), SETS) == Settings(sharpness=6.0)
+
+
 def test_a_sequence_left_out_is_judged_on_the_sets_it_has_seen():
     sequences = two_kinds(np.random.default_rng(0))
     for i, s in enumerate(sequences):
