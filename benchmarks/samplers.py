@@ -31,16 +31,15 @@ from scipy.stats import wilcoxon
 
 from adaptune import cores, report
 from adaptune.simulation import record
-from adaptune.space import Float, ParameterSet, ParameterSpace
+from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from adaptune.study import OfflineConfig, Study, load_study
 from offline.samplers import make_sampler
 from offline.trial import PreparedSequence, run_trials
 
 TRIALS = 96
 SEEDS = range(20)
-TABLE_TRIALS = 32
-SIDE = 16
-"""Points of the recorded grid along each parameter."""
+SIDE = 32
+"""Points of the recorded grid along each parameter, closer than annealing's steps are long."""
 THESIS = {
     "gicp": [],
     "evalio_kiss_icp": [
@@ -95,29 +94,25 @@ def hartmann(x: NDArray[np.float64]) -> float:
 
 
 def best_so_far(
-    space: ParameterSpace, error: Error, sampler: str, seed: int, trials: int, **given: Any
+    space: ParameterSpace, error: Error, sampler: str, seed: int
 ) -> NDArray[np.float64]:
     """Best error after every trial of one search."""
-    config = OfflineConfig(sampler=sampler, seed=seed, **given)
+    config = OfflineConfig(sampler=sampler, seed=seed)
     search = make_sampler(space, config)
     history: list[tuple[ParameterSet, float]] = []
-    while len(history) < trials:
-        history += [(s, error(s)) for s in search.propose(history)]  # type: ignore[arg-type]
-    return np.minimum.accumulate([value for _, value in history[:trials]])
+    while len(history) < TRIALS:
+        history += [(s, error(s)) for s in search.propose(history)]
+    return np.minimum.accumulate([value for _, value in history[:TRIALS]])
 
 
 def against_random(
     name: str,
     spaces: Callable[[int], ParameterSpace],
     error: Error,
-    trials: int,
-    **given: Any,
 ) -> None:
     """Print a row for each sampler."""
     best = {
-        sampler: np.array(
-            [best_so_far(spaces(seed), error, sampler, seed, trials, **given)[-1] for seed in SEEDS]
-        )
+        sampler: np.array([best_so_far(spaces(seed), error, sampler, seed)[-1] for seed in SEEDS])
         for sampler in ("random", "sobol", "annealing", "tpe")
     }
     for sampler, found in best.items():
@@ -142,7 +137,7 @@ def functions() -> None:
             value: float = function(np.array(list(s.values())))
             return value
 
-        against_random(function.__name__, spaces, error, TRIALS)
+        against_random(function.__name__, spaces, error)
 
 
 STUDY = """\
@@ -177,7 +172,7 @@ def table(folder: Path) -> None:
         (at,) = space.to_unit([s])
         return float(errors[np.argmin(((points - at) ** 2).sum(axis=1))])
 
-    against_random("table", lambda _: space, error, TABLE_TRIALS, initial=8, batch=4)
+    against_random("table", lambda _: space, error)
 
 
 def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -197,7 +192,9 @@ def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, A
     curves: dict[str, Any] = {}
     side = round((THESIS_TRIALS - 1) ** (1 / len(study.space)))
     axes = {
-        n: {"low": p.low, "high": p.high, "count": side} for n, p in study.space.parameters.items()
+        n: {"low": p.low, "high": p.high, "count": side}
+        for n, p in study.space.parameters.items()
+        if not isinstance(p, Categorical)
     }
     for sampler in ("grid", "random", "annealing", "tpe"):
         best = []
@@ -213,7 +210,7 @@ def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, A
                 ),
             )
             history: list[tuple[ParameterSet, float]] = []
-            while len(history) < THESIS_TRIALS and (sets := search.propose(history)):  # type: ignore[arg-type]
+            while len(history) < THESIS_TRIALS and (sets := search.propose(history)):
                 history += [(s, measures(s)[0]) for s in sets]
             best.append([measures(s) for s, _ in history[:THESIS_TRIALS]])
             print(f"{name}: {sampler}, seed {seed}", file=sys.stderr, flush=True)
