@@ -270,14 +270,8 @@ def offline(
         console.print(f"The sets that no other one beats in all: {front}.*", highlight=False)
     if model.paired.n_sets == 1:
         console.print(
-            "On the training sequences left out in turn adapting did not pay: `paired` will always "
-            "take the fixed set.",
-            highlight=False,
-        )
-    elif len(model.sequences) == 1:
-        console.print(
-            "Selections will rest on a single training sequence: nothing shows that they hold "
-            "elsewhere.",
+            "On the training sequences left out in turn nothing showed that adapting pays, for "
+            "which it takes six or more: `paired` will always take the fixed set.",
             highlight=False,
         )
     console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert, rotation_angle, steps
 
 RESAMPLES = 2000
+"""Of a bootstrap."""
 MIN_BLOCKS = 10
+"""Independent pieces of a drive below which an interval would only seem to say something."""
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
@@ -215,7 +217,8 @@ def bootstrap(
 
     A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
     share most of their sub-trajectories and are drawn together. It speaks of one drive, not of
-    other places.
+    other places. With few blocks it is too narrow: of skewed errors, intervals of 10 blocks hold
+    the truth 8 times in 10.
 
     Parameters
     ----------

@@ -398,6 +398,12 @@ class Study:
         """Settings of the odometry."""
         return self.box.settings_type.model_validate(self.config.odometry.settings)
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Name and settings of the odometry, as a model tells what it was made for."""
+        settings = self.settings.model_dump(mode="json")
+        return {"name": self.config.odometry.name, "settings": settings}
+
     @cached_property
     def described(self) -> Description:
         """What the odometry says of itself."""

@@ -203,10 +203,13 @@ def by_descriptor(paths: list[Path], described: list[Path]) -> None:
         print_summary(leave_one_out(sequences, sets), RULES)
 
 
+Take = Callable[[TrainingData], TrainingData]
+
+
 class OfLess(Rule):
     """A rule that is fitted on less than there is."""
 
-    def __init__(self, rule: Rule, less: Callable[[TrainingData], TrainingData]):
+    def __init__(self, rule: Rule, less: Take):
         self.rule, self.less = rule, less
 
     def fit(self, data: TrainingData) -> Self:
@@ -251,21 +254,22 @@ def with_gaps(data: TrainingData, share: float) -> TrainingData:
 def less(paths: list[Path]) -> None:
     """Leave each sequence out in turn, with less known of the others."""
 
-    def maker(name: str, take: Callable[[TrainingData], TrainingData]) -> Maker:
+    def maker(name: str, take: Take, every: int = 1) -> Maker:
         def make(others: Sequence[LabelledSequence], sets: Any) -> Rule:
             settings = tune(others, sets) if name == "paired" else Settings()
-            return OfLess(RULES[name](settings, 0.0), take)
+            of_less = {"n_frames": max(1, settings.n_frames // every)}
+            return OfLess(RULES[name](settings.model_copy(update=of_less), 0.0), take)
 
         return make
 
-    takes: dict[str, Callable[[TrainingData], TrainingData]] = {"all": lambda data: data}
-    for every in (2, 4, 10):
-        takes[f"one frame in {every}"] = partial(thinned, every=every)
-    for share in (0.75, 0.5, 0.25):
-        takes[f"{share:.0%} of the pairs"] = partial(with_gaps, share=share)
-    makers = {
-        f"{rule}, {what}": maker(rule, take) for rule in RULES for what, take in takes.items()
-    }
+    makers: dict[str, Maker] = {}
+    for name in RULES:
+        for every in (1, 2, 4, 10):
+            kept = partial(thinned, every=every)
+            makers[f"{name}, one frame in {every}"] = maker(name, kept, every)
+        for share in (0.75, 0.5, 0.25):
+            kept = partial(with_gaps, share=share)
+            makers[f"{name}, {share:.0%} of the pairs"] = maker(name, kept)
     print_summary(leave_one_out(*labelled(paths), makers), makers)
 
 

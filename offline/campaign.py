@@ -94,6 +94,7 @@ def train(
         whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
     model = fit(study, archive, verdicts, fixed)
     model = replace(model, paired=tune(*labelled_sequences(study, model)))
+    model = model.thinned(config.max_frames)
     model.save(study.folder / "model.npz")
     finished = {
         name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
@@ -459,11 +460,8 @@ def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: 
         elevations.append(float(np.nanmedian(frames.elevations)))
         sequence.append(np.full(labelled.sum(), s))
         errors.append(of_sequence[labelled])
-    model = ErrorModel(
-        odometry={
-            "name": study.config.odometry.name,
-            "settings": study.settings.model_dump(mode="json"),
-        },
+    return ErrorModel(
+        odometry=study.identity,
         space=study.space,
         sets=[verdicts[n].parameters for n in numbers],
         fixed=numbers.index(fixed),
@@ -480,5 +478,3 @@ def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: 
             mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
         ),
     )
-    max_frames = study.config.offline.max_frames
-    return model if max_frames is None else model.thinned(max_frames)

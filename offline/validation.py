@@ -23,6 +23,7 @@ from adaptune.metrics import bootstrap, cap, span
 from adaptune.model import (
     RULES,
     ErrorModel,
+    ModelError,
     PairedExpectedRatio,
     Rule,
     Settings,
@@ -39,6 +40,8 @@ MIN_SEQUENCES = 6
 """Fewer say too little about places they are not to advise for adapting."""
 NO_WORSE = 1.05
 """A rule may not have more than this much of the fixed set's error on any sequence left out."""
+TINY = 1e-6
+"""Percent, which is no error: what has none can still be compared."""
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
 SHARPNESS = (6.0, 12.0, 24.0, 48.0)
@@ -139,11 +142,8 @@ class Validation:
 
     def __post_init__(self) -> None:
         modes = list(self.left_out[0].errors)
-        # Where the fixed set has no error at all, there is nothing to divide by.
-        least = np.finfo(np.float64).tiny
         means = {
-            mode: np.maximum([s.errors[mode].mean() for s in self.left_out], least)
-            for mode in modes
+            mode: np.array([s.errors[mode].mean() for s in self.left_out]) + TINY for mode in modes
         }
         self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
 
@@ -174,8 +174,8 @@ class Validation:
         ndarray of shape (MOST_SETS,)
             For K = 1 (the fixed set), 2, ...
         """
-        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out])
-        portfolios = np.array([s.portfolio for s in self.left_out])
+        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out]) + TINY
+        portfolios = np.array([s.portfolio for s in self.left_out]) + TINY
         return np.asarray(np.exp(np.log(portfolios / fixed[:, None]).mean(axis=0)))
 
     def verdict(self, rule: str) -> str:
@@ -188,6 +188,8 @@ class Validation:
             f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
             f"adapting {share:.0f} % of the time"
         )
+        if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
+            return f"`{rule}` kept the fixed set: what it was fitted on did not show that it pays."
         if s["worst"] > NO_WORSE:
             return f"Do not adapt by `{rule}`: {s['worst']:.2f} times on {worst}; {ratio}."
         if len(self.left_out) < MIN_SEQUENCES:
@@ -228,11 +230,18 @@ def validate(
     Raises
     ------
     ModelError
-        If there is no model yet.
+        If there is no model yet, or it is not this study's.
     ValidationError
         If there is but one training sequence.
     """
-    model = ErrorModel.load(study.folder / "model.npz")
+    path = study.folder / "model.npz"
+    model = ErrorModel.load(path)
+    model.check_study(study.identity, study.space, path)
+    if (study.training, study.window) != (model.sequences, model.window):
+        raise ModelError(
+            f"{path}: was fitted to other training sequences or descriptors than the study's; run "
+            f"`adaptune offline` again"
+        )
     sequences, sets = labelled_sequences(study, model)
     validation = leave_one_out(
         sequences, sets, progress=lambda i, n: progress("sequences left out", i, n)
@@ -344,7 +353,13 @@ def labelled_sequences(
     archive = Archive(study.folder / "trials")
     period = study.config.online.period
     everywhere = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
-    numbers = [model.provenance["trials"][i] for i in everywhere]
+    numbers = [model.trials[i] for i in everywhere]
+    for name in model.sequences:
+        if missing := set(numbers) - set(archive.finished(name)):
+            raise ModelError(
+                f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
+                f"fitted to; run `adaptune offline` again"
+            )
     owners = [owner(study.config.offline, model.sequences, n) for n in numbers]
     objective = study.config.offline.objective[0]
     sequences = []
@@ -515,8 +530,7 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
 
     Of the settings with which it was nowhere worse than `NO_WORSE` times the fixed set, those
     with the least geometric mean, if its 95 % interval lies below 1; if not, or where there are
-    none, those with which it always takes the fixed set. Of fewer than `MIN_SEQUENCES` sequences
-    nothing is concluded: the usual settings.
+    none, or fewer than `MIN_SEQUENCES` sequences, those with which it always takes the fixed set.
 
     Parameters
     ----------
@@ -527,7 +541,7 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
     """
     folds = _folds(sequences)
     if len(folds) < MIN_SEQUENCES:
-        return Settings()
+        return Settings(n_sets=1)
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
         logs = np.array([_tried(sequence, others, sets) for sequence, others in folds])
@@ -553,5 +567,6 @@ def _tried(
         best, _ = rule.best(near)
         chosen = rule.candidates_[best]
         errors = capped[np.arange(len(capped)), chosen[period]]
-        logs.append(float(np.log(errors.mean() / capped[:, data.fixed].mean())))
+        # A millionth of a percent is no error, and no fixed set better than another.
+        logs.append(float(np.log((errors.mean() + TINY) / (capped[:, data.fixed].mean() + TINY))))
     return logs

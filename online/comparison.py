@@ -25,7 +25,6 @@ from online.replay import Policy, adaptive, replay, write_replay
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
 
-"""Independent pieces of a drive below which an interval would only seem to say something."""
 SCANT = 1.5
 """Training sequences below which a selection rests on hardly more than one."""
 
@@ -68,7 +67,9 @@ def run_replays(
         If there is no test sequence, or the model is of another odometry or other parameters.
     """
     model = ErrorModel.load(model_path)
-    check_model(study, model, model_path)
+    model.check_study(study.identity, study.space, model_path)
+    if study.mechanism == "bank":
+        bank_sets(study, model)
     if not study.config.test:
         raise ComparisonError("test: name at least one sequence to replay")
     study.open()
@@ -105,7 +106,8 @@ def run_replays(
             if not made_here:
                 _write_reference(folder, sequence.reference(), result.trajectory)
             write_replay(folder / mode, result, about)
-            _warn_of_scant_evidence(what, [c.selection for c in result.choices], model.fixed)
+            fixed = bank_sets(study, model)[0][0] if study.mechanism == "bank" else model.fixed
+            _warn_of_scant_evidence(what, [c.selection for c in result.choices], fixed)
             made_here += 1
         made += made_here
     return made
@@ -153,12 +155,12 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
 
 
 def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[ParameterSet]]:
-    """Numbers and parameters of the sets in a study's bank, the one to begin with first.
+    """Numbers in the model, and parameters, of the sets in a study's bank, the first one first.
 
     Raises
     ------
     ComparisonError
-        If the model knows nothing of a set that is named.
+        If the model knows nothing of a set that is named, or one is named twice.
     """
     given = study.config.online.switching.sets
     if given is None:
@@ -166,13 +168,15 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
         return members, [model.sets[i] for i in members]
     members = []
     for i, named in enumerate(given):
-        number = named if isinstance(named, int) else _number(model, study.space.baseline | named)
-        if number >= len(model.sets):
+        number = _number(model, named if isinstance(named, int) else study.space.baseline | named)
+        if number is None:
             raise ComparisonError(
                 f"online.switching.sets.{i}: is none of the {len(model.sets)} parameter sets that "
                 f"were tried, so nothing is known of its errors; name the number of a trial, or "
                 f"the parameters of one (trials.csv lists them)"
             )
+        if number in members:
+            raise ComparisonError(f"online.switching.sets.{i}: is in the bank already")
         if np.isnan(model.errors[:, number]).any():
             raise ComparisonError(
                 f"online.switching.sets.{i}: was not run on every training sequence, so it cannot "
@@ -182,32 +186,10 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
     return members, [model.sets[i] for i in members]
 
 
-def _number(model: ErrorModel, parameters: ParameterSet) -> int:
-    """Number of a set, the first that there is not if the model does not know it."""
-    return model.sets.index(parameters) if parameters in model.sets else len(model.sets)
-
-
-def check_model(study: Study, model: ErrorModel, path: Path) -> None:
-    """Refuse a model that was not made for this odometry.
-
-    Raises
-    ------
-    ComparisonError
-    """
-    odometry = {
-        "name": study.config.odometry.name,
-        "settings": study.settings.model_dump(mode="json"),
-    }
-    if model.odometry != odometry:
-        raise ComparisonError(
-            f"{path}: is a model of {json.dumps(model.odometry)}, the study's odometry is "
-            f"{json.dumps(odometry)}; run `adaptune offline` for this study"
-        )
-    if model.space != study.space:
-        raise ComparisonError(
-            f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
-            f"offline` for this study"
-        )
+def _number(model: ErrorModel, named: int | ParameterSet) -> int | None:
+    """Number in the model of a trial or a set, if it knows it."""
+    known: list[Any] = model.trials if isinstance(named, int) else model.sets
+    return known.index(named) if named in known else None
 
 
 def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:

@@ -147,19 +147,20 @@ class ErrorModel:
         """Choose complementary sets, the fixed one first; see `complementary`."""
         return complementary(self.errors, places(self.sequences)[self.sequence], self.fixed, size)
 
-    def thinned(self, max_frames: int) -> Self:
+    def thinned(self, max_frames: int | None) -> Self:
         """Keep fewer frames, so that a selection costs less.
 
         Of each sequence its share, at least one, as far from each other in time: so mean errors
-        stay what they are. (Frames that cover what all of them look like would be rare ones.)
+        stay what they are. (Frames that cover what all of them look like would be rare ones.) The
+        paired rule asks for as much fewer of them.
 
         Parameters
         ----------
         max_frames
-            How many to keep, over all sequences.
+            How many to keep, over all sequences, but one of each at least; all if None.
         """
         n_frames = len(self.sequence)
-        if n_frames <= max_frames:
+        if max_frames is None or n_frames <= max_frames:
             return self
         kept = []
         for s in np.unique(self.sequence):
@@ -168,12 +169,49 @@ class ErrorModel:
             kept.append(members[(2 * np.arange(share) + 1) * len(members) // (2 * share)])
         # In their order, for what follows may ask for it.
         frames = np.sort(np.concatenate(kept))
+        n_near = max(1, round(self.paired.n_frames * len(frames) / n_frames))
         return replace(
             self,
+            paired=self.paired.model_copy(update={"n_frames": n_near}),
             descriptors=self.descriptors[frames],
             sequence=self.sequence[frames],
             errors=self.errors[frames],
         )
+
+    @property
+    def trials(self) -> list[int]:
+        """Numbers of the trials that the sets are of; those of the sets where it is not told."""
+        told = self.provenance.get("trials")
+        if isinstance(told, list) and len(told) == len(self.sets):
+            return told
+        return list(range(len(self.sets)))
+
+    def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
+        """Refuse a model that was not made for this odometry and these parameters.
+
+        Parameters
+        ----------
+        odometry
+            Its name and settings.
+        space
+            The parameters.
+        path
+            Where the model is from.
+
+        Raises
+        ------
+        ModelError
+        """
+        if self.odometry != odometry:
+            raise ModelError(
+                f"{path}: is a model of {json.dumps(self.odometry)}, the study's odometry is "
+                f"{json.dumps(odometry)}; run `adaptune offline` for this study"
+            )
+        if self.space != space:
+            raise ModelError(
+                f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
+                f"offline` for this study"
+            )
 
     def is_foreign(self, elevation: float) -> bool:
         """Whether scans whose lowest points lie there come from no sensor of the training's.
@@ -266,7 +304,9 @@ class ErrorModel:
             raise ModelError(f"{path}: there is no such model; run `adaptune offline`") from error
         except _DAMAGED as error:
             lines = " ".join(str(error).split())
-            raise ModelError(f"{path}: is not an error model, or damaged ({lines})") from error
+            raise ModelError(
+                f"{path}: is not an error model, or damaged ({lines}); run `adaptune offline` again"
+            ) from error
         return model
 
     def check(self) -> None:

@@ -41,11 +41,11 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     n_sets: PositiveInt | None = 3
-    sharpness: NonNegativeFloat = 6.0
-    width: PositiveFloat = 0.12
+    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
+    width: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 0.12
     n_frames: PositiveInt = 300
-    threshold: Annotated[float, Field(le=0.0)] = -0.1
-    caution: NonNegativeFloat = 0.5
+    threshold: Annotated[float, Field(le=0.0, allow_inf_nan=False)] = -0.1
+    caution: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.5
 
 
 class Near(NamedTuple):
@@ -249,7 +249,8 @@ class PairedExpectedRatio(Rule):
         # What takes a set back in a place unlike all training need not pay.
         if self.price and current is not None and near.familiarity[0] >= NOVEL:
             at = np.flatnonzero(self.candidates_ == current)
-            if len(at) and cautious[at[0]] - cautious[best] <= self.price:
+            # Nor what takes back one that is not expected to be better than the fixed one.
+            if len(at) and cautious[best] + self.price >= cautious[at[0]] <= 1.0:
                 best = at[0]
         fixed = float(weights @ near.fixed[0])
         return Selection(

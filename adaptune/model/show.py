@@ -57,7 +57,10 @@ def _validation(model: ErrorModel) -> list[str]:
         return ["Not validated yet: `adaptune validate` tells whether adapting pays."]
     lines = []
     for rule, found in model.validation.items():
-        lines += _pairs(f"Validation, {rule}", found) or [f"Validation, {rule}: {found}"]
+        told = found
+        if isinstance(found, dict):
+            told = {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in found.items()}
+        lines += _pairs(f"Validation, {rule}", told) or [f"Validation, {rule}: {told}"]
     return lines
 
 

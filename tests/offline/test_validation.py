@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptune.model import Selection, Settings
+from adaptune.model import ModelError, Selection, Settings
 from adaptune.model.base import Rule
 from adaptune.study import load_study
 from offline.campaign import train
@@ -115,6 +115,10 @@ def test_the_oracle_is_never_worse_than_anything():
     ],
 )
 def test_verdicts(ratios, verdict):
+    kept = LeftOut(
+        "a", {m: np.ones(9) for m in ("fixed", "rule")}, {"rule": 0.0}, *[np.ones(6)] * 2
+    )
+    assert Validation([kept] * 6).verdict("rule").startswith("`rule` kept the fixed set")
     left_out = [
         LeftOut(str(i), {"fixed": np.ones(9), "rule": np.full(9, r)}, {}, np.ones(9), np.ones(6))
         for i, r in enumerate(ratios)
@@ -143,7 +147,18 @@ def test_settings_are_chosen_on_the_sequences_at_hand():
         sequence(str(i), [9.0, 9.0, 1.0, 9.0, 0.5 if i % 2 else 2.5], 0, rng) for i in range(8)
     ]
     assert tune(random, SETS) == Settings(n_sets=1)
-    assert tune(sequences[:5], SETS) == Settings()
+    assert tune(sequences[:5], SETS) == Settings(n_sets=1)
+
+
+@pytest.mark.parametrize(("odd", "pays"), [(1.04, True), (1.5, False)])
+def test_no_gain_makes_up_for_harm(odd, pays):
+    rng = np.random.default_rng(0)
+    one, other = [2.0, 2.0, 1.0, 2.0, 4.0], [2.0, 2.0, 1.0, 2.0, 0.4]
+    sequences = [sequence(f"one{i}", one, 0, rng) for i in range(4)]
+    sequences += [sequence(f"other{i}", other, 1, rng) for i in range(8)]
+    # It looks like those where the last set does well.
+    sequences.append(sequence("odd", [2.0, 2.0, 1.0, 2.0, odd], 1, rng))
+    assert (tune(sequences, SETS) != Settings(n_sets=1)) is pays
 
 
 def test_a_gain_that_may_be_chance_is_none():
@@ -228,3 +243,14 @@ def test_validates_a_study(study_file, tmp_path):
     assert rows[2]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert (study.folder / "validation.csv").exists()
+    for other, text in (
+        ("odometry.parameters.keyframe_interval.high=20", "other parameters or ranges"),
+        ("training=[one]", "other training sequences"),
+        ("descriptor.window=0", "other training sequences or descriptors"),
+    ):
+        with pytest.raises(ModelError, match=text):
+            validate(load_study(study_file, [other], study.folder))
+    archive = study.folder / "trials/one"
+    (archive / "00003.npz").rename(archive / "gone")
+    with pytest.raises(ModelError, match=r"lacks trial 3 on one.*adaptune offline"):
+        validate(study)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, Selection
 from adaptune.study import ConfigurationError, load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
@@ -97,6 +98,19 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
     values = "{" + ", ".join(f"{k}: {v!r}" for k, v in model.sets[4].items()) + "}"
     named = load_study(study_file, [bank, f"online.switching.sets=[{values}, 1]"], trained.folder)
     assert bank_sets(named, model)[0] == [4, 1]
+    # They go by their trials, whatever sets were left out of the model.
+    some = replace(
+        model,
+        sets=model.sets[2:],
+        errors=model.errors[:, 2:],
+        fixed=0,
+        provenance={"trials": model.trials[2:]},
+    )
+    by_number = load_study(study_file, [bank, "online.switching.sets=[3, 2]"], trained.folder)
+    assert bank_sets(by_number, some) == ([1, 0], [model.sets[3], model.sets[2]])
+    twice = load_study(study_file, [bank, "online.switching.sets=[3, 3]"], trained.folder)
+    with pytest.raises(ComparisonError, match=r"switching\.sets\.1: is in the bank already"):
+        run_replays(twice, trained.folder / "model.npz")
     errors = model.errors.copy()
     errors[:3, 4] = np.nan
     with pytest.raises(ComparisonError, match=r"switching\.sets\.0: was not run on every"):
@@ -160,7 +174,7 @@ def test_rows_over_several_sequences(replayed, study_file):
 )
 def test_refuses_a_model_of_something_else(trained, study_file, override, words):
     study = load_study(study_file, [override], trained.folder)
-    with pytest.raises(ComparisonError, match=words):
+    with pytest.raises(AdaptuneError, match=words):
         run_replays(study, trained.folder / "model.npz")
 
 

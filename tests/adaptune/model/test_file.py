@@ -70,9 +70,12 @@ def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
         sequence=np.repeat([0, 1], [n, m]),
         errors=np.tile(np.arange(n + m, dtype=np.float32)[:, None], 6),
     )
+    assert model.thinned(None) is model
     few = model.thinned(most)
     few.check()
     kept = few.errors[:, 0].astype(int)
+    near = max(1, round(300 * len(kept) / (n + m)))
+    assert few.paired == model.paired.model_copy(update={"n_frames": near})
     np.testing.assert_array_equal(few.sequence, model.sequence[kept])
     np.testing.assert_array_equal(few.descriptors, model.descriptors[kept])
     if most >= n + m:

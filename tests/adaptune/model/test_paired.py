@@ -326,6 +326,12 @@ def test_a_switch_must_pay():
     assert rule.select(np.zeros(2), current=7).set_index == 1
 
 
+@pytest.mark.parametrize(("other", "chosen"), [(0.95, 1), (1.25, 0)])
+def test_what_is_worse_than_the_fixed_set_need_not_be_kept(other, chosen):
+    rule = PairedExpectedRatio(price=0.5).fit(two_sets(1.0, other))
+    assert rule.select(np.zeros(2), current=1).set_index == chosen
+
+
 def test_in_a_place_unlike_all_training_going_back_costs_nothing():
     data = random_data(1, 60, 5)
     data.errors[:, 0], data.errors[:, 1:] = 0.5, 1.0
