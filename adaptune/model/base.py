@@ -55,7 +55,8 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     Returns
     -------
     ndarray of shape (n_sets,)
-        Percent. The *fixed* set is where this is least; of equal ones, the first. A set's frames
+        Percent. Where nothing else is judged by, the *fixed* set is where this is least; of equal
+        ones, the first. A set's frames
         without an error do not count. If a whole sequence is without, the mean is infinite, for
         sequences differ more than sets, and means over different ones cannot be compared: such a
         set cannot be the fixed one.

@@ -38,7 +38,8 @@ class Settings(BaseModel):
         How many standard errors, by how much the sequences differ, are added to a ratio first.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # A file of a later version may say more.
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
     n_sets: PositiveInt | None = 3
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
@@ -179,7 +180,10 @@ class PairedExpectedRatio(Rule):
         weights = self._weights(near.squared)
         expected = np.einsum("qs,qsc->qc", weights, ratio)
         variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
-        error = np.sqrt(variance * (weights**2).sum(axis=1)[:, None])
+        # One over the number of sequences that this rests on. The fewer they are, the less do they
+        # tell how much they differ: as much as all sequences do, where it is one alone.
+        share = (weights**2).sum(axis=1)[:, None]
+        error = np.sqrt(share * (variance + share * ratio.var(axis=1)))
         trust = np.minimum(1.0, near.familiarity / NOVEL)[:, None]
         expected = 1.0 + trust * (expected - 1.0)
         return Ratios(expected, expected + trust * self.settings.caution * error, weights)
