@@ -217,8 +217,7 @@ def bootstrap(
 
     A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
     share most of their sub-trajectories and are drawn together. It speaks of one drive, not of
-    other places. With few blocks it is too narrow: of skewed errors, intervals of 10 blocks hold
-    the truth 8 times in 10.
+    other places. With few blocks it is too narrow, the more so the more skewed the errors are.
 
     Parameters
     ----------

@@ -438,16 +438,15 @@ def _check_grid(
             help_ = nearest(name, space.names)
             yield ("grid", name), f"no parameter {name!r} is tuned: {help_}"
             return
-    wrong = False
+    made = {}
     for name, parameter in space.parameters.items():
         try:
-            _axis(parameter, axes.get(name))
+            made[name] = _axis(parameter, axes.get(name))
         except ValueError as error:
-            wrong = True
             yield ("grid", name), str(error)
-    if wrong:
+    if len(made) < len(space):
         return
-    grid = make_grid(space, axes)
+    grid = Grid(made)
     if sampler == "grid" and not budgeted and grid.size > MAX_GRID:
         yield (
             ("grid",),

@@ -96,12 +96,12 @@ _Weighted = Annotated[
 def _weighted(given: Any) -> Any:
     """A metric or a weighted sum of metrics, or several of them, all as weighted sums."""
     objectives = given if isinstance(given, list | tuple) else [given]
+    weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
     metrics = get_args(Metric)
-    for one in objectives:
-        for metric in [one] if isinstance(one, str) else one if isinstance(one, dict) else []:
+    for weights in weighted:
+        for metric in weights if isinstance(weights, dict) else ():
             if metric not in metrics:
                 raise ValueError(f"there is no metric {metric!r}: {nearest(str(metric), metrics)}")
-    weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
     if any(weights in weighted[:i] for i, weights in enumerate(weighted)):
         raise ValueError("names an objective twice")
     return weighted

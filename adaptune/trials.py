@@ -24,8 +24,8 @@ _OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
-_COLUMN = {"rte": "mean", "ms_per_scan": "ms"}
-"""What columns are called in a study's objectives."""
+_COLUMN = {"rte": "mean"}
+"""What is called otherwise in a study's objectives than here."""
 _CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
 
 

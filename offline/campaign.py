@@ -86,8 +86,8 @@ def train(
     archive = Archive(study.folder / "trials")
     archive.tidy()
     n_workers = config.workers or available()
-    where = f"on {cluster}" if cluster else f"{n_workers} worker{'s' if n_workers > 1 else ''}"
-    _log.info("trials run %s; each sequence is prepared before its first one", where)
+    where = cluster or f"{n_workers} worker{'s' if n_workers > 1 else ''}"
+    _log.info("trials run on %s; each sequence is prepared before its first one", where)
     with Cluster(study, cluster) if cluster else Workers(study, n_workers) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)

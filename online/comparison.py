@@ -68,8 +68,8 @@ def run_replays(
     """
     model = ErrorModel.load(model_path)
     model.check_study(study.identity, study.space, model_path)
-    if study.mechanism == "bank":
-        bank_sets(study, model)
+    # The set that adaptive modes begin with.
+    fixed = bank_sets(study, model)[0][0] if study.mechanism == "bank" else model.fixed
     if not study.config.test:
         raise ComparisonError("test: name at least one sequence to replay")
     study.open()
@@ -106,7 +106,6 @@ def run_replays(
             if not made_here:
                 _write_reference(folder, sequence.reference(), result.trajectory)
             write_replay(folder / mode, result, about)
-            fixed = bank_sets(study, model)[0][0] if study.mechanism == "bank" else model.fixed
             _warn_of_scant_evidence(what, [c.selection for c in result.choices], fixed)
             made_here += 1
         made += made_here

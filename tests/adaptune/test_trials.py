@@ -1,6 +1,7 @@
 """The table of trials."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -8,6 +9,7 @@ import pytest
 
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.report import csv_text
+from adaptune.study import Metric
 from adaptune.trajectory import read_tum
 from adaptune.trials import TrialsError, export, rows, select
 
@@ -63,6 +65,13 @@ def test_a_metric_that_not_all_have_is_not_told(archive):
 
 def test_columns_go_by_what_objectives_call_them_too():
     assert select(TABLE, ["rte < 1.5"], "rte") == select(TABLE, ["mean < 1.5"], "mean")
+
+
+def test_every_metric_of_an_objective_is_a_column(archive):
+    known = {metric: 1.0 for metric in get_args(Metric) if metric not in ("rte", "ms_per_scan")}
+    archive.write("cave", 0, replace(archive.read("cave", 0), metrics=known))
+    for metric in get_args(Metric):
+        assert len(select(rows(archive, ["cave"]), [f"{metric} >= 0"], metric))
 
 
 TABLE = [
