@@ -358,8 +358,8 @@ def validate(
     console.print(
         f"If the best of 1, 2, ... complementary sets were always known: {known}.", highlight=False
     )
-    for rule in loaded.config.online.rules:
-        console.print(validation.verdict(rule), highlight=False)
+    for mode in validation.modes:
+        console.print(validation.verdict(mode), highlight=False)
     console.print(f"Tables and picture: {loaded.folder / 'validation'}.*", highlight=False)
 
 

@@ -103,6 +103,33 @@ def scale(T_previous_current: Poses, share: float) -> Poses:
     return T
 
 
+def mean_motion(T_previous_current: Poses, weights: NDArray[np.float64]) -> Poses:
+    """Weighted mean of motions that are nearly the same.
+
+    Parameters
+    ----------
+    T_previous_current
+        Motions of shape (..., n, 4, 4), turning by much less than half a turn.
+    weights
+        Of shape (..., n), not all of them zero.
+
+    Returns
+    -------
+    ndarray of shape (..., 4, 4)
+        Translations and rotation vectors are averaged.
+    """
+    weights = weights / weights.sum(axis=-1, keepdims=True)
+    shape = weights.shape
+    R = Rotation.from_matrix(T_previous_current[..., :3, :3].reshape(-1, 3, 3), assume_valid=True)
+    turns = R.as_rotvec().reshape(*shape, 3)
+    turn = np.einsum("...i,...ix->...x", weights, turns)
+    T = np.zeros((*shape[:-1], 4, 4))
+    T[..., :3, :3] = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3)
+    T[..., :3, 3] = np.einsum("...i,...ix->...x", weights, T_previous_current[..., :3, 3])
+    T[..., 3, 3] = 1.0
+    return T
+
+
 def rotation_angle(T_target_source: Poses) -> Any:
     """Angle of the rotations in radians, of shape (...)."""
     R = T_target_source[..., :3, :3]

@@ -92,19 +92,43 @@ def sub_trajectory_rte(
         Percent of `length`: NaN for frames without a full sub-trajectory, infinity for those
         whose sub-trajectory contains a lost track or poses that are not finite.
     """
+    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, restarted)
+    return np.asarray(np.linalg.norm(vectors, axis=1))
+
+
+def sub_trajectory_vectors(
+    T_ref_sensor: Poses,
+    T_odom_sensor: Poses,
+    length: float,
+    restarted: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Where each sub-trajectory's end was believed to be, from where it was.
+
+    Parameters
+    ----------
+    T_ref_sensor, T_odom_sensor, length, restarted
+        See `sub_trajectory_rte`, whose errors are the lengths of these vectors.
+
+    Returns
+    -------
+    ndarray of shape (n, 3)
+        Percent of `length`, in the frame of the sub-trajectory's start; NaN and infinite as there.
+    """
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
-    errors = np.full(len(ends), np.nan)
+    ends = ends[starts]
+    vectors = np.full((len(T_ref_sensor), 3), np.nan)
     with np.errstate(invalid="ignore"):
-        T = _relative_errors(T_ref_sensor, T_odom_sensor, starts, ends[starts])
-    errors[starts] = 100.0 / length * np.linalg.norm(T[:, :3, 3], axis=1)
+        d_gt = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends]
+        d_est = invert(T_odom_sensor[starts]) @ T_odom_sensor[ends]
+        vectors[starts] = 100.0 / length * (d_est - d_gt)[:, :3, 3]
     # An odometry whose poses are not finite has lost track; only the reference may be unknown.
-    errors[starts[~np.isfinite(errors[starts])]] = np.inf
+    vectors[starts[~np.isfinite(vectors[starts]).all(axis=1)]] = np.inf
     if restarted is not None:
         # The step that failed ends at its frame: a window that starts there is sound.
         failures = np.cumsum(restarted)
-        errors[starts[failures[ends[starts]] > failures[starts]]] = np.inf
-    return errors
+        vectors[starts[failures[ends] > failures[starts]]] = np.inf
+    return vectors
 
 
 class KittiError(NamedTuple):

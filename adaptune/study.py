@@ -279,8 +279,8 @@ class SwitchingConfig(_Section):
     ----------
     mechanism : str
         `live`: by itself. `hand_over`: a new instance takes over. `bank`: instances with a few
-        complementary sets run side by side. `auto`: the first of live, bank (where there is more
-        than one core, and memory) and hand-over that can be had.
+        sets run side by side, and the mean of their motions is taken. `auto`: the first of bank
+        (where there is more than one core, and memory), live and hand-over that can be had.
     warm_up : float, optional
         Seconds of scans that a new instance sees before it takes over; the odometry's own when
         left out, as the next two.
@@ -294,8 +294,8 @@ class SwitchingConfig(_Section):
     size : int
         Instances in the bank.
     sets : list of int or dict, optional
-        Parameter sets in the bank, or numbers of trials; those that complement each other best
-        when left out.
+        Parameter sets in the bank, or numbers of trials, the first of which counts as the fixed
+        one; the fixed one and those whose errors cancel each other best when left out.
     cores, memory : int, float, optional
         What `auto` may spend on a bank: cores, all there are when left out; gigabytes, of which
         each instance may take `isolation.memory`.
@@ -306,10 +306,10 @@ class SwitchingConfig(_Section):
     full_rate: float | None = Field(None, ge=0, allow_inf_nan=False)
     stride: int | None = Field(None, ge=1)
     beside: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
-    size: int = Field(2, ge=2, le=4)
+    size: int = Field(4, ge=2, le=6)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0)] | dict[str, Value], ...] | None,
-        Field(min_length=2, max_length=4),
+        Field(min_length=2, max_length=6),
     ] = None
     cores: int | None = Field(None, ge=1)
     memory: float = Field(16.0, gt=0, allow_inf_nan=False)
@@ -485,13 +485,13 @@ class Study:
         asked = self.config.online.switching.mechanism
         if asked != "auto":
             return asked
-        if self.described.live:
-            return "live"
         switching = self.config.online.switching
         instances = switching.size if switching.sets is None else len(switching.sets)
         cores = available() if switching.cores is None else switching.cores
         enough = instances * self.config.isolation.memory <= switching.memory
-        return "bank" if cores > 1 and enough else "hand_over"
+        if cores > 1 and enough:
+            return "bank"
+        return "live" if self.described.live else "hand_over"
 
     @cached_property
     def warm_up(self) -> WarmUp:

@@ -37,6 +37,7 @@ from adaptune.model import (
 from adaptune.model.base import complementary
 from adaptune.simulation import Course, simulate
 from adaptune.study import Study, StudyConfig
+from offline.fusion import Drive, error_vectors, recorded_motions
 from offline.samplers import make_sampler
 from offline.trial import run_trials
 from offline.validation import (
@@ -113,7 +114,10 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     sets = make_sampler(study.space, offline).propose([])
     box = study.odometry()
     sequence: Any = Prepared(path.stem, [box.prepare(scan) for scan in scans], frames)
-    errors = [trial.errors for trial in run_trials(study, sequence, sets)]
+    trials = run_trials(study, sequence, sets)
+    length, lost_track = study.config.sub_trajectory, study.config.lost_track
+    vectors = [error_vectors(frames, trial, length) for trial in trials]
+    motions = recorded_motions(frames, trials, lost_track)[..., :3, :]
     with replacing(path) as beside, beside.open("wb") as file:
         np.savez_compressed(
             file,
@@ -121,7 +125,9 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
             T_world_sensor=frames.T_ref_sensor,
             histograms=frames.descriptors.astype(np.uint16),
             sets=study.space.to_unit(sets),
-            errors=np.stack(errors, axis=1).astype(np.float32),
+            errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
+            vectors=np.stack(vectors, axis=1),
+            motions=motions.astype(np.float32),
         )
 
 
@@ -150,11 +156,33 @@ def labelled(paths: list[Path]) -> tuple[list[LabelledSequence], NDArray[np.floa
     for path in paths:
         with np.load(path) as found:
             known = ~np.isnan(found["errors"]).any(axis=1)
-            seconds = (found["stamps"] - found["stamps"][0])[known] // 10**9
+            stamps, T_world_sensor = found["stamps"], found["T_world_sensor"]
+            period = (stamps - stamps[0]) // 10**9
             histograms = found["histograms"].astype(np.float32)
-            described = averaged(histograms, found["stamps"], WINDOW, 1.0)[known]
-            name = path.stem.rsplit("-", 1)[1]
-            sequences.append(LabelledSequence(name, seconds, described, found["errors"][known]))
+            described = averaged(histograms, stamps, WINDOW, 1.0)
+            few = found["motions"]
+            motions = np.tile(np.eye(4), (*few.shape[:2], 1, 1))
+            motions[..., :3, :] = few
+            config = study_of("gicp").config
+            drive = Drive(
+                stamps,
+                T_world_sensor,
+                described,
+                period,
+                config.sub_trajectory,
+                config.lost_track,
+                partial(np.take, motions, axis=1),
+            )
+            sequences.append(
+                LabelledSequence(
+                    path.stem.rsplit("-", 1)[1],
+                    period[known],
+                    described[known],
+                    found["errors"][known],
+                    vectors=found["vectors"][known],
+                    drive=drive,
+                )
+            )
             sets = found["sets"]
     return sequences, sets
 

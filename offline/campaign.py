@@ -23,7 +23,7 @@ from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
 from offline.pruning import rungs
 from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
 from offline.storage import Told, open_mirror
-from offline.validation import labelled_sequences, tune
+from offline.validation import choose_bank, labelled_sequences, tune, tune_bank
 from offline.workers import Pool, Task, Workers, run
 
 Progress = Callable[[str, int, int, str], None]
@@ -93,7 +93,7 @@ def train(
         fixed = choose_fixed(config, verdicts)
         whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
     model = fit(study, archive, verdicts, fixed)
-    model = replace(model, paired=tune(*labelled_sequences(study, model)))
+    model = _tuned(study, model)
     model = model.thinned(config.max_frames)
     model.save(study.folder / "model.npz")
     finished = {
@@ -426,6 +426,25 @@ def _run_whole(
         for n in (0, fixed)
     }
     return {name: (means[name, 0], means[name, fixed]) for name in names}
+
+
+def _tuned(study: Study, model: ErrorModel) -> ErrorModel:
+    """Choose the bank, and the settings of the rule and of the bank's weights."""
+    sequences, sets, everywhere = labelled_sequences(study, model)
+    fixed = everywhere.index(model.fixed)
+    switching = study.config.online.switching
+    members = choose_bank(sequences, fixed, switching.size)
+    named = [model.number(n, study.space) for n in switching.sets or ()]
+    if named and set(named) <= set(everywhere) and len(set(named)) == len(named):
+        members = [everywhere.index(n) for n in named if n is not None]
+    vectors = [s.vectors[:, members] for s in sequences if s.vectors is not None]
+    return replace(
+        model,
+        paired=tune(sequences, sets),
+        bank=[everywhere[i] for i in members],
+        vectors=np.concatenate(vectors),
+        fusion=tune_bank(sequences, sets, members),
+    )
 
 
 def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int) -> ErrorModel:

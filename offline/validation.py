@@ -30,9 +30,11 @@ from adaptune.model import (
     TrainingData,
 )
 from adaptune.model.base import complementary, mean_errors
-from adaptune.model.paired import ERROR_FLOOR
+from adaptune.model.fusion import PairedFusion, bank
+from adaptune.model.paired import ERROR_FLOOR, Near
 from adaptune.sequence.views import origin, places
 from adaptune.study import Study
+from offline.fusion import Drive, drive, error_vectors
 from offline.objective import weighted
 from offline.search import owner
 
@@ -45,7 +47,15 @@ TINY = 1e-6
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
 SHARPNESS = (6.0, 12.0, 24.0, 48.0)
-"""What `tune` chooses from; of equally good ones the first."""
+"""What `tune` and `tune_bank` choose from; of equally good ones the first."""
+HEDGES = (0.0, 0.25, 0.5)
+"""Shares of the weight that the fixed set keeps in a bank; `tune_bank` chooses from them."""
+BANK = "bank"
+"""The mode in which a bank is driven."""
+BANK_SIZE = 4
+"""Its members, unless the study says otherwise."""
+BANK_FRAMES = 1000
+"""Nearest frames of each sequence: products of errors take more to be known than their means."""
 
 
 Interval = tuple[float, float] | None
@@ -79,6 +89,11 @@ class LabelledSequence:
         not been there does not know them.
     block : int
         Frames that a sub-trajectory takes.
+    vectors : ndarray of shape (n, n_sets, 3), optional
+        The errors as vectors, see `adaptune.model.TrainingData`; without them, and `drive`, there
+        is no bank.
+    drive : Drive, optional
+        With all frames.
     """
 
     name: str
@@ -90,6 +105,8 @@ class LabelledSequence:
     values: NDArray[np.float64] | None = None
     own: NDArray[np.bool_] | None = None
     block: int = 1
+    vectors: NDArray[np.float32] | None = None
+    drive: Drive | None = None
 
 
 class LeftOut(NamedTuple):
@@ -101,7 +118,8 @@ class LeftOut(NamedTuple):
     errors : dict
         For every mode the capped error in percent at each frame, of shape (n,).
     adapted : dict
-        For every rule the share of periods in which it did not choose the fixed set.
+        For every rule the share of periods in which it did not choose the fixed set; of a bank,
+        the share of the weight that others had.
     familiarity : ndarray of shape (n,)
         See `Selection`; NaN without a rule that tells it.
     portfolio : ndarray of shape (MOST_SETS,)
@@ -147,6 +165,16 @@ class Validation:
         }
         self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
 
+    @property
+    def modes(self) -> list[str]:
+        """A bank, if one was driven, and the rules."""
+        return [mode for mode in (BANK, *RULES) if mode in self.ratios]
+
+    @property
+    def default(self) -> str:
+        """The first of them."""
+        return self.modes[0] if self.modes else next(iter(RULES))
+
     def summary(self, mode: str) -> dict[str, float]:
         """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
 
@@ -186,7 +214,11 @@ class Validation:
         ratio = (
             f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
             f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
-            f"adapting {share:.0f} % of the time"
+            + (
+                f"others than the fixed set having {share:.0f} % of the weight"
+                if rule == BANK
+                else f"adapting {share:.0f} % of the time"
+            )
         )
         if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
             return f"`{rule}` kept the fixed set: what it was fitted on did not show that it pays."
@@ -242,16 +274,22 @@ def validate(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "
             f"`adaptune offline` again"
         )
-    sequences, sets = labelled_sequences(study, model)
+    sequences, sets, _ = labelled_sequences(study, model)
     validation = leave_one_out(
-        sequences, sets, progress=lambda i, n: progress("sequences left out", i, n)
+        sequences,
+        sets,
+        progress=lambda i, n: progress("sequences left out", i, n),
+        size=study.config.online.switching.size,
     )
     rows = _rows(validation)
     report.write_rows(study.folder, "validation", rows)
     learning = []
     if curve:
         learning = learning_curve(
-            sequences, sets, progress=lambda i, n: progress("learning curve", i, n)
+            sequences,
+            sets,
+            progress=lambda i, n: progress("learning curve", i, n),
+            members=study.config.online.switching.size,
         )
         report.write_rows(study.folder, "learning", learning)
     report.draw_validation(
@@ -263,14 +301,14 @@ def validate(
         validation.portfolio(),
         learning,
     )
-    found = {rule: validation.summary(rule) for rule in RULES}
+    found = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=found).save(study.folder / "model.npz")
     return validation, rows
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
     """Ratios to the fixed set's error; beside the default rule's their intervals."""
-    default = next(iter(RULES))
+    default = validation.default
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
 
@@ -295,7 +333,7 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
 
 def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Familiarity of every frame left out, and its error by the default rule over the fixed's."""
-    rule = next(iter(RULES))
+    rule = validation.default
     familiarity = np.concatenate([s.familiarity for s in validation.left_out])
     ratio = np.concatenate(
         [
@@ -309,11 +347,11 @@ def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArra
 def learning_curve(
     sequences: Sequence[LabelledSequence],
     sets: NDArray[np.float64],
-    rule: str = "paired",
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda *_: None,
+    members: int = BANK_SIZE,
 ) -> list[dict[str, Any]]:
-    """What a rule gains with fewer training sequences.
+    """What a bank, or if there is none the paired rule, gains with fewer training sequences.
 
     Each sequence is left out in turn, and the rule and its settings are fitted on some of the
     others, drawn by chance.
@@ -327,6 +365,7 @@ def learning_curve(
     """
     folds = _folds(sequences)
     most = len(folds) - 1
+    rules = {"paired": _maker("paired")}
     sizes = sorted({n for n in (3, 5, 8, 11, 16, 24, 32) if n < most} | {most})
     rows = []
     for i, size in enumerate(sizes):
@@ -337,22 +376,31 @@ def learning_curve(
             names = sorted({origin(other.name) for other in others})
             drawn = set(rng.choice(names, size, replace=False))
             some = [other for other in others if origin(other.name) in drawn]
-            left_out.append(_leave_out(sequence, some, sets, {rule: _maker(rule)}))
-        rows.append({"sequences": size} | Validation(left_out).summary(rule))
+            left_out.append(_leave_out(sequence, some, sets, rules, members))
+        validation = Validation(left_out)
+        rows.append({"sequences": size} | validation.summary(validation.default))
     progress(len(sizes) * len(folds), len(sizes) * len(folds))
     return rows
 
 
 def labelled_sequences(
     study: Study, model: ErrorModel
-) -> tuple[list[LabelledSequence], NDArray[np.float64]]:
-    """The training sequences of a model, and its sets in the unit cube, from the archive.
+) -> tuple[list[LabelledSequence], NDArray[np.float64], list[int]]:
+    """The training sequences of a model from the archive, and of which sets they tell.
 
     Only of sets that were run on all sequences: others have no error to be looked up.
+
+    Returns
+    -------
+    sequences : list of LabelledSequence
+    sets : ndarray of shape (n_sets, n_parameters)
+        In the unit cube.
+    everywhere : list of int
+        Their numbers in the model.
     """
     archive = Archive(study.folder / "trials")
     period = study.config.online.period
-    everywhere = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
+    everywhere = np.flatnonzero(~np.isnan(model.errors).any(axis=0)).tolist()
     numbers = [model.trials[i] for i in everywhere]
     for name in model.sequences:
         if missing := set(numbers) - set(archive.finished(name)):
@@ -370,6 +418,10 @@ def labelled_sequences(
         described = averaged(frames.descriptors, frames.stamps, model.window, period)
         since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
         values = [weighted(objective, archive.finished(name)[n].metrics) for n in numbers]
+        length = study.config.sub_trajectory
+        vectors = np.empty((int(labelled.sum()), len(numbers), 3), np.float32)
+        for i, n in enumerate(numbers):
+            vectors[:, i] = error_vectors(frames, archive.read(name, n), length)[labelled]
         sequences.append(
             LabelledSequence(
                 name,
@@ -380,10 +432,21 @@ def labelled_sequences(
                 archive.read(name, 0).errors[labelled],
                 np.array(values),
                 np.array([other is not None and origin(other) == origin(name) for other in owners]),
-                span(frames.T_ref_sensor, study.config.sub_trajectory),
+                span(frames.T_ref_sensor, length),
+                vectors,
+                drive(
+                    archive,
+                    name,
+                    frames,
+                    numbers,
+                    described,
+                    period,
+                    length,
+                    study.config.lost_track,
+                ),
             )
         )
-    return sequences, model.space.to_unit([model.sets[i] for i in everywhere])
+    return sequences, model.space.to_unit([model.sets[i] for i in everywhere]), everywhere
 
 
 Maker = Callable[[Sequence[LabelledSequence], NDArray[np.float64]], Rule]
@@ -402,6 +465,7 @@ def leave_one_out(
     sets: NDArray[np.float64],
     rules: Mapping[str, Maker] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
+    size: int = BANK_SIZE,
 ) -> Validation:
     """Leave each sequence out in turn, with all views of it.
 
@@ -416,6 +480,8 @@ def leave_one_out(
         `tune` chooses anew on the other sequences.
     progress
         Told about every sequence.
+    size
+        Members of a bank, if the sequences tell what it takes to drive one; none with 0.
 
     Raises
     ------
@@ -432,7 +498,7 @@ def leave_one_out(
     folds = _folds(sequences)
     for i, (sequence, others) in enumerate(folds):
         progress(i, len(folds))
-        left_out.append(_leave_out(sequence, others, sets, rules))
+        left_out.append(_leave_out(sequence, others, sets, rules, size))
     progress(len(folds), len(folds))
     return Validation(left_out)
 
@@ -472,6 +538,7 @@ def _leave_out(
     others: Sequence[LabelledSequence],
     sets: NDArray[np.float64],
     rules: Mapping[str, Maker],
+    size: int,
 ) -> LeftOut:
     sequence, others, sets = _comparable(sequence, others, sets)
     data, pca = training_data(others, sets)
@@ -490,10 +557,12 @@ def _leave_out(
         errors[name] = capped[frames, chosen[name][period]]
         if not np.isnan(selections[0].familiarity):
             familiarity = np.array([selection.familiarity for selection in selections])
+    adapted = {name: float(np.mean(of_rule != data.fixed)) for name, of_rule in chosen.items()}
+    if size and sequence.drive is not None:
+        errors[BANK], adapted[BANK] = _driven(sequence, others, sets, data, pca, size)
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
     errors["oracle, period"] = capped[frames, of_periods.argmin(axis=1)[period]]
-    adapted = {name: float(np.mean(sets != data.fixed)) for name, sets in chosen.items()}
     few = complementary(data.errors, data.sequence, data.fixed, MOST_SETS)
     least = np.minimum.accumulate(of_periods[:, few], axis=1)[period].mean(axis=0)
     portfolio = least[np.minimum(np.arange(MOST_SETS), len(few) - 1)]
@@ -513,7 +582,13 @@ def _comparable(
     if run.all():
         return sequence, list(others), sets
     few = [
-        replace(s, errors=s.errors[:, run], values=None if s.values is None else s.values[run])
+        replace(
+            s,
+            errors=s.errors[:, run],
+            values=None if s.values is None else s.values[run],
+            vectors=None if s.vectors is None else s.vectors[:, run],
+            drive=None if s.drive is None else s.drive.of(np.flatnonzero(run)),
+        )
         for s in (sequence, *others)
     ]
     return few[0], [s for s in few[1:] if not np.isnan(s.errors).all()], sets[run]
@@ -544,11 +619,21 @@ def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Se
         return Settings(n_sets=1)
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
-        logs = np.array([_tried(sequence, others, sets) for sequence, others in folds])
+        best = _paying(np.array([_tried(sequence, others, sets) for sequence, others in folds]))
+    return Settings(n_sets=1) if best is None else Settings(sharpness=SHARPNESS[best])
+
+
+def _paying(logs: NDArray[np.float64]) -> int | None:
+    """Of settings that are nowhere worse than `NO_WORSE` those with the least mean, if that pays.
+
+    Parameters
+    ----------
+    logs
+        Logarithms of ratios to the fixed set's error, of shape (n_sequences, n_settings).
+    """
     means = np.where(logs.max(axis=0) <= np.log(NO_WORSE), logs.mean(axis=0), np.inf)
     best = int(np.argmin(means))
-    pays = means[best] + _margin(logs[:, best]) < 0.0
-    return Settings(sharpness=SHARPNESS[best]) if pays else Settings(n_sets=1)
+    return best if means[best] + _margin(logs[:, best]) < 0.0 else None
 
 
 def _tried(
@@ -570,3 +655,111 @@ def _tried(
         # A millionth of a percent is no error, and no fixed set better than another.
         logs.append(float(np.log((errors.mean() + TINY) / (capped[:, data.fixed].mean() + TINY))))
     return logs
+
+
+def choose_bank(sequences: Sequence[LabelledSequence], fixed: int, size: int) -> list[int]:
+    """Choose a bank's members, the fixed set first, see `adaptune.model.fusion.bank`."""
+    vectors = [s.vectors for s in sequences if s.vectors is not None]
+    return bank(vectors, [s.errors for s in sequences], fixed, size)
+
+
+def tune_bank(
+    sequences: Sequence[LabelledSequence], sets: NDArray[np.float64], members: Sequence[int]
+) -> Settings:
+    """Choose how a bank's weights are found, leaving each of these sequences out in turn.
+
+    By the same criterion as `tune`; where nothing keeps it, the fixed set has all the weight.
+
+    Parameters
+    ----------
+    sequences, sets
+        See `tune`.
+    members
+        Numbers of the bank's sets, the fixed one first, chosen on these sequences.
+    """
+    folds = _folds(sequences)
+    if len(folds) < MIN_SEQUENCES or len(members) < 2:
+        return Settings(hedge=1.0)
+    with threadpool_limits(1, "blas"):
+        logs = np.array(
+            [_bank_tried(sequence, others, sets, members) for sequence, others in folds]
+        )
+    best = _paying(logs)
+    return Settings(hedge=1.0) if best is None else _BANK_SETTINGS[best]
+
+
+_BANK_SETTINGS = [
+    Settings(sharpness=s, hedge=h, n_frames=BANK_FRAMES) for s in SHARPNESS for h in HEDGES
+]
+
+
+def _bank_tried(
+    sequence: LabelledSequence,
+    others: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    members: Sequence[int],
+) -> list[float]:
+    """With each of `_BANK_SETTINGS`, logarithm of the ratio to the fixed set's error."""
+    data, pca = training_data(others, sets)
+    rule, near = _fusion(sequence, others, data, pca, members)
+    fixed = cap(sequence.errors[:, members[0]]).mean() + TINY
+    logs = []
+    for sharpness in SHARPNESS:
+        rule.settings = Settings(sharpness=sharpness, n_frames=BANK_FRAMES)
+        weights, _ = rule.weigh(near)
+        for hedge in HEDGES:
+            hedged = (1.0 - hedge) * weights
+            hedged[:, 0] += hedge
+            errors = _bank_errors(sequence, members, hedged)
+            logs.append(float(np.log((errors.mean() + TINY) / fixed)))
+    return logs
+
+
+def _fusion(
+    sequence: LabelledSequence,
+    others: Sequence[LabelledSequence],
+    data: TrainingData,
+    pca: ScaledPCA,
+    members: Sequence[int],
+) -> tuple[PairedFusion, Near]:
+    """A rule that is fitted on the others, and what it finds near to this sequence's scans."""
+    vectors = [s.vectors[:, members] for s in others if s.vectors is not None]
+    rule = PairedFusion(_BANK_SETTINGS[0]).fit(
+        replace(
+            data,
+            fixed=members[0],
+            candidates=list(members),
+            vectors=np.concatenate(vectors),
+        )
+    )
+    assert sequence.drive is not None
+    first, _ = sequence.drive.periods()
+    return rule, rule.near(pca.transform(sequence.drive.descriptors[first]))
+
+
+def _bank_errors(
+    sequence: LabelledSequence, members: Sequence[int], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Capped errors of a bank on the frames that have a sub-trajectory."""
+    assert sequence.drive is not None
+    errors = sequence.drive.errors(members, weights)
+    return errors[~np.isnan(errors)]
+
+
+def _driven(
+    sequence: LabelledSequence,
+    others: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    data: TrainingData,
+    pca: ScaledPCA,
+    size: int,
+) -> tuple[NDArray[np.float64], float]:
+    """A bank on the sequence left out: its errors, and the weight that the fixed set had not."""
+    members = choose_bank(others, data.fixed, size)
+    settings = tune_bank(others, sets, members)
+    if settings.hedge == 1.0:
+        return cap(sequence.errors[:, data.fixed]), 0.0
+    rule, near = _fusion(sequence, others, data, pca, members)
+    rule.settings = settings
+    weights, _ = rule.weigh(near)
+    return _bank_errors(sequence, members, weights), float(1.0 - weights[:, 0].mean())

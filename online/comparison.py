@@ -150,7 +150,11 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
         box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
         return box, adaptive(model, mode, study.price())
     members, sets = bank_sets(study, model)
-    return Bank(study.odometry, sets, study.warm_up), adaptive(model, mode, members=members)
+    if mode == "paired" and model.fusion.hedge == 1.0:
+        # The fixed set has all the weight: others would only cost.
+        members, sets = members[:1], sets[:1]
+    bank = Bank(study.odometry, sets, study.warm_up, study.config.lost_track)
+    return bank, adaptive(model, mode, members=members)
 
 
 def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[ParameterSet]]:
@@ -163,11 +167,14 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
     """
     given = study.config.online.switching.sets
     if given is None:
-        members = model.portfolio(study.config.online.switching.size)
+        size = study.config.online.switching.size
+        if size > len(model.bank) < len(model.sets):
+            raise _another_bank("size")
+        members = model.bank[:size]
         return members, [model.sets[i] for i in members]
     members = []
     for i, named in enumerate(given):
-        number = _number(model, named if isinstance(named, int) else study.space.baseline | named)
+        number = model.number(named, study.space)
         if number is None:
             raise ComparisonError(
                 f"online.switching.sets.{i}: is none of the {len(model.sets)} parameter sets that "
@@ -182,13 +189,16 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
                 f"be compared with the others; name another (trials.csv tells which were)"
             )
         members.append(number)
+    if set(members) - set(model.bank):
+        raise _another_bank("sets")
     return members, [model.sets[i] for i in members]
 
 
-def _number(model: ErrorModel, named: int | ParameterSet) -> int | None:
-    """Number in the model of a trial or a set, if it knows it."""
-    known: list[Any] = model.trials if isinstance(named, int) else model.sets
-    return known.index(named) if named in known else None
+def _another_bank(key: str) -> ComparisonError:
+    return ComparisonError(
+        f"online.switching.{key}: the model was fitted for another bank; run `adaptune offline` "
+        f"again, which fits it to the trials there are"
+    )
 
 
 def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:

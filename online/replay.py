@@ -17,8 +17,8 @@ from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
-from adaptune.model import RULES, ErrorModel, Selection
-from adaptune.odometry import Box, HealthCheck
+from adaptune.model import RULES, ErrorModel, PairedFusion, Selection
+from adaptune.odometry import Bank, Box, HealthCheck
 from adaptune.odometry.health import Guard
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
@@ -99,12 +99,17 @@ def adaptive(
     price
         What a switch must promise, as a share of the fixed set's error.
     members
-        The sets to choose among, the first of which counts as the fixed one; all, and the model's
-        fixed one, when left out.
+        The sets in a bank, the first of which counts as the fixed one: the paired rule weighs
+        them, others choose among them. All sets, and the model's fixed one, when left out.
     """
     pca = model.pca()
     data = model.training_data(pca, members)
-    fitted = RULES[rule](model.paired, price).fit(data)
+    fused = members is not None and rule == "paired"
+    fitted = (
+        PairedFusion(model.fusion).fit(data)
+        if fused
+        else RULES[rule](model.paired, price).fit(data)
+    )
     describe = Describer(model.blocks)
     if describe.blocks != model.blocks:
         raise DescriptorError(
@@ -122,7 +127,8 @@ def adaptive(
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
         if fitted.gated and foreign(scan):
             fixed = selection.predicted_fixed
-            selection = Selection(data.fixed, fixed, fixed, 0.0)
+            weights = tuple(float(i == data.fixed) for i in members or ()) if fused else None
+            selection = Selection(data.fixed, fixed, fixed, 0.0, weights=weights)
         current = selection.set_index
         return selection
 
@@ -217,7 +223,10 @@ def replay(
             selection = policy(scan)
             parameters = sets[selection.set_index]
             seconds = time.perf_counter() - t
-            odometry.configure(parameters)
+            if isinstance(odometry, Bank) and selection.weights is not None:
+                odometry.weigh(selection.weights)
+            else:
+                odometry.configure(parameters)
             choices.append(Choice(scan.stamp, selection, parameters, seconds))
             n_periods = int((scan.stamp - first) // (period * 1e9)) + 1
         t_prepare = time.perf_counter()
@@ -278,11 +287,13 @@ def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None
     ):
         writer = csv.writer(file)
         columns = "stamp_ns set predicted_error_percent predicted_fixed_percent"
-        writer.writerow([*columns.split(), "familiarity", "sequences", "ms", *names])
+        writer.writerow([*columns.split(), "familiarity", "sequences", "weights", "ms", *names])
         for choice in result.choices:
-            index, *numbers = choice.selection
+            index, *numbers, weights = choice.selection
             writer.writerow(
-                [choice.stamp, index, *(f"{x:.4f}" for x in numbers), f"{1e3 * choice.seconds:.3f}"]
+                [choice.stamp, index, *(f"{x:.4f}" for x in numbers)]
+                + [" ".join(f"{weight:.3f}" for weight in weights or ())]
+                + [f"{1e3 * choice.seconds:.3f}"]
                 + [choice.parameters[name] for name in names]
             )
     with (

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from adaptune.model.base import Rule, Selection, TrainingData
 from adaptune.model.file import ErrorModel, ModelError
+from adaptune.model.fusion import PairedFusion
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 from adaptune.model.paired import PairedExpectedRatio, Settings
 
@@ -22,6 +23,7 @@ __all__ = [
     "ModelError",
     "NearestNeighbours",
     "PairedExpectedRatio",
+    "PairedFusion",
     "ProductKNeighborsRegressor",
     "Rule",
     "Selection",

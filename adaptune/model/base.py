@@ -32,6 +32,9 @@ class TrainingData:
         The one set that is best over all sequences.
     candidates : list of int, optional
         The sets to choose among, the fixed one among them; all when left out.
+    vectors : ndarray of shape (n_frames, n_candidates, 3), optional
+        Of the candidates, the errors as vectors in the frame of the sub-trajectory's start; not
+        finite where the track was lost. See `adaptune.metrics.sub_trajectory_vectors`.
     """
 
     features: NDArray[np.float64]
@@ -40,6 +43,7 @@ class TrainingData:
     sets: NDArray[np.float64]
     fixed: int
     candidates: list[int] | None = None
+    vectors: NDArray[np.float32] | None = None
 
 
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -132,6 +136,8 @@ class Selection(NamedTuple):
     sequences : float
         How many training sequences this rests on: one over the sum of their squared weights; NaN
         where they have none.
+    weights : tuple of float, optional
+        Of the members of a bank, which are all driven; the set chosen is then the heaviest.
     """
 
     set_index: int
@@ -139,6 +145,7 @@ class Selection(NamedTuple):
     predicted_fixed: float
     familiarity: float = math.nan
     sequences: float = math.nan
+    weights: tuple[float, ...] | None = None
 
 
 class Rule(ABC):

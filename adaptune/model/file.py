@@ -18,12 +18,12 @@ from adaptune.archive import compact
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
-from adaptune.model.base import TrainingData, complementary
+from adaptune.model.base import TrainingData
 from adaptune.model.paired import Settings
 from adaptune.sequence.views import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
-FORMAT = 2
+FORMAT = 3
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 SAME_SENSOR = 3.0
@@ -34,6 +34,7 @@ _TYPES = {
     "descriptors": ("<u2", "<f4"),
     "sequence": ("<u4",),
     "errors": ("<f4",),
+    "vectors": ("<f4",),
 }
 """The arrays in a file, and what numbers they may be of."""
 
@@ -60,6 +61,8 @@ class _Header(BaseModel):
     window: PositiveInt
     elevations: list[float] = []
     paired: Settings = Settings()
+    bank: list[int] = []
+    fusion: Settings = Settings()
     provenance: dict[str, Any]
     validation: dict[str, Any]
 
@@ -94,11 +97,16 @@ class ErrorModel:
         float32 percent, infinite where the track was lost, NaN where the set was never run.
     provenance : dict
         Where the model comes from, for people.
+    bank : list of int, optional
+        The sets whose errors cancel each other best, the fixed one first; see
+        `adaptune.model.fusion.bank`; empty if there is no bank.
+    vectors : ndarray of shape (n_frames, len(bank), 3), optional
+        float32, their errors as vectors; see `TrainingData`.
     elevations : list of float, optional
         For each training sequence, degrees at which its scans' lowest points lie, see
         `adaptune.descriptor.lowest_elevation`; empty if that is not known.
-    paired : Settings
-        Of the paired rule, chosen on the training sequences.
+    paired, fusion : Settings
+        Of the paired rule, and of the bank's weights, chosen on the training sequences.
     validation : dict
         By selection rule what `adaptune validate` found, for people; empty before.
     """
@@ -115,8 +123,11 @@ class ErrorModel:
     sequence: NDArray[np.intp]
     errors: NDArray[np.float32]
     provenance: dict[str, Any]
+    bank: list[int] = field(default_factory=list)
+    vectors: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
     elevations: list[float] = field(default_factory=list)
     paired: Settings = field(default_factory=Settings)
+    fusion: Settings = field(default_factory=Settings)
     validation: dict[str, Any] = field(default_factory=dict)
 
     def pca(self) -> ScaledPCA:
@@ -131,21 +142,20 @@ class ErrorModel:
         pca
             Of `pca`.
         members
-            Sets to choose among, the first of which counts as the fixed one; all, and the fixed
-            one, when left out.
+            Of `bank`, those that are driven, the first of which counts as the fixed one; all
+            sets, and the fixed one, when left out.
         """
-        return TrainingData(
+        data = TrainingData(
             pca.transform(self.descriptors),
             places(self.sequences)[self.sequence],
             self.errors,
             self.space.to_unit(self.sets),
-            members[0] if members else self.fixed,
-            members,
+            self.fixed,
         )
-
-    def portfolio(self, size: int) -> list[int]:
-        """Choose complementary sets, the fixed one first; see `complementary`."""
-        return complementary(self.errors, places(self.sequences)[self.sequence], self.fixed, size)
+        if members is None:
+            return data
+        vectors = self.vectors[:, [self.bank.index(i) for i in members]]
+        return replace(data, fixed=members[0], candidates=members, vectors=vectors)
 
     def thinned(self, max_frames: int | None) -> Self:
         """Keep fewer frames, so that a selection costs less.
@@ -176,6 +186,8 @@ class ErrorModel:
             descriptors=self.descriptors[frames],
             sequence=self.sequence[frames],
             errors=self.errors[frames],
+            vectors=self.vectors[frames] if self.bank else self.vectors,
+            fusion=self.fusion.model_copy(update={"n_frames": n_near}),
         )
 
     @property
@@ -185,6 +197,16 @@ class ErrorModel:
         if isinstance(told, list) and len(told) == len(self.sets):
             return told
         return list(range(len(self.sets)))
+
+    def number(self, named: int | ParameterSet, space: ParameterSpace) -> int | None:
+        """Number of a trial's set, or of a set that is named by what differs from the baseline.
+
+        None if the model does not know it.
+        """
+        if isinstance(named, int):
+            return self.trials.index(named) if named in self.trials else None
+        whole = space.baseline | named
+        return self.sets.index(whole) if whole in self.sets else None
 
     def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
         """Refuse a model that was not made for this odometry and these parameters.
@@ -229,6 +251,7 @@ class ErrorModel:
             "descriptors": np.ascontiguousarray(compact(self.descriptors)),
             "sequence": self.sequence.astype(np.uint32),
             "errors": np.ascontiguousarray(self.errors, np.float32),
+            "vectors": np.ascontiguousarray(self.vectors, np.float32),
         }
 
     def _header(self) -> dict[str, Any]:
@@ -243,6 +266,8 @@ class ErrorModel:
             "window": self.window,
             "elevations": self.elevations,
             "paired": self.paired.model_dump(),
+            "bank": self.bank,
+            "fusion": self.fusion.model_dump(),
         }
 
     @property
@@ -294,9 +319,12 @@ class ErrorModel:
                     descriptors=_read(file, size, "descriptors").astype(np.float32),
                     sequence=_read(file, size, "sequence").astype(np.intp),
                     errors=_read(file, size, "errors"),
+                    bank=header.bank,
+                    vectors=_read(file, size, "vectors"),
                     provenance=header.provenance,
                     elevations=header.elevations,
                     paired=header.paired,
+                    fusion=header.fusion,
                     validation=header.validation,
                 )
                 model.check()
@@ -324,6 +352,12 @@ class ErrorModel:
             raise ValueError("the errors are not of as many frames as the sequence numbers")
         if not n_frames or len(self.sets) != n_sets or not 0 <= self.fixed < n_sets:
             raise ValueError("errors and parameter sets do not go together")
+        if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):
+            raise ValueError(
+                "the error vectors are not of as many frames as the errors, and the bank"
+            )
+        if set(self.bank) - set(range(n_sets)) or len(set(self.bank)) != len(self.bank):
+            raise ValueError("the bank holds sets that there are not, or one twice")
         if not 0 <= self.sequence.min() <= self.sequence.max() < len(self.sequences):
             raise ValueError("a frame is of no sequence")
         # Not a number is neither; both are true of most files, and make no copy of the errors.

@@ -36,6 +36,8 @@ class Settings(BaseModel):
         Logarithm of the ratio that a set must stay below to be taken.
     caution : float
         How many standard errors, by how much the sequences differ, are added to a ratio first.
+    hedge : float
+        In a bank, share of the weight that the fixed set keeps; with 1 it always has all.
     """
 
     # A file of a later version may say more.
@@ -47,6 +49,7 @@ class Settings(BaseModel):
     n_frames: PositiveInt = 300
     threshold: Annotated[float, Field(le=0.0, allow_inf_nan=False)] = -0.1
     caution: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.5
+    hedge: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
 
 
 class Near(NamedTuple):
@@ -120,9 +123,8 @@ class PairedExpectedRatio(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        self.fixed_errors_ = cap(data.errors[:, data.fixed])
         self.candidates_ = self._candidates()
-        self.errors_ = self._mixed()
+        self.fixed_errors_, self.errors_ = self._evidence()
         self.sequences_ = [np.flatnonzero(data.sequence == s) for s in np.unique(data.sequence)]
         self.features_ = [data.features[members] for members in self.sequences_]
         self.novelty_ = self._calibrate()
@@ -140,19 +142,22 @@ class PairedExpectedRatio(Rule):
             return np.union1d(np.flatnonzero(everywhere), data.fixed)
         return np.array(complementary(data.errors, data.sequence, data.fixed, n_sets))
 
-    def _mixed(self) -> NDArray[np.float32]:
-        """Error of every candidate on every frame, mixed with its neighbours'.
+    def _evidence(self) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Error of the fixed set, and of every candidate, on every frame.
 
-        Before ratios are taken, for a ratio of means is linear in its numerator.
+        The candidates' are mixed with their neighbours' before ratios are taken, for a ratio of
+        means is linear in its numerator.
         """
         data = self.data_
+        fixed_errors = cap(data.errors[:, data.fixed])
         squared = ((data.sets[:, None] - data.sets[self.candidates_]) ** 2).sum(axis=2)
         kernel = np.exp(-0.5 * squared / self.settings.width**2)
         kernel /= kernel.sum(axis=0)
         errors = np.minimum(data.errors, np.float32(FAILURE))
         # Where a set was not run, the fixed one's error makes it neither better nor worse.
-        fixed = self.fixed_errors_[:, None].astype(np.float32)
-        return np.asarray(np.where(np.isnan(errors), fixed, errors) @ kernel.astype(np.float32))
+        fixed = fixed_errors[:, None].astype(np.float32)
+        mixed = np.where(np.isnan(errors), fixed, errors) @ kernel.astype(np.float32)
+        return fixed_errors, np.asarray(mixed)
 
     def near(self, features: NDArray[np.float64]) -> Near:
         """What the training frames nearest to scans say.
@@ -164,7 +169,7 @@ class PairedExpectedRatio(Rule):
         """
         shape = len(features), len(self.sequences_)
         squared, fixed = np.empty(shape), np.empty(shape)
-        means = np.empty((*shape, len(self.candidates_)))
+        means = np.empty((*shape, *self.errors_.shape[1:]))
         for s, (members, of_sequence) in enumerate(
             zip(self.sequences_, self.features_, strict=True)
         ):
@@ -177,7 +182,7 @@ class PairedExpectedRatio(Rule):
     def ratios(self, near: Near) -> Ratios:
         """Ratio of every candidate's error to the fixed set's."""
         ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
-        weights = self._weights(near.squared)
+        weights = self.weights(near.squared)
         expected = np.einsum("qs,qsc->qc", weights, ratio)
         variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
         # One over the number of sequences that this rests on. The fewer they are, the less do they
@@ -188,7 +193,8 @@ class PairedExpectedRatio(Rule):
         expected = 1.0 + trust * (expected - 1.0)
         return Ratios(expected, expected + trust * self.settings.caution * error, weights)
 
-    def _weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+    def weights(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of the training sequences, by the distances in `Near`."""
         # With the median at zero every sequence has the very same place in it.
         spread = np.median(squared, axis=1, keepdims=True)
         spread[spread == 0.0] = 1.0

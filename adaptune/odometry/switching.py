@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, invert, mean_motion, rectify
 from adaptune.odometry.base import Box, OdometryError, Registration, WarmUp
 from adaptune.odometry.isolation import Isolated
 from adaptune.sequence import Imu, Scan
@@ -21,8 +21,8 @@ from adaptune.space import ParameterSet
 Make = Callable[[ParameterSet], Box]
 """Makes a new instance with these parameters."""
 
-AGREEMENT = 0.1
-"""Metres between the motions of two instances over one scan that confirm each other."""
+TRUST = 0.3
+"""By how much more than its weight the first instance of a bank is heard where they disagree."""
 
 
 class Stamped(NamedTuple):
@@ -235,8 +235,8 @@ class HandOver:
 class Bank:
     """Several instances side by side, each with its own parameters and each on every scan.
 
-    The motion of the chosen one is taken if that of another one confirms it; else the medoid of
-    all motions. An instance that disagrees with a confirmed motion has lost track, and is started
+    The mean of their motions is taken, each by its weight. Those that depart from the others by
+    more than a lost track does are left out of it, and where two or more agree the rest are started
     anew on the last seconds of scans.
 
     Parameters
@@ -244,9 +244,12 @@ class Bank:
     make
         Makes instances.
     sets
-        Their parameters; the first is chosen to begin with.
+        Their parameters. The first has all the weight to begin with, and a vote more than its
+        weight: it is the one to trust where they disagree.
     warm_up
         Which scans an instance sees when it is started anew.
+    lost_track
+        Metres a second by which motions may differ and agree.
 
     Attributes
     ----------
@@ -254,13 +257,19 @@ class Bank:
         How often an instance was started anew.
     """
 
-    def __init__(self, make: Make, sets: Sequence[ParameterSet], warm_up: WarmUp):
+    def __init__(
+        self,
+        make: Make,
+        sets: Sequence[ParameterSet],
+        warm_up: WarmUp,
+        lost_track: float = 3.0,
+    ):
         self.sets = [dict(parameters) for parameters in sets]
         self.restarts = 0
         self._boxes = [make(parameters) for parameters in self.sets]
-        self._T_own_sensor = [np.eye(4)] * len(self.sets)
-        self._T_odom_own = np.eye(4)
-        self._chosen = self._taken = 0
+        self._T_own_sensor = np.tile(np.eye(4), (len(self.sets), 1, 1))
+        self._weights = np.eye(len(self.sets))[0]
+        self._lost_track = lost_track
         self._recent = _Recent(warm_up, self._boxes[0])
 
     def prepare(self, scan: Scan) -> Stamped:
@@ -268,7 +277,7 @@ class Bank:
         return Stamped.by(self._boxes[0], scan)
 
     def configure(self, parameters: ParameterSet) -> None:
-        """Choose the instance that has these parameters.
+        """Give all the weight to the instance that has these parameters.
 
         Raises
         ------
@@ -277,7 +286,11 @@ class Bank:
         """
         if parameters not in self.sets:
             raise OdometryError(f"no instance of the bank has the parameters {parameters}")
-        self._chosen = self.sets.index(parameters)
+        self._weights = np.eye(len(self.sets))[self.sets.index(parameters)]
+
+    def weigh(self, weights: Sequence[float]) -> None:
+        """Give each instance a weight, of shape (n_instances,)."""
+        self._weights = np.array(weights, np.float64)
 
     def start(
         self, prepared: Stamped, T_odom_sensor: Poses, T_previous_current: Poses | None = None
@@ -285,34 +298,32 @@ class Bank:
         """See `Odometry.start`."""
         for box in self._boxes:
             box.start(prepared.prepared, T_odom_sensor, T_previous_current)
-        self._T_own_sensor = [T_odom_sensor] * len(self._boxes)
-        self._T_odom_own, self._taken = np.eye(4), self._chosen
+        self._T_own_sensor[:] = T_odom_sensor
         self._recent.begin(prepared, T_odom_sensor, T_previous_current)
 
     def register(self, prepared: Stamped) -> Registration:
         """See `Odometry.register`."""
-        T_own_before = self._T_own_sensor
         registrations = _register_all(self._boxes, prepared.prepared)
-        self._T_own_sensor = [r.T_odom_sensor for r in registrations]
-        moved = [
-            (invert(before) @ now)[:3, 3]
-            for before, now in zip(T_own_before, self._T_own_sensor, strict=True)
-        ]
-        apart = _distances(np.array(moved))
-        taken = _pick(apart, self._chosen)
-        if taken != self._taken:
-            self._T_odom_own = _between(self._recent.pose, T_own_before[taken])
-            self._taken = taken
-        T_odom_sensor = self._T_odom_own @ self._T_own_sensor[taken]
-        if np.isfinite(T_odom_sensor).all():
-            self._recent.add(prepared, T_odom_sensor)
-            self._restart(_lost(apart, taken))
-        return Registration(T_odom_sensor, registrations[taken].registered)
-
-    def _restart(self, lost: Iterable[int]) -> None:
-        for i in lost:
-            self._T_own_sensor[i] = self._recent.warm_up(self._boxes[i])
-            self.restarts += 1
+        T_own_before = self._T_own_sensor
+        self._T_own_sensor = np.array([r.T_odom_sensor for r in registrations])
+        T_previous_current = invert(T_own_before) @ self._T_own_sensor
+        seconds = (prepared.stamp - self._recent.last.scan.stamp) * 1e-9
+        agreeing = agreement(T_previous_current, self._weights, self._lost_track * seconds)
+        if not agreeing.any():
+            return Registration(np.full((4, 4), np.nan), registered=False)
+        shares = share(self._weights, agreeing)[agreeing]
+        T_moved = mean_motion(T_previous_current[agreeing], shares)
+        T_odom_sensor = rectify(self._recent.pose @ T_moved)
+        self._recent.add(prepared, T_odom_sensor)
+        for i in np.flatnonzero(~agreeing):
+            # One that stands alone may be the one that is not lost.
+            if agreeing.sum() > 1 or not np.isfinite(T_previous_current[i]).all():
+                self._T_own_sensor[i] = self._recent.warm_up(self._boxes[i])
+                self.restarts += 1
+        registered = any(
+            r.registered for r, its in zip(registrations, agreeing, strict=True) if its
+        )
+        return Registration(T_odom_sensor, registered)
 
 
 def _register_all(boxes: Sequence[Box], prepared: Any) -> list[Registration]:
@@ -323,27 +334,44 @@ def _register_all(boxes: Sequence[Box], prepared: Any) -> list[Registration]:
     return [box.result() if isinstance(box, Isolated) else box.register(prepared) for box in boxes]
 
 
-def _distances(moved: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Metres between translations of shape (n, 3), infinite where one is not finite."""
-    apart = np.linalg.norm(moved[:, None] - moved, axis=-1)
-    return np.where(np.isfinite(apart), apart, np.inf)
+def agreement(
+    T_previous_current: Poses,
+    weights: NDArray[np.float64],
+    bound: float | NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Which motions over a scan to believe: those near the one that most others are near to.
+
+    Parameters
+    ----------
+    T_previous_current
+        Of shape (..., n_instances, 4, 4); NaN where there is none.
+    weights
+        Of shape (..., n_instances). The first instance's counts `TRUST` more.
+    bound
+        Metres by which two motions may differ and agree, of shape (..., 1, 1).
+
+    Returns
+    -------
+    ndarray of shape (..., n_instances)
+        Nowhere true where there is no motion at all.
+    """
+    moved = T_previous_current[..., :3, 3]
+    known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
+    with np.errstate(invalid="ignore"):
+        apart = np.linalg.norm(moved[..., :, None, :] - moved[..., None, :, :], axis=-1)
+    near = np.asarray((apart <= bound) & known[..., None, :] & known[..., :, None])
+    # Of those that have no weight, two that agree are heard more than one.
+    votes = weights + 1e-9
+    votes[..., 0] += TRUST
+    heard = (near * votes[..., None, :]).sum(axis=-1)
+    return np.asarray(
+        np.take_along_axis(near, heard.argmax(axis=-1)[..., None, None], -2)[..., 0, :]
+    )
 
 
-def _pick(apart: NDArray[np.float64], chosen: int) -> int:
-    """Number of the instance whose motion is taken."""
-    others = np.delete(apart[chosen], chosen)
-    if (others <= AGREEMENT).any():
-        return chosen
-    # Where one has no motion at all, those that have one are still compared with each other.
-    sums = np.minimum(apart, 1e6).sum(axis=1)
-    return chosen if sums[chosen] <= sums.min() else int(sums.argmin())
-
-
-def _lost(apart: NDArray[np.float64], taken: int) -> list[int]:
-    """Numbers of the instances that a confirmed motion shows to be lost."""
-    confirmed = (np.delete(apart[taken], taken) <= AGREEMENT).any()
-    return [
-        i
-        for i in range(len(apart))
-        if i != taken and (np.isinf(apart[i, i]) or (confirmed and apart[taken, i] > AGREEMENT))
-    ]
+def share(
+    weights: NDArray[np.float64], agreeing: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Weights of those that agree; where they have none, each as much, of shape (..., n)."""
+    shares = np.where(agreeing, weights, 0.0)
+    return np.where(shares.any(axis=-1, keepdims=True), shares, agreeing.astype(np.float64))

@@ -20,10 +20,10 @@ def test_switching_that_the_odometry_has_not(study_file):
 
 
 def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
-    assert load_study(study_file).mechanism == "live"
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
-    for cores, mechanism in ((1, "hand_over"), (2, "bank")):
+    for cores, own, mechanism in ((1, "live", "hand_over"), (2, "bank", "bank")):
         monkeypatch.setattr("adaptune.study.available", lambda cores=cores: cores)
+        assert load_study(study_file).mechanism == own
         assert load_study(study_file, stiff).mechanism == mechanism
 
 
@@ -31,11 +31,11 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
     monkeypatch.setattr("adaptune.study.available", lambda: 4)
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for given, mechanism in (
-        ("online.switching.memory=8", "bank"),
-        ("online.switching.memory=7", "hand_over"),
+        ("online.switching.memory=16", "bank"),
+        ("online.switching.memory=15", "hand_over"),
         ("online.switching.cores=1", "hand_over"),
-        ("online.switching.size=4", "bank"),
-        ("isolation.memory=9", "hand_over"),
+        ("online.switching.size=5", "hand_over"),
+        ("isolation.memory=5", "hand_over"),
     ):
         assert load_study(study_file, [*stiff, given]).mechanism == mechanism
 
@@ -126,7 +126,7 @@ def test_reads_a_study(study_file, tmp_path):
         ("online.rules=[best]", ["online.rules.0", "best"]),
         ("online.switching.mechanism=banks", ["online.switching.mechanism", "banks"]),
         ("online.switching.warm_up=0", ["online.switching.warm_up", "not 0"]),
-        ("online.switching.size=5", ["online.switching.size", "not 5"]),
+        ("online.switching.size=7", ["online.switching.size", "not 7"]),
         ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
         ("online.switching.beside=1", ["online.switching.beside", "never catch up"]),
         ("online.switching.sets=[0]", ["online.switching.sets"]),

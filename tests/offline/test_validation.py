@@ -238,9 +238,9 @@ def test_validates_a_study(study_file, tmp_path):
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
     # Four sub-trajectories tell nothing; a dozen would.
-    assert rows[0]["paired, 95 %"] is None
-    summary = validation.summary("paired")
-    assert rows[2]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert rows[0]["bank, 95 %"] is None
+    summary = validation.summary("bank")
+    assert rows[2]["bank, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert (study.folder / "validation.csv").exists()
     for other, text in (

@@ -39,6 +39,8 @@ def random_model(seed=0, n_frames=50, n_sets=6):
         descriptors=rng.integers(0, 500, (n_frames, 90)).astype(np.float32),
         sequence=rng.integers(0, 2, n_frames),
         errors=errors,
+        bank=[2, 5],
+        vectors=rng.normal(0.0, 1.0, (n_frames, 2, 3)).astype(np.float32),
         provenance={"trials": n_sets, "note": None},
         elevations=[-30.7, -15.0],
     )
@@ -56,11 +58,11 @@ def test_views_are_of_one_place():
     data = model.training_data(model.pca())
     assert not data.sequence.any()
     assert (data.fixed, data.candidates) == (2, None)
-    data = model.training_data(model.pca(), [4, 1])
-    assert (data.fixed, data.candidates) == (4, [4, 1])
+    data = model.training_data(model.pca(), [5, 2])
+    assert (data.fixed, data.candidates) == (5, [5, 2])
+    np.testing.assert_array_equal(data.vectors, model.vectors[:, ::-1])
     apart = random_model()
     assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
-    assert apart.portfolio(3)[0] == 2
 
 
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 70))
@@ -264,7 +266,7 @@ def test_an_older_format_is_refused_by_name(tmp_path):
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
-    rewrite(path, adaptune="7.8.9", format=3)
+    rewrite(path, adaptune="7.8.9", format=4)
     message = refused(path)
     assert "7.8.9" in message
     assert "newer" in message

@@ -1,0 +1,125 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from adaptune.metrics import FAILURE
+from adaptune.model import PairedFusion, Settings, TrainingData
+from adaptune.model.fusion import LIMIT, RIDGE, bank, least, limited
+
+
+def places(rng, n_places=6, n=40, n_sets=4):
+    """Sets 1 and 2 err in opposite directions, set 3 loses track; places look alike."""
+    errors = rng.normal(0.0, 1.0, (n_places * n, n_sets, 3)).astype(np.float32)
+    common = rng.normal(0.0, 1.0, (n_places * n, 3))
+    errors[:, 1] = common
+    errors[:, 2] = -common
+    errors[:, 3] = np.inf
+    return TrainingData(
+        rng.normal(size=(n_places * n, 2)),
+        np.repeat(np.arange(n_places), n),
+        np.linalg.norm(errors, axis=-1),
+        np.linspace(0.0, 1.0, n_sets)[:, None],
+        0,
+        list(range(n_sets)),
+        errors,
+    )
+
+
+def test_errors_that_cancel_get_the_weight():
+    data = places(np.random.default_rng(0))
+    rule = PairedFusion().fit(data)
+    selection = rule.select(data.features[5])
+    np.testing.assert_allclose(selection.weights, [0.0, 0.5, 0.5, 0.0], atol=0.1)
+    assert selection.set_index in (1, 2)
+    assert selection.predicted_error < 0.3 * selection.predicted_fixed
+    alone = rule.predict(data.features[5])
+    np.testing.assert_allclose(alone[:3], np.sqrt(3.0), rtol=0.1)
+    assert alone[3] > 5.0
+
+
+def test_weights_are_of_the_places_that_are_near():
+    """In one kind of place set 1 is right, in the other set 2."""
+    rng = np.random.default_rng(1)
+    data = places(rng)
+    kind = data.sequence % 2
+    features = data.features + 20.0 * kind[:, None]
+    vectors = data.vectors.copy()
+    vectors[kind == 0, 1] *= 0.05
+    vectors[kind == 1, 2] *= 0.05
+    rule = PairedFusion(Settings(sharpness=24.0)).fit(
+        replace(data, features=features, vectors=vectors)
+    )
+    for k, best in ((0, 1), (1, 2)):
+        weights = rule.select(np.array([20.0 * k, 20.0 * k])).weights
+        assert weights[best] > 0.85
+
+
+@pytest.mark.parametrize(("hedge", "kept"), [(0.5, 0.5), (1.0, 1.0)])
+def test_a_hedge_is_kept_with_the_fixed_set(hedge, kept):
+    data = places(np.random.default_rng(2))
+    weights = PairedFusion(Settings(hedge=hedge)).fit(data).select(data.features[0]).weights
+    assert sum(weights) == pytest.approx(1.0)
+    assert weights[0] == pytest.approx(kept, abs=0.05)
+
+
+def test_in_a_place_unlike_all_others_the_fixed_set_is_kept():
+    data = places(np.random.default_rng(3))
+    selection = PairedFusion().fit(data).select(np.array([500.0, 0.0]))
+    assert selection.familiarity == 0.0
+    assert selection.weights == (1.0, 0.0, 0.0, 0.0)
+    assert selection.predicted_error == pytest.approx(selection.predicted_fixed)
+
+
+def test_a_bank_needs_members():
+    data = places(np.random.default_rng(4))
+    for lacking in ({"candidates": None}, {"vectors": None}, {"candidates": [1, 0, 2, 3]}):
+        with pytest.raises(ValueError, match="needs members, the fixed set first"):
+            PairedFusion().fit(replace(data, **lacking))
+
+
+@given(st.integers(1, 5), st.integers(0, 2**32 - 1))
+def test_the_least_mean_square_of_all_weights(n, seed):
+    errors = np.random.default_rng(seed).normal(size=(n, 7))
+    squares = errors @ errors.T
+    weights = least(squares)
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights.min() >= 0.0
+    ridged = squares + np.eye(n) * RIDGE * squares[0, 0]
+    found = minimize(
+        lambda w: w @ ridged @ w,
+        np.full(n, 1.0 / n),
+        bounds=[(0.0, 1.0)] * n,
+        constraints={"type": "eq", "fun": lambda w: w.sum() - 1.0},
+    )
+    assert weights @ ridged @ weights <= found.fun * (1.0 + 1e-6)
+
+
+def test_no_error_counts_more_than_its_limit():
+    vectors = np.zeros((10, 2, 3), np.float32)
+    vectors[:, 0, 0] = 1.0
+    vectors[:, 1, 1] = [0.5, 5.0, 7.0, 29.0, 31.0, np.inf, np.nan, 0.0, 6.0, 1.0]
+    kept, lost = limited(vectors, 0)
+    limit = LIMIT * np.sqrt(1.0 + 0.02**2)
+    np.testing.assert_allclose(kept[:, 0], vectors[:, 0])
+    expected = [0.5, 5.0, limit, limit, 0.0, 0.0, 0.0, 0.0, 6.0, 1.0]
+    np.testing.assert_allclose(kept[:, 1, 1], expected, rtol=1e-6)
+    np.testing.assert_allclose(lost[:, 1], [0, 0, 0, 0, limit, limit, limit, 0, 0, 0], rtol=1e-6)
+    # A fixed set that fails itself allows others more.
+    vectors[:5, 0] = np.inf
+    _, lost = limited(vectors, 0)
+    assert lost[0, 0] == pytest.approx(LIMIT * np.sqrt((5 * FAILURE**2 + 5) / 10), rel=1e-5)
+
+
+def test_a_bank_is_of_sets_whose_errors_cancel():
+    data = places(np.random.default_rng(5))
+    vectors = [data.vectors[data.sequence == s] for s in range(6)]
+    errors = [data.errors[data.sequence == s] for s in range(6)]
+    assert sorted(bank(vectors, errors, 1, 2)) == [1, 2]
+    assert len(bank(vectors, errors, 1, 9)) == 4
+    # What was not run everywhere is no member.
+    errors[3][:, 2] = np.nan
+    assert sorted(bank(vectors, errors, 1, 4)) == [0, 1, 3]
