@@ -41,12 +41,15 @@ from offline.fusion import Drive, error_vectors, recorded_motions
 from offline.samplers import make_sampler
 from offline.trial import run_trials
 from offline.validation import (
+    BANK_SIZE,
     NO_WORSE,
     LabelledSequence,
     Maker,
     Validation,
+    choose_bank,
     learning_curve,
     leave_one_out,
+    training_data,
     tune,
 )
 
@@ -189,10 +192,30 @@ def labelled(paths: list[Path]) -> tuple[list[LabelledSequence], NDArray[np.floa
 
 def validate(paths: list[Path]) -> None:
     """Leave each sequence out in turn, and print what came of it."""
-    validation = leave_one_out(*labelled(paths))
+    sequences, sets = labelled(paths)
+    left_out = leave_one_out(sequences, sets).left_out
+    for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
+        of.errors["bank, even weights"] = evenly(sequence, sequences[:i] + sequences[i + 1 :], sets)
+    validation = Validation(left_out)
     print_summary(validation, validation.ratios)
+    for mode in validation.modes:
+        each = zip(left_out, validation.ratios[mode], strict=True)
+        print(f"{mode}: " + ", ".join(f"{of.name} {ratio:.2f}" for of, ratio in each))
     known = " ".join(f"{ratio:.3f}" for ratio in validation.portfolio())
     print(f"if the best of 1, 2, ... complementary sets were known: {known}", flush=True)
+
+
+def evenly(
+    sequence: LabelledSequence, others: list[LabelledSequence], sets: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Errors of a bank whose members have the same weight anywhere."""
+    data, _ = training_data(others, sets)
+    members = choose_bank(others, data.fixed, BANK_SIZE)
+    assert sequence.drive is not None
+    n_periods = len(sequence.drive.periods()[0])
+    weights = np.full((n_periods, len(members)), 1.0 / len(members))
+    errors = sequence.drive.errors(members, weights)
+    return errors[~np.isnan(errors)]
 
 
 def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
@@ -224,11 +247,15 @@ def by_descriptor(paths: list[Path], described: list[Path]) -> None:
                 known = ~np.isnan(found["errors"]).any(axis=1)
                 stamps = found["stamps"]
                 blocks = [its[name][np.arange(len(stamps)) // PERIOD] for name in names]
-            of_frames = averaged(np.hstack(blocks), stamps, WINDOW, 1.0)[known]
+            of_frames = averaged(np.hstack(blocks), stamps, WINDOW, 1.0)
             lengths = tuple(block.shape[1] for block in blocks)
-            sequences.append(replace(sequence, descriptors=of_frames, blocks=lengths))
+            assert sequence.drive is not None
+            drive = replace(sequence.drive, descriptors=of_frames)
+            of_known = {"descriptors": of_frames[known], "blocks": lengths}
+            sequences.append(replace(sequence, drive=drive, **of_known))
         print(f"by {' and '.join(names)}: ", end="")
-        print_summary(leave_one_out(sequences, sets), RULES)
+        validation = leave_one_out(sequences, sets)
+        print_summary(validation, validation.modes)
 
 
 Take = Callable[[TrainingData], TrainingData]
@@ -298,7 +325,7 @@ def less(paths: list[Path]) -> None:
         for share in (0.75, 0.5, 0.25):
             kept = partial(with_gaps, share=share)
             makers[f"{name}, {share:.0%} of the pairs"] = maker(name, kept)
-    print_summary(leave_one_out(*labelled(paths), makers), makers)
+    print_summary(leave_one_out(*labelled(paths), makers, size=0), makers)
 
 
 class Unafraid(PairedExpectedRatio):
@@ -341,6 +368,7 @@ def ablate(paths: list[Path]) -> None:
             "sharpness 12": maker(paired, n_sets=3, sharpness=12.0),
             "sharpness 48": maker(paired, n_sets=3, sharpness=48.0),
         },
+        size=0,
     )
     print_summary(validation, [mode for mode in validation.ratios if mode != "baseline"])
 

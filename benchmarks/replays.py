@@ -6,8 +6,7 @@ Rules are fitted on the 24 sequences of `benchmarks/gain.py`, and eight mixed co
 worlds are replayed with keyframe GICP (or NDT), each with the health check. Printed are the mean of
 min(RTE, 30 %) over 25 m, in brackets how often the odometry was started anew, and ratios to the
 fixed set's error. The rivals: the defaults; the set that is fixed by the geometric mean of the
-training sequences' errors; a bank that nobody asks for a set, which takes the fixed set's motion
-where another confirms it, and else the medoid of all.
+training sequences' errors; a bank whose members always have the same weight.
 """
 
 import argparse
@@ -25,14 +24,13 @@ from numpy.typing import NDArray
 from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
-from adaptune.model import RULES, Rule, Selection, TrainingData
-from adaptune.model.base import complementary
+from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
 from adaptune.sequence import Scan
 from adaptune.simulation import Course, simulate
 from adaptune.space import ParameterSet
-from offline.validation import training_data, tune
+from offline.validation import choose_bank, training_data, tune, tune_bank
 from online.replay import Policy, replay
 
 ORDERS = (
@@ -89,11 +87,19 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
         rule = RULES[name](settings, 0.0).fit(data)
         return lambda: study.odometry(sets[data.fixed]), asking(rule, pca)
 
-    def bank(size: int, asked: bool) -> Way:
-        members = complementary(data.errors, data.sequence, data.fixed, size)
-        rule = RULES["paired"](settings, 0.0).fit(replace(data, candidates=members))
-        its = [sets[i] for i in members]
-        return lambda: Bank(study.odometry, its, WarmUp()), asking(rule, pca) if asked else None
+    def bank(size: int, even: bool = False) -> Way:
+        members = choose_bank(sequences, data.fixed, size)
+        found = tune_bank(sequences, units, members)
+        print(f"bank of {size}: sets {members}, {found}", flush=True)
+        vectors = np.concatenate(
+            [s.vectors[:, members] for s in sequences if s.vectors is not None]
+        )
+        rule = PairedFusion(found).fit(replace(data, candidates=members, vectors=vectors))
+        weights = tuple(1.0 / size for _ in members)
+        policy = asking(rule, pca)
+        if even:
+            policy = lambda _: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
+        return lambda: Bank(study.odometry, [sets[i] for i in members], WarmUp()), policy
 
     return sets, {
         "baseline": alone(None),
@@ -101,11 +107,10 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
         "fixed, geometric": alone(geometric(data)),
         "paper": live("paper"),
         "paired": live("paired"),
-        "bank of 2": bank(2, True),
-        "bank of 3": bank(3, True),
-        "bank of 4": bank(4, True),
-        "medoid of 3": bank(3, False),
-        "medoid of 4": bank(4, False),
+        "bank of 2": bank(2),
+        "bank of 3": bank(3),
+        "bank of 4": bank(4),
+        "4, even weights": bank(4, even=True),
     }
 
 
