@@ -336,8 +336,9 @@ def validate(
     """Tell whether adapting would pay in places that were not trained on.
 
     Leaves out one training sequence after the other, fits on the rest, and looks up the errors of
-    the sets that would have been chosen, period by period: no odometry is run. Numbers are ratios
-    to the error of the fixed set, which is chosen without that sequence too.
+    the sets that would have been chosen, period by period: no odometry is run. A bank takes the
+    mean of the motions that were recorded of its members. Numbers are ratios to the error of the
+    fixed set, which is chosen without that sequence too.
     """
     from adaptune import report
     from offline.validation import validate as validate_study

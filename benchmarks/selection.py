@@ -27,8 +27,17 @@ from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
 from adaptune import cores
-from adaptune.model import ErrorModel, NearestNeighbours, PairedExpectedRatio, Rule, TrainingData
+from adaptune.model import (
+    ErrorModel,
+    NearestNeighbours,
+    PairedExpectedRatio,
+    PairedFusion,
+    Rule,
+    Settings,
+    TrainingData,
+)
 from adaptune.space import Float, ParameterSpace
+from offline.validation import BANK_FRAMES, BANK_SIZE
 
 LENGTHS = (4541, 1101, 4661, 801, 271, 2761)
 """Scans of KITTI's sequences 00 to 05."""
@@ -58,6 +67,7 @@ def kitti_size(seed: int, own_sets: bool) -> ErrorModel:
     errors[rng.random(errors.shape, np.float32) < 0.02] = np.inf
     if own_sets:
         errors[sequence[:, None] != np.arange(len(unit)) // PER_SEQUENCE] = np.nan
+    n_bank = 0 if own_sets else BANK_SIZE
     return ErrorModel(
         odometry={"name": "gicp", "settings": {}},
         space=SPACE,
@@ -71,6 +81,8 @@ def kitti_size(seed: int, own_sets: bool) -> ErrorModel:
         sequence=sequence,
         errors=errors,
         provenance={},
+        bank=list(range(n_bank)),
+        vectors=rng.normal(0.0, 0.3, (len(place) if n_bank else 0, n_bank, 3)).astype(np.float32),
     )
 
 
@@ -104,12 +116,12 @@ def measure_file(model: ErrorModel, folder: Path) -> ErrorModel:
 
 
 def measure_selection(
-    model: ErrorModel, name: str, rule: Rule, limits: str
+    model: ErrorModel, name: str, rule: Rule, limits: str, members: list[int] | None = None
 ) -> tuple[Rule, float, NDArray[np.float32]]:
     """Fit, then select from descriptors that no training frame has."""
     begin = time.perf_counter()
     pca = model.pca()
-    rule.fit(model.training_data(pca))
+    rule.fit(model.training_data(pca, members))
     fitting = time.perf_counter() - begin
     rng = np.random.default_rng(1)
     scans = rng.poisson(model.descriptors[rng.integers(0, len(model.descriptors), 1000)])
@@ -221,6 +233,8 @@ def main(picture: Path | None) -> None:
         model = measure_file(kitti_size(0, own_sets=False), Path(folder))
         measure_selection(model, "paper", NearestNeighbours(), "limits: median 1, 99 % 5")
         measure_selection(model, "paired", PairedExpectedRatio(), "limit: median 5")
+        bank = PairedFusion(Settings(n_frames=BANK_FRAMES))
+        measure_selection(model, "bank", bank, "limit: median 5", model.bank)
     if picture is not None:
         print("\nCPU time of a selection against training frames")
         draw_growth(picture)

@@ -168,7 +168,8 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
     given = study.config.online.switching.sets
     if given is None:
         size = study.config.online.switching.size
-        if size > len(model.bank) < len(model.sets):
+        complete = int((~np.isnan(model.errors).any(axis=0)).sum())
+        if len(model.bank) < min(size, complete):
             raise _another_bank("size")
         members = model.bank[:size]
         return members, [model.sets[i] for i in members]
