@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.model import ErrorModel, Selection
+from adaptune.model import ErrorModel, Selection, Settings
 from adaptune.study import ConfigurationError, load_study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.campaign import train
@@ -81,17 +81,50 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
     assert about["switching"]["warm_up"]["seconds"] == 0.5
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
-    members = model.portfolio(2) if mechanism == "bank" else range(len(model.sets))
+    members = model.bank if mechanism == "bank" else range(len(model.sets))
     for row in rows:
         # The numbers are those of the model, not of the bank.
         assert int(row["set"]) in members
         chosen = model.sets[int(row["set"])]
         assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
+        # Two training sequences do not show that it pays.
+        assert row["weights"] == ("1.000" if mechanism == "bank" else "")
+    run_replays(trained, trained.folder / "model.npz")
+
+
+def test_a_bank_that_pays_is_weighed(trained, study_file):
+    """And what is replayed does not end in failure."""
+    model = ErrorModel.load(trained.folder / "model.npz")
+    assert len(model.bank) == 4
+    assert model.fusion.hedge == 1.0
+    paying = replace(model, fusion=Settings(hedge=0.5))
+    path = trained.folder / "paying.npz"
+    paying.save(path)
+    study = load_study(study_file, ["online.switching.mechanism=bank"], trained.folder)
+    run_replays(study, path)
+    folder = study.folder / "replays/three"
+    with (folder / "paired/selections.csv").open() as file:
+        for row in csv.DictReader(file):
+            weights = [float(weight) for weight in row["weights"].split()]
+            assert len(weights) == 4
+            assert weights[0] >= 0.5
+            assert sum(weights) == pytest.approx(1.0, abs=0.002)
+            assert int(row["set"]) == model.fixed
+    # The published rule chooses among its members.
+    with (folder / "paper/selections.csv").open() as file:
+        assert {int(row["set"]) for row in csv.DictReader(file)} <= set(model.bank)
+    error = next(row["RTE [%]"] for row in compare(study) if row["mode"] == "paired")
+    assert error < 3.0
+    more = load_study(study_file, ["online.switching.mechanism=bank"], trained.folder)
+    with pytest.raises(ComparisonError, match=r"switching\.size: the model was fitted for another"):
+        bank_sets(more, replace(model, bank=model.bank[:3]))
     run_replays(trained, trained.folder / "model.npz")
 
 
 def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file):
     model = ErrorModel.load(trained.folder / "model.npz")
+    all_sets = {"bank": list(range(10)), "vectors": np.zeros((len(model.errors), 10, 3))}
+    model = replace(model, **all_sets)
     bank = "online.switching.mechanism=bank"
     named = load_study(study_file, [bank, "online.switching.sets=[3, 0]"], trained.folder)
     assert bank_sets(named, model) == ([3, 0], [model.sets[3], model.sets[0]])
@@ -105,12 +138,15 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
         errors=model.errors[:, 2:],
         fixed=0,
         provenance={"trials": model.trials[2:]},
+        bank=list(range(8)),
     )
     by_number = load_study(study_file, [bank, "online.switching.sets=[3, 2]"], trained.folder)
     assert bank_sets(by_number, some) == ([1, 0], [model.sets[3], model.sets[2]])
     twice = load_study(study_file, [bank, "online.switching.sets=[3, 3]"], trained.folder)
     with pytest.raises(ComparisonError, match=r"switching\.sets\.1: is in the bank already"):
         run_replays(twice, trained.folder / "model.npz")
+    with pytest.raises(ComparisonError, match=r"switching\.sets: the model was fitted for another"):
+        bank_sets(named, replace(model, bank=[0, 1, 2]))
     errors = model.errors.copy()
     errors[:3, 4] = np.nan
     with pytest.raises(ComparisonError, match=r"switching\.sets\.0: was not run on every"):
