@@ -42,8 +42,18 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         report.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         report.table("Parameters", _parameters(model)),
         report.table(f"The best sets of {n_sets}", _sets(model), "Mean error over all sequences."),
-        escape("\n".join(_pairs("From", model.provenance) + _validation(model))),
+        escape("\n".join(_bank(model) + _pairs("From", model.provenance) + _validation(model))),
     )
+
+
+def _bank(model: ErrorModel) -> list[str]:
+    if not model.bank:
+        return []
+    sets = ", ".join(map(str, model.bank))
+    kept = model.fusion.hedge
+    if kept == 1.0:
+        return [f"Bank: sets {sets}; it was not shown to pay, and keeps to the first."]
+    return [f"Bank: sets {sets}; the first has {100 * kept:.0f} % of the weight at least."]
 
 
 def _pairs(title: str, data: Any) -> list[str]:

@@ -369,9 +369,7 @@ def agreement(
     )
 
 
-def share(
-    weights: NDArray[np.float64], agreeing: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def share(weights: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Weights of those that agree; where they have none, each as much, of shape (..., n)."""
     shares = np.where(agreeing, weights, 0.0)
     return np.where(shares.any(axis=-1, keepdims=True), shares, agreeing.astype(np.float64))

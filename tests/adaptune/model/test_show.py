@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.cli import app
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, Settings
 from adaptune.space import Categorical, Float, ParameterSpace
 
 
@@ -79,3 +79,15 @@ def test_a_file_that_is_no_model_is_refused_in_a_sentence(tmp_path):
     result = CliRunner().invoke(app, ["model", "show", str(tmp_path / "model.npz")])
     assert result.exit_code == 2
     assert "Traceback" not in result.output
+
+
+def test_a_bank_is_told(model, tmp_path):
+    assert "Bank" not in shown(model, tmp_path)
+    vectors = np.zeros((4, 2, 3), np.float32)
+    for hedge, told in ((1.0, "keeps to the first"), (0.25, "has 25 % of the weight at least")):
+        of_two = dataclasses.replace(
+            model, bank=[0, 2], vectors=vectors, fusion=Settings(hedge=hedge)
+        )
+        text = shown(of_two, tmp_path)
+        assert "Bank: sets 0, 2;" in text
+        assert told in text
