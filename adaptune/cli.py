@@ -268,7 +268,9 @@ def offline(
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         console.print(f"The sets that no other one beats in all: {front}.*", highlight=False)
-    if model.paired.n_sets == 1:
+    if loaded.mechanism == "bank" and model.fusion.hedge < 1.0:
+        console.print(f"Bank: trials {', '.join(map(str, model.bank_trials))}", highlight=False)
+    elif model.paired.n_sets == 1:
         console.print(
             "On the training sequences left out in turn nothing showed that adapting pays, for "
             "which it takes six or more: `paired` will always take the fixed set.",
@@ -385,6 +387,8 @@ def online(
     from online.comparison import run_replays
 
     loaded = load_study(study, override, folder)
+    # It asks how many cores there are, of which the replays see one.
+    _ = loaded.mechanism
     unpin = pin(os.getpid())
     try:
         with _progress() as progress:

@@ -14,7 +14,13 @@ from rich.table import Table
 
 from adaptune.files import replacing, write_text
 
-COLOURS = {"baseline": "#7f7f7f", "fixed": "#1f77b4", "paper": "#ff7f0e", "paired": "#2ca02c"}
+COLOURS = {
+    "baseline": "#7f7f7f",
+    "fixed": "#1f77b4",
+    "paper": "#ff7f0e",
+    "paired": "#2ca02c",
+    "bank": "#d62728",
+}
 STYLES: dict[str, dict[str, Any]] = {"fixed": {"lw": 4.0, "alpha": 0.35}}
 """Adaptive modes often take the fixed set, and must not hide it."""
 _FEW = 10
@@ -255,6 +261,7 @@ def draw_validation(
     by_sequence.yaxis.set_major_formatter("{x:g}")
     by_sequence.yaxis.set_minor_formatter("")
     by_sequence.legend(fontsize="small", ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    default = "bank" if "bank" in ratios else "paired"
     known = ~np.isnan(familiarity)
     if known.any():
         order = np.argsort(familiarity[known], kind="stable")
@@ -263,10 +270,10 @@ def draw_validation(
             [familiarity[known][p].mean() for p in parts],
             [np.exp(np.log(gain[known][p]).mean()) for p in parts],
             "o-",
-            color=COLOURS["paired"],
+            color=COLOURS[default],
         )
     by_novelty.set_xlabel("familiarity (0: unlike all training)")
-    by_novelty.set_title("paired, tenths of the frames", fontsize="medium")
+    by_novelty.set_title(f"{default}, tenths of the frames", fontsize="medium")
     by_size.plot(
         np.arange(1, len(portfolio) + 1),
         portfolio,
@@ -284,9 +291,9 @@ def draw_validation(
             middle,
             np.abs(bounds - middle),
             fmt="o-",
-            color=COLOURS["paired"],
+            color=COLOURS[default],
             capsize=3,
-            label="paired, by training sequences",
+            label=f"{default}, by training sequences",
         )
         by_size.set_xlabel("sets; training sequences")
     by_size.legend(fontsize="small")

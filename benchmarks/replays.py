@@ -89,7 +89,7 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
 
     def bank(size: int, even: bool = False) -> Way:
         members = choose_bank(sequences, data.fixed, size)
-        found = tune_bank(sequences, units, members)
+        found = tune_bank(sequences, units, members, data.fixed)
         print(f"bank of {size}: sets {members}, {found}", flush=True)
         vectors = np.concatenate(
             [s.vectors[:, members] for s in sequences if s.vectors is not None]

@@ -437,13 +437,18 @@ def _tuned(study: Study, model: ErrorModel) -> ErrorModel:
     named = [model.number(n, study.space) for n in switching.sets or ()]
     if named and set(named) <= set(everywhere) and len(set(named)) == len(named):
         members = [everywhere.index(n) for n in named if n is not None]
+    elif named:
+        _log.warning(
+            "online.switching.sets: not all of them were run on every training sequence, or one is "
+            "named twice; the bank is chosen without them (trials.csv tells which were)"
+        )
     vectors = [s.vectors[:, members] for s in sequences if s.vectors is not None]
     return replace(
         model,
         paired=tune(sequences, sets),
         bank=[everywhere[i] for i in members],
         vectors=np.concatenate(vectors),
-        fusion=tune_bank(sequences, sets, members),
+        fusion=tune_bank(sequences, sets, members, fixed),
     )
 
 

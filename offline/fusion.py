@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.geometry import Poses, mean_motion, steps
+from adaptune.geometry import Poses, invert, mean_motion, steps
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.odometry.switching import agreement, share
 
@@ -16,21 +16,38 @@ from adaptune.odometry.switching import agreement, share
 def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:
     """Errors of a trial as vectors, see `sub_trajectory_vectors`.
 
-    Of a trial that was run several times or in pieces, they point where those of the first run,
-    or of the pieces joined, do, and are as long as the trial's errors.
+    Of a trial that was run in pieces (``offline.runs: episodes``), or several times, they point
+    where those of the pieces joined, or of the first run, do, and are as long as its errors.
 
     Returns
     -------
     ndarray of shape (n_frames, 3)
     """
-    vectors = sub_trajectory_vectors(
-        frames.T_ref_sensor, trial.T_odom_sensor, length, trial.restarted
-    )
+    T_odom_sensor = _joined(frames, trial)
+    vectors = sub_trajectory_vectors(frames.T_ref_sensor, T_odom_sensor, length, trial.restarted)
     vectors[np.isinf(trial.errors)] = np.inf
     lengths = np.linalg.norm(vectors, axis=1)
     finite = np.isfinite(lengths) & (lengths > 0.0)
     vectors[finite] *= (trial.errors[finite] / lengths[finite])[:, None]
     return vectors.astype(np.float32)
+
+
+def _anew(frames: Frames, trial: Trial) -> NDArray[np.bool_]:
+    """At which frames but the first a trial began anew at the reference."""
+    anew = (trial.T_odom_sensor == frames.T_ref_sensor).all(axis=(1, 2))
+    anew[0] = False
+    return np.asarray(anew)
+
+
+def _joined(frames: Frames, trial: Trial) -> Poses:
+    """Poses of a trial, the reference's motion standing in where a piece of it began."""
+    T_odom_sensor = trial.T_odom_sensor.copy()
+    for i in np.flatnonzero(_anew(frames, trial) & ~trial.restarted):
+        T_ref_step = invert(frames.T_ref_sensor[i - 1]) @ frames.T_ref_sensor[i]
+        T_joined = T_odom_sensor[i - 1] @ T_ref_step @ invert(T_odom_sensor[i])
+        if np.isfinite(T_joined).all():
+            T_odom_sensor[i:] = T_joined @ T_odom_sensor[i:]
+    return T_odom_sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +145,7 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial], lost_track: float)
     motions = np.empty((len(bounds), len(trials), 4, 4))
     for k, trial in enumerate(trials):
         T = steps(trial.T_odom_sensor)
-        anew = (trial.T_odom_sensor[1:] == frames.T_ref_sensor[1:]).all(axis=(1, 2))
+        anew = _anew(frames, trial)[1:]
         lost = trial.restarted[1:]
         T[anew & ~lost] = np.nan
         T[lost] = T_ref_step[lost]

@@ -664,7 +664,10 @@ def choose_bank(sequences: Sequence[LabelledSequence], fixed: int, size: int) ->
 
 
 def tune_bank(
-    sequences: Sequence[LabelledSequence], sets: NDArray[np.float64], members: Sequence[int]
+    sequences: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    members: Sequence[int],
+    fixed: int,
 ) -> Settings:
     """Choose how a bank's weights are found, leaving each of these sequences out in turn.
 
@@ -675,14 +678,16 @@ def tune_bank(
     sequences, sets
         See `tune`.
     members
-        Numbers of the bank's sets, the fixed one first, chosen on these sequences.
+        Numbers of the bank's sets, chosen on these sequences; the first counts as the fixed one.
+    fixed
+        Number of the fixed set, that the bank is compared with.
     """
     folds = _folds(sequences)
     if len(folds) < MIN_SEQUENCES or len(members) < 2:
         return Settings(hedge=1.0)
     with threadpool_limits(1, "blas"):
         logs = np.array(
-            [_bank_tried(sequence, others, sets, members) for sequence, others in folds]
+            [_bank_tried(sequence, others, sets, members, fixed) for sequence, others in folds]
         )
     best = _paying(logs)
     return Settings(hedge=1.0) if best is None else _BANK_SETTINGS[best]
@@ -698,11 +703,12 @@ def _bank_tried(
     others: Sequence[LabelledSequence],
     sets: NDArray[np.float64],
     members: Sequence[int],
+    fixed: int,
 ) -> list[float]:
     """With each of `_BANK_SETTINGS`, logarithm of the ratio to the fixed set's error."""
     data, pca = training_data(others, sets)
     rule, near = _fusion(sequence, others, data, pca, members)
-    fixed = cap(sequence.errors[:, members[0]]).mean() + TINY
+    of_fixed = cap(sequence.errors[:, fixed]).mean() + TINY
     logs = []
     for sharpness in SHARPNESS:
         rule.settings = Settings(sharpness=sharpness, n_frames=BANK_FRAMES)
@@ -711,7 +717,7 @@ def _bank_tried(
             hedged = (1.0 - hedge) * weights
             hedged[:, 0] += hedge
             errors = _bank_errors(sequence, members, hedged)
-            logs.append(float(np.log((errors.mean() + TINY) / fixed)))
+            logs.append(float(np.log((errors.mean() + TINY) / of_fixed)))
     return logs
 
 
@@ -756,7 +762,7 @@ def _driven(
 ) -> tuple[NDArray[np.float64], float]:
     """A bank on the sequence left out: its errors, and the weight that the fixed set had not."""
     members = choose_bank(others, data.fixed, size)
-    settings = tune_bank(others, sets, members)
+    settings = tune_bank(others, sets, members, data.fixed)
     if settings.hedge == 1.0:
         return cap(sequence.errors[:, data.fixed]), 0.0
     rule, near = _fusion(sequence, others, data, pca, members)

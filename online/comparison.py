@@ -144,15 +144,16 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
     if mode not in study.rules:
         return study.odometry(fixed if mode == "fixed" else None, name), None
     switching = study.config.online.switching
-    if study.mechanism == "live":
+    mechanism = study.mechanism
+    if mechanism == "bank" and mode == "paired" and model.fusion.hedge == 1.0:
+        # It was not shown to pay: others than the fixed set would only cost.
+        mechanism = "live" if study.described.live else "hand_over"
+    if mechanism == "live":
         return study.odometry(fixed), adaptive(model, mode, study.price())
-    if study.mechanism == "hand_over":
+    if mechanism == "hand_over":
         box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
         return box, adaptive(model, mode, study.price())
     members, sets = bank_sets(study, model)
-    if mode == "paired" and model.fusion.hedge == 1.0:
-        # The fixed set has all the weight: others would only cost.
-        members, sets = members[:1], sets[:1]
     bank = Bank(study.odometry, sets, study.warm_up, study.config.lost_track)
     return bank, adaptive(model, mode, members=members)
 
@@ -171,6 +172,8 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
         complete = int((~np.isnan(model.errors).any(axis=0)).sum())
         if len(model.bank) < min(size, complete):
             raise _another_bank("size")
+        if model.bank[0] != model.fixed:
+            raise _another_bank("sets")
         members = model.bank[:size]
         return members, [model.sets[i] for i in members]
     members = []
@@ -190,7 +193,7 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
                 f"be compared with the others; name another (trials.csv tells which were)"
             )
         members.append(number)
-    if set(members) - set(model.bank):
+    if members != model.bank:
         raise _another_bank("sets")
     return members, [model.sets[i] for i in members]
 

@@ -179,15 +179,20 @@ class ErrorModel:
             kept.append(members[(2 * np.arange(share) + 1) * len(members) // (2 * share)])
         # In their order, for what follows may ask for it.
         frames = np.sort(np.concatenate(kept))
-        n_near = max(1, round(self.paired.n_frames * len(frames) / n_frames))
+        share_kept = len(frames) / n_frames
+
+        def fewer(settings: Settings) -> Settings:
+            n_near = max(1, round(settings.n_frames * share_kept))
+            return settings.model_copy(update={"n_frames": n_near})
+
         return replace(
             self,
-            paired=self.paired.model_copy(update={"n_frames": n_near}),
+            paired=fewer(self.paired),
+            fusion=fewer(self.fusion),
             descriptors=self.descriptors[frames],
             sequence=self.sequence[frames],
             errors=self.errors[frames],
             vectors=self.vectors[frames] if self.bank else self.vectors,
-            fusion=self.fusion.model_copy(update={"n_frames": n_near}),
         )
 
     @property
@@ -197,6 +202,11 @@ class ErrorModel:
         if isinstance(told, list) and len(told) == len(self.sets):
             return told
         return list(range(len(self.sets)))
+
+    @property
+    def bank_trials(self) -> list[int]:
+        """Numbers of the trials that the bank's sets are of."""
+        return [self.trials[i] for i in self.bank]
 
     def number(self, named: int | ParameterSet, space: ParameterSpace) -> int | None:
         """Number of a trial's set, or of a set that is named by what differs from the baseline.

@@ -78,7 +78,9 @@ class PairedFusion(PairedExpectedRatio):
         weights *= trust[:, None]
         weights[:, 0] += 1.0 - trust
         mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)
-        return weights, np.sqrt(mean_square / squares[:, 0, 0])
+        # Without any error of the fixed set there is none to be gained on.
+        of_fixed = np.maximum(squares[:, 0, 0], 1e-12)
+        return weights, np.sqrt(mean_square / of_fixed)
 
     def select(
         self,

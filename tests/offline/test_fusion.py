@@ -106,6 +106,11 @@ def test_where_a_piece_of_a_trial_began_nothing_is_known():
     motions = recorded_motions(frames(), [pieces], 3.0)
     assert np.isnan(motions[29]).all()
     assert np.isfinite(np.delete(motions, 29, axis=0)).all()
+    # Vectors point where they would without the border, but for the one step.
+    vectors = error_vectors(frames(), pieces, LENGTH)
+    whole = error_vectors(frames(), trial(straight(0.33)), LENGTH)
+    known = np.isfinite(whole[:, 0])
+    assert (vectors[known, 0] > 0.0).all()
     drive, errors = driven([pieces], [1.0])
     # There the reference's motion stands in.
     assert errors[25] == pytest.approx(pieces.errors[5] * 16 / 17, rel=0.01)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from adaptune.model import RULES, ErrorModel, ModelError
+from adaptune.model import RULES, ErrorModel, ModelError, Settings
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 
 SPACE = ParameterSpace(
@@ -78,6 +78,9 @@ def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
     kept = few.errors[:, 0].astype(int)
     near = max(1, round(300 * len(kept) / (n + m)))
     assert few.paired == model.paired.model_copy(update={"n_frames": near})
+    wide = dataclasses.replace(model, fusion=Settings(n_frames=1000)).thinned(most)
+    if wide is not model and len(kept) < n + m:
+        assert wide.fusion.n_frames == max(1, round(1000 * len(kept) / (n + m)))
     np.testing.assert_array_equal(few.sequence, model.sequence[kept])
     np.testing.assert_array_equal(few.descriptors, model.descriptors[kept])
     if most >= n + m:
