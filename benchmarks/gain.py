@@ -325,7 +325,7 @@ def less(paths: list[Path]) -> None:
         for share in (0.75, 0.5, 0.25):
             kept = partial(with_gaps, share=share)
             makers[f"{name}, {share:.0%} of the pairs"] = maker(name, kept)
-    print_summary(leave_one_out(*labelled(paths), makers, size=0), makers)
+    print_summary(leave_one_out(*labelled(paths), makers, bank=0), makers)
 
 
 class Unafraid(PairedExpectedRatio):
@@ -368,7 +368,7 @@ def ablate(paths: list[Path]) -> None:
             "sharpness 12": maker(paired, n_sets=3, sharpness=12.0),
             "sharpness 48": maker(paired, n_sets=3, sharpness=48.0),
         },
-        size=0,
+        bank=0,
     )
     print_summary(validation, [mode for mode in validation.ratios if mode != "baseline"])
 

@@ -28,9 +28,10 @@ from adaptune.model import (
     Rule,
     Settings,
     TrainingData,
+    fusion,
 )
 from adaptune.model.base import complementary, mean_errors
-from adaptune.model.fusion import PairedFusion, bank
+from adaptune.model.fusion import PairedFusion
 from adaptune.model.paired import ERROR_FLOOR, Near
 from adaptune.sequence.views import origin, places
 from adaptune.study import Study
@@ -274,12 +275,15 @@ def validate(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "
             f"`adaptune offline` again"
         )
-    sequences, sets, _ = labelled_sequences(study, model)
+    sequences, sets, everywhere = labelled_sequences(study, model)
+    switching = study.config.online.switching
+    named = switching.sets is not None and set(model.bank) <= set(everywhere)
+    members = [everywhere.index(i) for i in model.bank] if named else switching.size
     validation = leave_one_out(
         sequences,
         sets,
         progress=lambda i, n: progress("sequences left out", i, n),
-        size=study.config.online.switching.size,
+        bank=members,
     )
     rows = _rows(validation)
     report.write_rows(study.folder, "validation", rows)
@@ -289,7 +293,7 @@ def validate(
             sequences,
             sets,
             progress=lambda i, n: progress("learning curve", i, n),
-            members=study.config.online.switching.size,
+            bank=members,
         )
         report.write_rows(study.folder, "learning", learning)
     report.draw_validation(
@@ -349,7 +353,7 @@ def learning_curve(
     sets: NDArray[np.float64],
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda *_: None,
-    members: int = BANK_SIZE,
+    bank: int | Sequence[int] = BANK_SIZE,
 ) -> list[dict[str, Any]]:
     """What a bank, or if there is none the paired rule, gains with fewer training sequences.
 
@@ -376,7 +380,7 @@ def learning_curve(
             names = sorted({origin(other.name) for other in others})
             drawn = set(rng.choice(names, size, replace=False))
             some = [other for other in others if origin(other.name) in drawn]
-            left_out.append(_leave_out(sequence, some, sets, rules, members))
+            left_out.append(_leave_out(sequence, some, sets, rules, bank))
         validation = Validation(left_out)
         rows.append({"sequences": size} | validation.summary(validation.default))
     progress(len(sizes) * len(folds), len(sizes) * len(folds))
@@ -465,7 +469,7 @@ def leave_one_out(
     sets: NDArray[np.float64],
     rules: Mapping[str, Maker] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
-    size: int = BANK_SIZE,
+    bank: int | Sequence[int] = BANK_SIZE,
 ) -> Validation:
     """Leave each sequence out in turn, with all views of it.
 
@@ -480,8 +484,9 @@ def leave_one_out(
         `tune` chooses anew on the other sequences.
     progress
         Told about every sequence.
-    size
-        Members of a bank, if the sequences tell what it takes to drive one; none with 0.
+    bank
+        How many members a bank has, or numbers of their sets, the first of which counts as the
+        fixed one; no bank is driven with 0, nor without what it takes to drive one.
 
     Raises
     ------
@@ -493,12 +498,13 @@ def leave_one_out(
             "training: one sequence cannot be validated, for nothing remains to train on when it "
             "is left out; add sequences"
         )
-    rules = rules or {name: _maker(name) for name in RULES}
+    if rules is None:
+        rules = {name: _maker(name) for name in RULES}
     left_out = []
     folds = _folds(sequences)
     for i, (sequence, others) in enumerate(folds):
         progress(i, len(folds))
-        left_out.append(_leave_out(sequence, others, sets, rules, size))
+        left_out.append(_leave_out(sequence, others, sets, rules, bank))
     progress(len(folds), len(folds))
     return Validation(left_out)
 
@@ -538,8 +544,9 @@ def _leave_out(
     others: Sequence[LabelledSequence],
     sets: NDArray[np.float64],
     rules: Mapping[str, Maker],
-    size: int,
+    bank: int | Sequence[int],
 ) -> LeftOut:
+    n_sets = len(sets)
     sequence, others, sets = _comparable(sequence, others, sets)
     data, pca = training_data(others, sets)
     features = pca.transform(sequence.descriptors)
@@ -558,8 +565,10 @@ def _leave_out(
         if not np.isnan(selections[0].familiarity):
             familiarity = np.array([selection.familiarity for selection in selections])
     adapted = {name: float(np.mean(of_rule != data.fixed)) for name, of_rule in chosen.items()}
-    if size and sequence.drive is not None:
-        errors[BANK], adapted[BANK] = _driven(sequence, others, sets, data, pca, size)
+    if bank and sequence.drive is not None:
+        if not isinstance(bank, int) and len(sets) < n_sets:
+            bank = len(bank)
+        errors[BANK], adapted[BANK] = _driven(sequence, others, sets, data, pca, bank)
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
     errors["oracle, period"] = capped[frames, of_periods.argmin(axis=1)[period]]
@@ -660,7 +669,7 @@ def _tried(
 def choose_bank(sequences: Sequence[LabelledSequence], fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, see `adaptune.model.fusion.bank`."""
     vectors = [s.vectors for s in sequences if s.vectors is not None]
-    return bank(vectors, [s.errors for s in sequences], fixed, size)
+    return fusion.bank(vectors, [s.errors for s in sequences], fixed, size)
 
 
 def tune_bank(
@@ -758,10 +767,10 @@ def _driven(
     sets: NDArray[np.float64],
     data: TrainingData,
     pca: ScaledPCA,
-    size: int,
+    bank: int | Sequence[int],
 ) -> tuple[NDArray[np.float64], float]:
     """A bank on the sequence left out: its errors, and the weight that the fixed set had not."""
-    members = choose_bank(others, data.fixed, size)
+    members = choose_bank(others, data.fixed, bank) if isinstance(bank, int) else bank
     settings = tune_bank(others, sets, members, data.fixed)
     if settings.hedge == 1.0:
         return cap(sequence.errors[:, data.fixed]), 0.0

@@ -4,11 +4,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from adaptune.metrics import sub_trajectory_vectors
 from adaptune.model import ModelError, Selection, Settings
 from adaptune.model.base import Rule
 from adaptune.study import load_study
 from offline.campaign import train
+from offline.fusion import Drive
 from offline.validation import (
+    BANK,
     LabelledSequence,
     LeftOut,
     Validation,
@@ -17,6 +20,7 @@ from offline.validation import (
     leave_one_out,
     training_data,
     tune,
+    tune_bank,
     validate,
 )
 
@@ -254,3 +258,71 @@ def test_validates_a_study(study_file, tmp_path):
     (archive / "00003.npz").rename(archive / "gone")
     with pytest.raises(ModelError, match=r"lacks trial 3 on one.*adaptune offline"):
         validate(study)
+
+
+def with_drive(of, rng, n_steps=300):
+    """A sequence along x on which sets 0 and 4 err in opposite directions, and set 2 in both."""
+    T_ref_sensor = np.tile(np.eye(4), (n_steps, 1, 1))
+    T_ref_sensor[1:, 0, 3] = 0.3 * np.arange(1, n_steps)
+    stamps = np.arange(n_steps, dtype=np.int64) * 10**8
+    noise = rng.normal(0.0, 0.003, (n_steps - 1, 5))
+    noise[:, [0, 4]] = noise[:, :1] * [1.0, -1.0]
+    motions = np.tile(np.eye(4), (n_steps - 1, 5, 1, 1))
+    motions[..., 0, 3] = 0.3 + noise
+    motions[..., 1, 3] = rng.normal(0.0, 0.0005, noise.shape)
+    vectors, errors = [], []
+    for j in range(5):
+        T = np.tile(np.eye(4), (n_steps, 1, 1))
+        T[1:, :2, 3] = np.cumsum(motions[:, j, :2, 3], axis=0)
+        vectors.append(sub_trajectory_vectors(T_ref_sensor, T, 10.0))
+        errors.append(np.linalg.norm(vectors[-1], axis=1))
+    known = ~np.isnan(errors[0])
+    described = rng.poisson(3.0, (n_steps, 90)).astype(np.float32)
+    period = np.arange(n_steps) // 10
+    drive = Drive(stamps, T_ref_sensor, described, period, 10.0, 3.0, lambda m: motions[:, list(m)])
+    return LabelledSequence(
+        of,
+        period[known],
+        described[known],
+        np.array(errors, np.float32).T[known],
+        vectors=np.array(vectors, np.float32).transpose(1, 0, 2)[known],
+        drive=drive,
+    )
+
+
+def test_a_bank_gains_where_no_set_is_better_than_another():
+    rng = np.random.default_rng(6)
+    sequences = [with_drive(f"s{i}", rng) for i in range(8)]
+    validation = leave_one_out(sequences, SETS, {}, bank=3)
+    assert validation.modes == ["bank"]
+    assert validation.summary("bank")["geometric"] < 0.5
+    assert validation.verdict("bank").startswith("Adapt by `bank`")
+    assert all(0.2 < left_out.adapted["bank"] < 1.0 for left_out in validation.left_out)
+    # Members that are named: what cancels is not among them.
+    named = leave_one_out(sequences, SETS, {}, bank=[0, 1])
+    assert 0.5 < named.summary("bank")["geometric"] < 0.9
+    assert BANK not in leave_one_out(sequences, SETS, bank=0).ratios
+    rows = learning_curve(sequences[:6], SETS, bank=2)
+    assert [row["sequences"] for row in rows] == [3, 5]
+    assert all(row["geometric"] == 1.0 for row in rows)  # too few to show anything
+
+
+def test_a_bank_that_does_not_pay_keeps_the_fixed_set():
+    rng = np.random.default_rng(7)
+    sequences = [with_drive(f"s{i}", rng) for i in range(7)]
+    # All members err alike: nothing cancels.
+    alike = [
+        replace(
+            s,
+            errors=np.repeat(s.errors[:, :1], 5, axis=1),
+            vectors=np.repeat(s.vectors[:, :1], 5, axis=1),
+            drive=s.drive.of(np.zeros(5, int)),
+        )
+        for s in sequences
+    ]
+    assert tune_bank(alike, SETS, [0, 1, 2], 0) == Settings(hedge=1.0)
+    validation = leave_one_out(alike, SETS, {})
+    np.testing.assert_array_equal(validation.ratios["bank"], 1.0)
+    assert "kept the fixed set" in validation.verdict("bank")
+    assert tune_bank(sequences[:5], SETS, [0, 4], 0).hedge == 1.0
+    assert tune_bank(sequences, SETS, [0, 4], 0).hedge < 1.0
