@@ -412,6 +412,7 @@ def labelled_sequences(
                 f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
                 f"fitted to; run `adaptune offline` again"
             )
+    members = _eligible(study, model, everywhere)
     owners = [owner(study.config.offline, model.sequences, n) for n in numbers]
     objective = study.config.offline.objective[0]
     sequences = []
@@ -423,9 +424,10 @@ def labelled_sequences(
         since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
         values = [weighted(objective, archive.finished(name)[n].metrics) for n in numbers]
         length = study.config.sub_trajectory
-        vectors = np.empty((int(labelled.sum()), len(numbers), 3), np.float32)
-        for i, n in enumerate(numbers):
-            vectors[:, i] = error_vectors(frames, archive.read(name, n), length)[labelled]
+        vectors = np.full((int(labelled.sum()), len(numbers), 3), np.nan, np.float32)
+        for i in members:
+            trial = archive.read(name, numbers[i])
+            vectors[:, i] = error_vectors(frames, trial, length)[labelled]
         sequences.append(
             LabelledSequence(
                 name,
@@ -451,6 +453,15 @@ def labelled_sequences(
             )
         )
     return sequences, model.space.to_unit([model.sets[i] for i in everywhere]), everywhere
+
+
+def _eligible(study: Study, model: ErrorModel, everywhere: list[int]) -> list[int]:
+    """Which of the sets may be in a bank; to read the poses of thousands would take long."""
+    means = mean_errors(model.errors[:, everywhere], model.sequence)
+    # With a sequence left out, others than now may be among the best.
+    best = np.argsort(means, kind="stable")[: 2 * fusion.POOL].tolist()
+    named = [model.number(n, study.space) for n in study.config.online.switching.sets or ()]
+    return sorted({*best, *(everywhere.index(n) for n in named if n in everywhere)})
 
 
 Maker = Callable[[Sequence[LabelledSequence], NDArray[np.float64]], Rule]
