@@ -178,7 +178,7 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
 
     model = fit(study, archive, verdicts, fixed)
     assert np.isnan(model.errors).any()
-    sequences, unit = labelled_sequences(study, model)
+    sequences, unit, _ = labelled_sequences(study, model)
     complete = [n for n, v in verdicts.items() if v.complete]
     assert len(unit) == len(complete)
     for sequence in sequences:

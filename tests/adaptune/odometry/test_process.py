@@ -177,7 +177,7 @@ def test_a_study_takes_its_space(study_file, tmp_path):
     ]
     study = load_study(study_file, overrides, tmp_path / "study")
     assert study.space.parameters["speed"].high == 2.0
-    assert study.mechanism == "live"
+    assert study.described.live
     box = study.odometry({"speed": 1.5})
     box.start(scan(0), np.eye(4))
     assert box.register(scan(1)).T_odom_sensor[0, 3] == 1.5
