@@ -55,13 +55,13 @@ def window_ends(T_world_sensor: Poses, length: float) -> NDArray[np.intp]:
     return np.where(inside & whole, ends, -1)
 
 
-def _relative_errors(
+def _window_motions(
     T_ref_sensor: Poses, T_odom_sensor: Poses, starts: NDArray[np.intp], ends: NDArray[np.intp]
-) -> Poses:
-    """Transform inv(dEst) @ dGt for windows from `starts` to `ends`, of shape (m, 4, 4)."""
+) -> tuple[Poses, Poses]:
+    """Motions dGt and dEst over windows from `starts` to `ends`, each of shape (m, 4, 4)."""
     d_gt = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends]
     d_est = invert(T_odom_sensor[starts]) @ T_odom_sensor[ends]
-    return invert(d_est) @ d_gt
+    return d_gt, d_est
 
 
 def sub_trajectory_rte(
@@ -119,8 +119,7 @@ def sub_trajectory_vectors(
     ends = ends[starts]
     vectors = np.full((len(T_ref_sensor), 3), np.nan)
     with np.errstate(invalid="ignore"):
-        d_gt = invert(T_ref_sensor[starts]) @ T_ref_sensor[ends]
-        d_est = invert(T_odom_sensor[starts]) @ T_odom_sensor[ends]
+        d_gt, d_est = _window_motions(T_ref_sensor, T_odom_sensor, starts, ends)
         vectors[starts] = 100.0 / length * (d_est - d_gt)[:, :3, 3]
     # An odometry whose poses are not finite has lost track; only the reference may be unknown.
     vectors[starts[~np.isfinite(vectors[starts]).all(axis=1)]] = np.inf
@@ -173,7 +172,8 @@ def kitti_error(
         ends = ends[ends >= 0]
         if not len(starts):
             continue
-        T = _relative_errors(T_ref_sensor, T_odom_sensor, starts, ends)
+        d_gt, d_est = _window_motions(T_ref_sensor, T_odom_sensor, starts, ends)
+        T = invert(d_est) @ d_gt
         translations.append(np.linalg.norm(T[:, :3, 3], axis=1) / length)
         rotations.append(rotation_angle(T) / length)
         used.append(length)

@@ -37,7 +37,7 @@ from adaptune.model import (
 from adaptune.model.base import complementary
 from adaptune.simulation import Course, simulate
 from adaptune.study import Study, StudyConfig
-from offline.fusion import Drive, error_vectors, recorded_motions
+from offline.fusion import Drive, error_vectors, periods, recorded_motions
 from offline.samplers import make_sampler
 from offline.trial import run_trials
 from offline.validation import (
@@ -212,7 +212,7 @@ def evenly(
     data, _ = training_data(others, sets)
     members = choose_bank(others, data.fixed, BANK_SIZE)
     assert sequence.drive is not None
-    n_periods = len(sequence.drive.periods()[0])
+    n_periods = len(periods(sequence.drive.period)[0])
     weights = np.full((n_periods, len(members)), 1.0 / len(members))
     errors = sequence.drive.errors(members, weights)
     return errors[~np.isnan(errors)]

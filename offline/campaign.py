@@ -434,7 +434,7 @@ def _tuned(study: Study, model: ErrorModel) -> ErrorModel:
     fixed = everywhere.index(model.fixed)
     switching = study.config.online.switching
     members = choose_bank(sequences, fixed, switching.size)
-    named = [model.number(n, study.space) for n in switching.sets or ()]
+    named = [model.number(n) for n in switching.sets or ()]
     if named and set(named) <= set(everywhere) and len(set(named)) == len(named):
         members = [everywhere.index(n) for n in named if n is not None]
     elif named:

@@ -50,6 +50,18 @@ def _joined(frames: Frames, trial: Trial) -> Poses:
     return T_odom_sensor
 
 
+def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First frame of every period, and number of every frame's period among them.
+
+    Parameters
+    ----------
+    period
+        Whole periods since the first scan, of shape (n_frames,).
+    """
+    _, first, number = np.unique(period, return_index=True, return_inverse=True)
+    return first, number
+
+
 @dataclass(frozen=True, eq=False)
 class Drive:
     """What it takes to drive a bank along a sequence again, without any odometry.
@@ -85,11 +97,6 @@ class Drive:
         motions = self.motions
         return replace(self, motions=lambda members: motions([int(some[i]) for i in members]))
 
-    def periods(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """First frame of every period, and number of every frame's period among them."""
-        _, first, period = np.unique(self.period, return_index=True, return_inverse=True)
-        return first, period
-
     def errors(self, members: Sequence[int], weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory.
 
@@ -103,7 +110,7 @@ class Drive:
         T_previous_current = self.motions(members)
         T_ref_step = steps(self.T_ref_sensor)
         bounds = self.lost_track * np.diff(self.stamps) * 1e-9
-        of_steps = weights[self.periods()[1][1:]]
+        of_steps = weights[periods(self.period)[1][1:]]
         agreeing = agreement(T_previous_current, of_steps, bounds[:, None, None])
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))

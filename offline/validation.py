@@ -35,7 +35,7 @@ from adaptune.model.fusion import PairedFusion
 from adaptune.model.paired import ERROR_FLOOR, Near
 from adaptune.sequence.views import origin, places
 from adaptune.study import Study
-from offline.fusion import Drive, drive, error_vectors
+from offline.fusion import Drive, drive, error_vectors, periods
 from offline.objective import weighted
 from offline.search import owner
 
@@ -369,7 +369,9 @@ def learning_curve(
     """
     folds = _folds(sequences)
     most = len(folds) - 1
-    rules = {"paired": _maker("paired")}
+    # Only one of them is told.
+    alone = not bank or sequences[0].drive is None
+    rules = {"paired": _maker("paired")} if alone else {}
     sizes = sorted({n for n in (3, 5, 8, 11, 16, 24, 32) if n < most} | {most})
     rows = []
     for i, size in enumerate(sizes):
@@ -421,17 +423,26 @@ def labelled_sequences(
         errors = archive.read_errors(name, numbers)
         labelled = ~np.isnan(errors).all(axis=1)
         described = averaged(frames.descriptors, frames.stamps, model.window, period)
-        since = (frames.stamps[labelled] - frames.stamps[0]) * 1e-9
         values = [weighted(objective, archive.finished(name)[n].metrics) for n in numbers]
         length = study.config.sub_trajectory
         vectors = np.full((int(labelled.sum()), len(numbers), 3), np.nan, np.float32)
         for i in members:
             trial = archive.read(name, numbers[i])
             vectors[:, i] = error_vectors(frames, trial, length)[labelled]
+        driven = drive(
+            archive,
+            name,
+            frames,
+            numbers,
+            described,
+            period,
+            length,
+            study.config.lost_track,
+        )
         sequences.append(
             LabelledSequence(
                 name,
-                (since // period).astype(np.int64),
+                driven.period[labelled],
                 described[labelled],
                 errors[labelled],
                 tuple(frames.blocks.values()),
@@ -440,16 +451,7 @@ def labelled_sequences(
                 np.array([other is not None and origin(other) == origin(name) for other in owners]),
                 span(frames.T_ref_sensor, length),
                 vectors,
-                drive(
-                    archive,
-                    name,
-                    frames,
-                    numbers,
-                    described,
-                    period,
-                    length,
-                    study.config.lost_track,
-                ),
+                driven,
             )
         )
     return sequences, model.space.to_unit([model.sets[i] for i in everywhere]), everywhere
@@ -460,7 +462,7 @@ def _eligible(study: Study, model: ErrorModel, everywhere: list[int]) -> list[in
     means = mean_errors(model.errors[:, everywhere], model.sequence)
     # With a sequence left out, others than now may be among the best.
     best = np.argsort(means, kind="stable")[: 2 * fusion.POOL].tolist()
-    named = [model.number(n, study.space) for n in study.config.online.switching.sets or ()]
+    named = [model.number(n) for n in study.config.online.switching.sets or ()]
     return sorted({*best, *(everywhere.index(n) for n in named if n in everywhere)})
 
 
@@ -562,7 +564,7 @@ def _leave_out(
     data, pca = training_data(others, sets)
     features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)
-    first, period = _periods(sequence)
+    first, period = periods(sequence.period)
     frames = np.arange(len(capped))
     baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
     errors = {"baseline": baseline, "fixed": capped[:, data.fixed]}
@@ -614,12 +616,6 @@ def _comparable(
     return few[0], [s for s in few[1:] if not np.isnan(s.errors).all()], sets[run]
 
 
-def _periods(sequence: LabelledSequence) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First frame of every period, and number of every frame's period among them."""
-    _, first, period = np.unique(sequence.period, return_index=True, return_inverse=True)
-    return first, period
-
-
 def tune(sequences: Sequence[LabelledSequence], sets: NDArray[np.float64]) -> Settings:
     """Choose the settings of the paired rule, leaving each of these sequences out in turn.
 
@@ -663,7 +659,7 @@ def _tried(
     sequence, others, sets = _comparable(sequence, others, sets)
     data, pca = training_data(others, sets)
     rule = PairedExpectedRatio().fit(data)
-    first, period = _periods(sequence)
+    first, period = periods(sequence.period)
     near = rule.near(pca.transform(sequence.descriptors[first]))
     capped = cap(sequence.errors)
     logs = []
@@ -759,7 +755,7 @@ def _fusion(
         )
     )
     assert sequence.drive is not None
-    first, _ = sequence.drive.periods()
+    first, _ = periods(sequence.drive.period)
     return rule, rule.near(pca.transform(sequence.drive.descriptors[first]))
 
 

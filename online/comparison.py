@@ -178,7 +178,7 @@ def bank_sets(study: Study, model: ErrorModel) -> tuple[list[int], list[Paramete
         return members, [model.sets[i] for i in members]
     members = []
     for i, named in enumerate(given):
-        number = model.number(named, study.space)
+        number = model.number(named)
         if number is None:
             raise ComparisonError(
                 f"online.switching.sets.{i}: is none of the {len(model.sets)} parameter sets that "

@@ -162,7 +162,7 @@ class ErrorModel:
 
         Of each sequence its share, at least one, as far from each other in time: so mean errors
         stay what they are. (Frames that cover what all of them look like would be rare ones.) The
-        paired rule asks for as much fewer of them.
+        paired rule and the bank ask for as much fewer of them.
 
         Parameters
         ----------
@@ -208,14 +208,14 @@ class ErrorModel:
         """Numbers of the trials that the bank's sets are of."""
         return [self.trials[i] for i in self.bank]
 
-    def number(self, named: int | ParameterSet, space: ParameterSpace) -> int | None:
+    def number(self, named: int | ParameterSet) -> int | None:
         """Number of a trial's set, or of a set that is named by what differs from the baseline.
 
         None if the model does not know it.
         """
         if isinstance(named, int):
             return self.trials.index(named) if named in self.trials else None
-        whole = space.baseline | named
+        whole = self.space.baseline | named
         return self.sets.index(whole) if whole in self.sets else None
 
     def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
