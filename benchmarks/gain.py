@@ -190,12 +190,14 @@ def labelled(paths: list[Path]) -> tuple[list[LabelledSequence], NDArray[np.floa
     return sequences, sets
 
 
-def validate(paths: list[Path]) -> None:
+def validate(paths: list[Path], size: int) -> None:
     """Leave each sequence out in turn, and print what came of it."""
     sequences, sets = labelled(paths)
-    left_out = leave_one_out(sequences, sets).left_out
+    left_out = leave_one_out(sequences, sets, bank=size).left_out
     for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
-        of.errors["bank, even weights"] = evenly(sequence, sequences[:i] + sequences[i + 1 :], sets)
+        of.errors["bank, even weights"] = evenly(
+            sequence, sequences[:i] + sequences[i + 1 :], sets, size
+        )
     validation = Validation(left_out)
     print_summary(validation, validation.ratios)
     for mode in validation.modes:
@@ -206,11 +208,14 @@ def validate(paths: list[Path]) -> None:
 
 
 def evenly(
-    sequence: LabelledSequence, others: list[LabelledSequence], sets: NDArray[np.float64]
+    sequence: LabelledSequence,
+    others: list[LabelledSequence],
+    sets: NDArray[np.float64],
+    size: int,
 ) -> NDArray[np.float64]:
     """Errors of a bank whose members have the same weight anywhere."""
     data, _ = training_data(others, sets)
-    members = choose_bank(others, data.fixed, BANK_SIZE)
+    members = choose_bank(others, data.fixed, size)
     assert sequence.drive is not None
     n_periods = len(periods(sequence.drive.period)[0])
     weights = np.full((n_periods, len(members)), 1.0 / len(members))
@@ -401,6 +406,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11])
     parser.add_argument("--length", type=float, default=120.0, help="metres of a course")
     parser.add_argument("--odometries", nargs="+", default=ODOMETRIES, choices=ODOMETRIES)
+    parser.add_argument("--bank", type=int, default=BANK_SIZE, help="members of the bank")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--ablate", action="store_true", help="without one thing after the other")
     what.add_argument("--curve", action="store_true", help="with fewer training sequences")
@@ -422,7 +428,7 @@ def main() -> None:
         elif arguments.ablate:
             ablate(paths)
         else:
-            validate(paths)
+            validate(paths, arguments.bank)
 
 
 if __name__ == "__main__":

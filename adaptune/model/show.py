@@ -52,7 +52,7 @@ def _bank(model: ErrorModel) -> list[str]:
     sets = ", ".join(map(str, model.bank))
     kept = model.fusion.hedge
     if kept == 1.0:
-        return [f"Bank: sets {sets}; it was not shown to pay, and keeps to the first."]
+        return [f"Bank: sets {sets}; it was not shown to pay, and is not driven."]
     return [f"Bank: sets {sets}; the first has {100 * kept:.0f} % of the weight at least."]
 
 

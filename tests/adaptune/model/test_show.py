@@ -84,7 +84,10 @@ def test_a_file_that_is_no_model_is_refused_in_a_sentence(tmp_path):
 def test_a_bank_is_told(model, tmp_path):
     assert "Bank" not in shown(model, tmp_path)
     vectors = np.zeros((4, 2, 3), np.float32)
-    for hedge, told in ((1.0, "keeps to the first"), (0.25, "has 25 % of the weight at least")):
+    for hedge, told in (
+        (1.0, "it was not shown to pay, and is not driven."),
+        (0.25, "has 25 % of the weight at least"),
+    ):
         of_two = dataclasses.replace(
             model, bank=[0, 2], vectors=vectors, fusion=Settings(hedge=hedge)
         )
