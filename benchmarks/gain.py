@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Frames
 from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
+from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
 from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
 from adaptune.model import (
@@ -233,6 +234,8 @@ def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
             continue
         scans = list(simulate(course))[::PERIOD]
         of = {d: np.array([descriptor(d)(s) for s in scans], np.float32) for d in DESCRIPTORS}
+        stamps, poses = zip(*((scan.stamp, scan.T_world_sensor) for scan in scans), strict=True)
+        of[MOTION] = speed_and_turn_rate(np.array(stamps), np.array(poses)).astype(np.float32)
         with replacing(path) as beside, beside.open("wb") as file:
             np.savez_compressed(file, **of)  # type: ignore[arg-type]
         print(f"{name} is described", flush=True)
@@ -245,7 +248,8 @@ def by_descriptor(paths: list[Path], described: list[Path]) -> None:
     As if a scan looked in between as it did at the last full second, in every way the same.
     """
     of_ndt, sets = labelled(paths)
-    for names in (*((name,) for name in DESCRIPTORS), ("ndt", "ring_heights")):
+    pairs = (("ndt", name) for name in DESCRIPTORS if name != "ndt")
+    for names in (*((name,) for name in DESCRIPTORS), *pairs):
         sequences = []
         for sequence, path, file in zip(of_ndt, paths, described, strict=True):
             with np.load(path) as found, np.load(file) as its:
@@ -260,7 +264,7 @@ def by_descriptor(paths: list[Path], described: list[Path]) -> None:
             sequences.append(replace(sequence, drive=drive, **of_known))
         print(f"by {' and '.join(names)}: ", end="")
         validation = leave_one_out(sequences, sets)
-        print_summary(validation, validation.modes)
+        print_summary(validation, ["paired", "bank"])
 
 
 Take = Callable[[TrainingData], TrainingData]

@@ -51,7 +51,7 @@ def asking(rule: Rule, pca: ScaledPCA) -> Policy:
     current: int | None = None
     last: deque[NDArray[Any]] = deque(maxlen=WINDOW)
 
-    def select(scan: Scan) -> Selection:
+    def select(scan: Scan, *_: object) -> Selection:
         nonlocal current
         last.append(ndt_histogram(scan.points))
         selection = rule.select(pca.transform(np.mean(last, axis=0)[None])[0], current)
@@ -98,7 +98,7 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
         weights = tuple(1.0 / size for _ in members)
         policy = asking(rule, pca)
         if even:
-            policy = lambda _: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
+            policy = lambda *_: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
         return lambda: Bank(study.odometry, [sets[i] for i in members], WarmUp()), policy
 
     return sets, {

@@ -5,15 +5,18 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.archive import Frames, Trial
 from adaptune.descriptor import Describer, lowest_elevation
+from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.odometry import Box, Isolated
 from adaptune.odometry.base import prepared_bytes
 from adaptune.odometry.health import unhealthy
+from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.study import Study
 from offline.objective import trajectory_metrics
@@ -60,7 +63,7 @@ class PreparedSequence:
         for scan in self._sequence:
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
-            descriptors.append(describe(scan))
+            descriptors.append(_described(describe, scan, name))
             elevations.append(lowest_elevation(scan))
             if full:
                 continue
@@ -82,10 +85,14 @@ class PreparedSequence:
         at = np.array(stamps, np.int64)
         T_ref_sensor = reference.at(at)
         check_reference(study, name, T_ref_sensor)
+        described = np.array(descriptors)
+        # When a scan is to be described online, the pose of the one before is known.
+        motion = speed_and_turn_rate(at, T_ref_sensor)
+        fill_in(described[1:], describe.blocks, motion[:-1])
         self.frames = Frames(
             at,
             T_ref_sensor,
-            np.array(descriptors),
+            described,
             describe.blocks,
             np.array(elevations, np.float32),
         )
@@ -96,6 +103,13 @@ class PreparedSequence:
             for i, scan in enumerate(self._sequence):
                 if i >= len(self._kept):
                     yield self._box.prepare(scan)
+
+
+def _described(describe: Describer, scan: Scan, name: str) -> NDArray[np.float32]:
+    try:
+        return describe(scan)
+    except AdaptuneError as error:
+        raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
 def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:

@@ -4,6 +4,7 @@ import csv
 import json
 import logging
 import time
+from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
+from adaptune.descriptor.motion import SECOND, fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
@@ -29,8 +31,8 @@ _log = logging.getLogger(__name__)
 SCANS_TO_KNOW = 10
 """A sensor by: the median of so many scans that selections are made from."""
 
-Policy = Callable[[Scan], Selection]
-"""Chooses a parameter set for a scan."""
+Policy = Callable[[Scan, NDArray[np.float64]], Selection]
+"""Chooses a parameter set for a scan, and speed and turn rate before it, of shape (2,)."""
 
 
 class Choice(NamedTuple):
@@ -120,9 +122,11 @@ def adaptive(
     last: deque[NDArray[np.float32]] = deque(maxlen=model.window)
     current: int | None = None
 
-    def select(scan: Scan) -> Selection:
+    def select(scan: Scan, motion: NDArray[np.float64]) -> Selection:
         nonlocal current
-        last.append(describe(scan))
+        described = describe(scan)
+        fill_in(described, describe.blocks, motion)
+        last.append(described)
         mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
         if fitted.gated and foreign(scan):
@@ -133,7 +137,7 @@ def adaptive(
         return selection
 
     # The first call loads compiled code; the robot should not wait for that.
-    select(Scan(0, np.zeros((0, 3), np.float32)))
+    select(Scan(0, np.zeros((0, 3), np.float32)), np.zeros(2))
     last.clear()
     current = None
     return select
@@ -220,7 +224,7 @@ def replay(
             and (scan.stamp - first >= n_periods * period * 1e9)
         ):
             t = time.perf_counter()
-            selection = policy(scan)
+            selection = policy(scan, _motion(stamps, poses))
             parameters = sets[selection.set_index]
             seconds = time.perf_counter() - t
             if isinstance(odometry, Bank) and selection.weights is not None:
@@ -265,6 +269,15 @@ def replay(
         time.perf_counter() - begin,
         dict(unhealthy),
     )
+
+
+def _motion(stamps: list[int], poses: list[Poses]) -> NDArray[np.float64]:
+    """Speed and turn rate at the last pose, of shape (2,)."""
+    if not stamps:
+        return np.zeros(2)
+    begin = max(bisect_right(stamps, stamps[-1] - SECOND) - 1, 0)
+    recent = np.array(stamps[begin:], np.int64), np.array(poses[begin:])
+    return np.asarray(speed_and_turn_rate(*recent)[-1])
 
 
 def write_replay(folder: Path, result: Replay, about: dict[str, object]) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import plugins
+from adaptune.descriptor.motion import MOTION
 from adaptune.errors import AdaptuneError
 from adaptune.sequence import Scan
 
@@ -21,6 +22,8 @@ DESCRIPTORS = {
     "ring_heights": "adaptune.descriptor.polar:ring_heights",
     "range_image": "adaptune.descriptor.polar:range_image",
     "fpfh": "adaptune.descriptor.fpfh:fpfh",
+    "intensity": "adaptune.descriptor.intensity:intensity",
+    MOTION: "adaptune.descriptor.motion:unknown",
 }
 
 
@@ -53,6 +56,8 @@ def descriptor(name: str) -> Descriptor:
 
 class Describer:
     """Describes scans by one or several descriptors.
+
+    What `adaptune.descriptor.motion` tells is left zero, and filled in by those who know the poses.
 
     Parameters
     ----------

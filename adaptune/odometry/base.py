@@ -262,7 +262,8 @@ class Anchored(Odometry):
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
     if isinstance(prepared, Scan):
-        prepared = (prepared.points, prepared.times, prepared.rings, prepared.imu)
+        columns = (prepared.times, prepared.rings, prepared.intensities)
+        prepared = (prepared.points, *columns, prepared.imu)
     if isinstance(prepared, tuple):
         return sum(map(prepared_bytes, prepared))
     if prepared is None:

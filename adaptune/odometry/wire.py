@@ -12,8 +12,8 @@ The odometry answers each message with one of its own:
 type           holds                                                    answer
 =============  =======================================================  =========================
 ``hello``      version, odometry?, parameters, settings                 ``done``: see below
-``start``      stamp, points, times?, rings?, imu..?, pose, motion?     ``done``
-``register``   stamp, points, times?, rings?, imu..?                    ``pose``: see below
+``start``      as ``register``, and pose, motion?                       ``done``
+``register``   stamp, points, times?, rings?, intensities?, imu..?      ``pose``: see below
 ``configure``  parameters                                               ``done``
 =============  =======================================================  =========================
 
@@ -25,9 +25,9 @@ seconds that the odometry's process has computed, and memory, its peak in megaby
 forgets all scans.
 
 Points are float32 of shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16,
-poses and motions float64 of shape (4, 4), stamps integer nanoseconds. What an IMU measured since
-the scan before are four arrays: imu_stamps, int64; imu, float64 of shape (n, 6), rad/s and m/s^2;
-imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,), see
+intensities float32, poses and motions float64 of shape (4, 4), stamps integer nanoseconds. What an
+IMU measured since the scan before are four arrays: imu_stamps, int64; imu, float64 of shape (n, 6),
+rad/s and m/s^2; imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,), see
 `adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
 """
 
@@ -135,6 +135,7 @@ def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
         "points": scan.points,
         "times": scan.times,
         "rings": scan.rings,
+        "intensities": scan.intensities,
     }
     if scan.imu is not None:
         arrays["imu_stamps"] = scan.imu.stamps
@@ -152,8 +153,8 @@ def to_scan(message: Message) -> Scan:
         gyro, acceleration = np.hsplit(arrays["imu"], 2)
         noise = ImuNoise(*arrays["imu_noise"].tolist())
         imu = Imu(arrays["imu_stamps"], gyro, acceleration, arrays["imu_pose"], noise)
-    points, times, rings = arrays["points"], arrays.get("times"), arrays.get("rings")
-    return Scan(message.header["stamp"], points, times, rings, imu)
+    times, rings, intensities = map(arrays.get, ("times", "rings", "intensities"))
+    return Scan(message.header["stamp"], arrays["points"], times, rings, intensities, imu)
 
 
 Make = Callable[[str, ParameterSet, BaseSettings], Box]

@@ -27,16 +27,19 @@ from adaptune.sequence.scan import Scan
 
 _log = logging.getLogger(__name__)
 
-_VERSION = 2
+_VERSION = 3
 _SAMPLE = 1 << 16
 _CAP_GB = 50.0
 # A writer that has not written for this long is taken for dead.
 _DEAD = 3600.0
-_INDEX = np.dtype([("stamp", "<i8"), ("end", "<i8"), ("times", "?"), ("rings", "?")])
+# What a scan may be without.
+_OPTIONAL = ("times", "rings", "intensities")
+_INDEX = np.dtype([("stamp", "<i8"), ("end", "<i8"), *((name, "?") for name in _OPTIONAL)])
 _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "points": ("<f4", (3,)),
     "times": ("<f4", ()),
     "rings": ("<u2", ()),
+    "intensities": ("<f4", ()),
 }
 
 
@@ -105,7 +108,8 @@ class CachedScans:
         self._index = np.load(path / "index.npy")
         self._ends: list[int] = self._index["end"].tolist()
         # All at once: what is mapped stays even if another process removes the entry.
-        self._points, self._times, self._rings = map(self._map, _ARRAYS)
+        self._points = self._map("points")
+        self._optional = [self._map(name) for name in _OPTIONAL]
         # Says when the entry was last of use.
         os.utime(path / "about.json")
 
@@ -113,14 +117,11 @@ class CachedScans:
         return len(self._index)
 
     def __getitem__(self, i: int) -> Scan:
-        stamp, end, times, rings = self._index[i].item()
+        stamp, end, *given = self._index[i].item()
         part = slice(self._ends[i - 1] if i else 0, end)
-        return Scan(
-            stamp,
-            self._points[part],
-            self._times[part] if times else None,
-            self._rings[part] if rings else None,
-        )
+        columns = zip(self._optional, given, strict=True)
+        times, rings, intensities = (column[part] if there else None for column, there in columns)
+        return Scan(stamp, self._points[part], times, rings, intensities)
 
     def __iter__(self) -> Iterator[Scan]:
         return (self[i] for i in range(len(self)))
@@ -205,7 +206,7 @@ class Writer:
             name: _Growing(self._beside / f"{name}.npy", np.dtype(kind), shape)
             for name, (kind, shape) in _ARRAYS.items()
         }
-        self._index: list[tuple[int, int, bool, bool]] = []
+        self._index: list[tuple[int | bool, ...]] = []
 
     def __enter__(self) -> Self:
         return self
@@ -214,20 +215,15 @@ class Writer:
         """Add a scan."""
         n = len(scan)
         self._arrays["points"].append(scan.points)
-        for name, values in (("times", scan.times), ("rings", scan.rings)):
+        given = [getattr(scan, name) for name in _OPTIONAL]
+        for name, values in zip(_OPTIONAL, given, strict=True):
             array = self._arrays[name]
             if values is not None:
                 # Those before had none: their share is left empty.
                 array.append(np.zeros(self._arrays["points"].length - n - array.length))
                 array.append(values)
-        self._index.append(
-            (
-                scan.stamp,
-                self._arrays["points"].length,
-                scan.times is not None,
-                scan.rings is not None,
-            )
-        )
+        there = (values is not None for values in given)
+        self._index.append((scan.stamp, self._arrays["points"].length, *there))
 
     def done(self, **about: Any) -> None:
         """Say that the last scan was added, and note more of the sequence."""

@@ -129,8 +129,9 @@ class Messages:
 def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -> None:
     """Write scans, and an IMU's measurements where there are any, for another program.
 
-    Bags hold `POINTS` (x, y, z, intensity, which is 0, and ring and time where the scans have
-    them) and `IMU`. A KITTI folder holds sequence 00, its camera in the LiDAR's frame.
+    Bags hold `POINTS` (x, y, z, intensity, which is 0 where the scans have none, and ring and time
+    where they have them) and `IMU`. A KITTI folder holds sequence 00, its camera in the LiDAR's
+    frame.
 
     Parameters
     ----------
@@ -172,6 +173,8 @@ def _structured(scan: Scan) -> NDArray[Any]:
         kinds.append(("time", "<f4"))
     cloud = np.zeros(len(scan), kinds)
     cloud["x"], cloud["y"], cloud["z"] = scan.points.T
+    if scan.intensities is not None:
+        cloud["intensity"] = scan.intensities
     if scan.rings is not None:
         cloud["ring"] = scan.rings
     if scan.times is not None:
@@ -193,8 +196,11 @@ def _write_kitti(scans: Iterable[Scan], path: Path) -> None:
     stamps = []
     for number, scan in enumerate(scans):
         stamps.append(scan.stamp)
-        cloud = np.column_stack([scan.points, np.zeros(len(scan), np.float32)])
-        (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.astype("<f4").tobytes())
+        cloud = np.zeros((len(scan), 4), "<f4")
+        cloud[:, :3] = scan.points
+        if scan.intensities is not None:
+            cloud[:, 3] = scan.intensities
+        (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.tobytes())
     write_kitti_times(sequence, (np.array(stamps) - stamps[0]) * 1e-9, np.eye(4))
 
 

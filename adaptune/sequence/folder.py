@@ -158,7 +158,8 @@ def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
         return _open3d_fields(path)
     if array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(f"an array of shape {array.shape} is not one of points")
-    return {axis: array[:, i] for i, axis in enumerate("xyz")}
+    columns = {axis: array[:, i] for i, axis in enumerate("xyz")}
+    return columns | {"intensity": array[:, 3]} if path.suffix == ".bin" else columns
 
 
 def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:

@@ -17,6 +17,7 @@ from adaptune.sequence.timing import AUTO, TIME_FIELDS, Timing, TimingError
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
+INTENSITY_FIELDS = ("intensity", "reflectivity")
 
 
 class PointCloudError(AdaptuneError):
@@ -178,32 +179,48 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
     time = next((name for name in TIME_FIELDS if name in names), None)
     ring = next((name for name in RING_FIELDS if name in names), None)
-    columns = {name: raw[name] for name in (*"xyz", time, ring) if name}
+    # What nothing needs is no reason to refuse a cloud.
+    numbers = (n for n in INTENSITY_FIELDS if n in names and raw[n].ndim == 1)
+    intensity = next((name for name in numbers if raw[name].dtype.kind in "iuf"), None)
+    columns = {name: raw[name] for name in (*"xyz", time, ring, intensity) if name}
     for name, column in columns.items():
         if column.ndim != 1 or column.dtype.kind not in "iuf":
             raise PointCloudError(f"field {name!r} is not one number for each point")
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = (np.asarray(columns[axis], np.float32) for axis in "xyz")
         given_rings = _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16)
+        given_intensities = (
+            _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32)
+        )
     given_times = _NO_TIMES if time is None else _native(columns[time])
     n = len(x)
     points = np.empty((n, 3), np.float32)
     times = np.empty(len(given_times), given_times.dtype)
     rings = np.empty(len(given_rings), np.uint16)
+    intensities = np.empty(len(given_intensities), np.float32)
     gather, compact = _kernels(times.dtype.str)
-    valid, low, high = gather(x, y, z, given_times, given_rings, points, times, rings)
+    made = (points, times, rings, intensities)
+    valid, low, high = gather(x, y, z, given_times, given_rings, given_intensities, *made)
     if valid < n:
-        _, low, high = compact(points, times, rings)
+        _, low, high = compact(*made)
         # Others are not to be kept in memory with them.
-        points, times, rings = points[:valid].copy(), times[:valid].copy(), rings[:valid].copy()
+        points, times = points[:valid].copy(), times[:valid].copy()
+        rings, intensities = rings[:valid].copy(), intensities[:valid].copy()
     try:
         start, seconds = timing.resolve(stamp, None if time is None else times, (low, high))
     except TimingError as error:
         raise PointCloudError(str(error)) from error
-    return Scan(start, points, seconds, None if ring is None else rings)
+    return Scan(
+        start,
+        points,
+        seconds,
+        None if ring is None else rings,
+        None if intensity is None else intensities,
+    )
 
 
 _NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
+_NO_INTENSITIES = np.empty(0, np.float32)
 
 
 def _native(values: NDArray[Any]) -> NDArray[Any]:
@@ -221,12 +238,14 @@ def _gather(
     z: NDArray[np.float32],
     given_times: NDArray[Any],
     given_rings: NDArray[np.uint16],
+    given_intensities: NDArray[np.float32],
     points: NDArray[np.float32],
     times: NDArray[Any],
     rings: NDArray[np.uint16],
+    intensities: NDArray[np.float32],
 ) -> tuple[int, Any, Any]:
     """Put each field side by side; count the valid points, and find the extent of times."""
-    timed, ringed = len(given_times) > 0, len(given_rings) > 0
+    timed, ringed, lit = len(given_times) > 0, len(given_rings) > 0, len(given_intensities) > 0
     low = high = given_times[0] if timed else times.dtype.type(0)
     valid = 0
     for i in range(len(x)):
@@ -244,15 +263,21 @@ def _gather(
             good &= t - t == 0
         if ringed:
             rings[i] = given_rings[i]
+        if lit:
+            light = given_intensities[i]
+            intensities[i] = light if light - light == _ZERO else _ZERO
         valid += good
     return valid, low, high
 
 
 def _compact(
-    points: NDArray[np.float32], times: NDArray[Any], rings: NDArray[np.uint16]
+    points: NDArray[np.float32],
+    times: NDArray[Any],
+    rings: NDArray[np.uint16],
+    intensities: NDArray[np.float32],
 ) -> tuple[int, Any, Any]:
     """Move the valid points to the front; count them, and find the extent of their times."""
-    timed, ringed = len(times) > 0, len(rings) > 0
+    timed, ringed, lit = len(times) > 0, len(rings) > 0, len(intensities) > 0
     low = high = times.dtype.type(0)
     count = 0
     for i in range(len(points)):
@@ -272,6 +297,8 @@ def _compact(
             low, high = (min(low, t), max(high, t)) if count else (t, t)
         if ringed:
             rings[count] = rings[i]
+        if lit:
+            intensities[count] = intensities[i]
         count += 1
     return count, low, high
 
@@ -288,8 +315,13 @@ def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     types: Any = numba.types
     real, whole, time = numba.float32, numba.uint16, numba.from_dtype(np.dtype(kind))
-    scan = (types.Array(real, 2, "C"), types.Array(time, 1, "C"), types.Array(whole, 1, "C"))
+    scan = (
+        types.Array(real, 2, "C"),
+        types.Array(time, 1, "C"),
+        types.Array(whole, 1, "C"),
+        types.Array(real, 1, "C"),
+    )
     told = types.Tuple((numba.int64, time, time))
     compiled = partial(numba.njit, nogil=True, cache=True)
-    given = (column(real), column(real), column(real), column(time), column(whole))
+    given = (*3 * (column(real),), column(time), column(whole), column(real))
     return compiled(told(*given, *scan))(_gather), compiled(told(*scan))(_compact)

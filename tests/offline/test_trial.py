@@ -34,6 +34,22 @@ def test_a_good_trial(study):
     np.testing.assert_array_equal(trial.errors, expected)
 
 
+def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_path):
+    study = load_study(study_file, ["descriptor=[ndt, motion]"], tmp_path)
+    frames = PreparedSequence(study, "one", 1e9).frames
+    assert frames.blocks == {"ndt": 90, "motion": 2}
+    np.testing.assert_allclose(frames.descriptors[:2, 90], 0.0)
+    # 0.3 m a scan, ten scans a second.
+    np.testing.assert_allclose(frames.descriptors[2:, 90], 3.0, rtol=0.1)
+    assert frames.descriptors[:, :90].any()
+
+
+def test_what_cannot_be_described_names_the_sequence(study_file, tmp_path):
+    study = load_study(study_file, ["descriptor=[ndt, intensity]"], tmp_path)
+    with pytest.raises(AdaptuneError, match=r"sequences.one: the points of .* no intensity"):
+        PreparedSequence(study, "one", 1e9)
+
+
 def test_trials_side_by_side_are_those_one_by_one(study):
     sequence = PreparedSequence(study, "one", 1e9)
     sets = [GOOD, GOOD | {"keyframe_interval": 5.0}, GOOD | {"max_correspondence_distance": 0.2}]

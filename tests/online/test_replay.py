@@ -57,9 +57,10 @@ HEALTH = HealthCheck(max_speed=5.0, max_acceleration=20.0)
 
 def test_selects_at_the_first_scan_and_then_every_period_before_registering():
     box = Scripted()
-    asked = []
+    asked, moves = [], []
 
-    def policy(scan):
+    def policy(scan, motion):
+        moves.append(motion.tolist())
         asked.append(scan.stamp)
         return Selection(len(asked) % 2, 1.0, 2.0)
 
@@ -67,6 +68,9 @@ def test_selects_at_the_first_scan_and_then_every_period_before_registering():
     result = replay(scans(stamps), box, HEALTH, policy, [{"speed": 3.0}, {"speed": 4.0}])
     assert [s / 1e9 for s in asked] == [0.0, 1.0, 2.3, 4.95, 5.0]
     assert [c.stamp for c in result.choices] == asked
+    # From the last pose a second before the last one: 0.1 m a scan.
+    speeds = [0, 0.2 / 0.8, 0.3 / (1.9 - 0.8), 0.2 / (2.3 - 1.2), 0.1 / (4.95 - 2.3)]
+    np.testing.assert_allclose(moves, [[speed, 0.0] for speed in speeds], atol=1e-6)
     assert [c.parameters["speed"] for c in result.choices] == [4.0, 3.0, 4.0, 3.0, 4.0]
     # The change comes before the scan that it was made from.
     assert box.events[:2] == [("configure", 4.0), ("start", 0, 0.0, None)]
@@ -170,7 +174,7 @@ def test_an_odometry_that_is_not_live_is_refused():
         live = False
 
     with pytest.raises(OdometryError, match="cannot change its parameters"):
-        replay(scans([0.0]), Stiff(), HEALTH, lambda _: Selection(0, 1.0, 1.0), [{"speed": 1.0}])
+        replay(scans([0.0]), Stiff(), HEALTH, lambda *_: Selection(0, 1.0, 1.0), [{"speed": 1.0}])
 
 
 def test_a_real_replay_is_the_same_every_time(tmp_path):
@@ -180,7 +184,7 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
         {"max_correspondence_distance": 0.7, "keyframe_interval": 3.0},
     ]
 
-    def policy(scan):
+    def policy(scan, _):
         return Selection(scan.stamp // 10**9 % 2, 0.5, 1.0)
 
     results = [replay(drive, KeyframeGicp(sets[0]), HealthCheck(), policy, sets) for _ in range(2)]
@@ -224,11 +228,11 @@ def test_scans_of_another_sensor_get_the_fixed_set(caplog):
     )
     for sensor, chosen in (("hdl32e", 1), ("vlp16", 0)):
         select = adaptive(model, "paired")
-        selections = [select(scan) for scan in drive_cave(sensor, 3)]
+        selections = [select(scan, np.zeros(2)) for scan in drive_cave(sensor, 3)]
         assert np.mean([s.set_index == chosen for s in selections]) > 0.9
     assert [r.levelname for r in caplog.records] == ["WARNING"]
     assert "-15 degrees, those of training at -31" in caplog.text
     assert all(s.set_index == 0 and s.familiarity == 0.0 for s in selections)
     # The published rule has no such doubts.
     select = adaptive(model, "paper")
-    assert all(select(scan).set_index == 1 for scan in drive_cave("vlp16", 3))
+    assert all(select(scan, np.zeros(2)).set_index == 1 for scan in drive_cave("vlp16", 3))

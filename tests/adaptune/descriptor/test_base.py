@@ -15,10 +15,17 @@ from adaptune.descriptor import (
     descriptor,
     lowest_elevation,
 )
+from adaptune.descriptor.motion import MOTION
 from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.sequence import Scan
 
 EMPTY = Scan(0, np.empty((0, 3), np.float32))
+
+
+def lit(points):
+    """A scan of what reflects the more the higher it is."""
+    return Scan(0, points, intensities=100.0 + points[:, 2])
+
 
 MINE = """
 import numpy as np
@@ -53,9 +60,9 @@ def test_every_descriptor_describes_any_scan_by_as_many_numbers(name):
     sizes = set()
     for scan in (
         EMPTY,
-        turns.turn(0),
-        Scan(0, turns.turn(0).points[:1]),
-        Scan(0, turns.turn(1).points),
+        lit(turns.turn(0).points),
+        lit(turns.turn(0).points[:1]),
+        lit(turns.turn(1).points),
     ):
         described = describe(scan)
         assert described.dtype == np.float32
@@ -64,13 +71,13 @@ def test_every_descriptor_describes_any_scan_by_as_many_numbers(name):
     assert sizes == {(describe.blocks[name],)}
 
 
-@pytest.mark.parametrize("name", DESCRIPTORS)
+@pytest.mark.parametrize("name", DESCRIPTORS.keys() - {MOTION})
 def test_every_descriptor_tells_places_apart_and_not_headings(name):
     describe = Describer([name])
     here, there = turns.turn(0).points, turns.turn(40).points
     # The street's end, and the same place faced backwards: columns of rays stay where they were.
     turned = here * np.array([-1, -1, 1], np.float32)
-    one, other, again = (describe(Scan(0, points)) for points in (here, there, turned))
+    one, other, again = (describe(lit(points)) for points in (here, there, turned))
     assert np.linalg.norm(one - again) < 0.3 * np.linalg.norm(one - other)
 
 

@@ -212,10 +212,14 @@ def test_what_an_imu_measured_arrives():
     )
     for given in (imu, imu.part(0, 0), None):
         sent = io.BytesIO()
-        whole = Scan(7, np.ones((5, 3), np.float32), imu=given)
+        light = np.arange(5, dtype=np.float32)
+        whole = Scan(7, np.ones((5, 3), np.float32), intensities=light, imu=given)
         wire.send(sent, {"type": "register", "stamp": 7}, **wire.scan_arrays(whole))
         sent.seek(0)
-        got = wire.to_scan(wire.receive(sent)).imu
+        there = wire.to_scan(wire.receive(sent))
+        assert there.times is there.rings is None
+        np.testing.assert_array_equal(there.intensities, light)
+        got = there.imu
         for name in ("stamps", "angular_velocity", "acceleration", "T_sensor_imu", "noise"):
             np.testing.assert_array_equal(getattr(got, name, None), getattr(given, name, None))
 

@@ -81,7 +81,7 @@ def test_a_changed_bag_is_decoded_anew(rec: Any, tmp_path: Path) -> None:
     assert len(list(open_sequence(SequenceConfig(bag=str(rec.drive(path, n=4)))))) == 4
 
 
-def test_scans_without_times_rings_or_points_are_kept_as_they_are() -> None:
+def test_scans_without_times_rings_intensities_or_points_are_kept_as_they_are() -> None:
     points = np.arange(6, dtype=np.float32).reshape(2, 3)
     times, rings = np.array([0, 0.1], np.float32), np.array([1, 2], np.uint16)
     scans = [
@@ -91,13 +91,14 @@ def test_scans_without_times_rings_or_points_are_kept_as_they_are() -> None:
         Scan(4, points + 2, None, rings),
         Scan(5, points + 3, times + 1, rings + 1),
         Scan(6, points[:0], times[:0], rings[:0]),
+        Scan(7, points + 4, None, None, times + 2),
     ]
     list(cache.tee(scans, "key", {"name": "a"}))
     kept = cache.find("key")
     assert kept is not None
-    assert kept.stamps.tolist() == [1, 2, 3, 4, 5, 6]
+    assert kept.stamps.tolist() == [1, 2, 3, 4, 5, 6, 7]
     for i, scan in enumerate(scans):
-        for name in ("points", "times", "rings"):
+        for name in ("points", "times", "rings", "intensities"):
             a, b = getattr(scan, name), getattr(kept[i], name)
             assert (a is None and b is None) or np.array_equal(a, b)
 

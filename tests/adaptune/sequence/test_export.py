@@ -10,7 +10,8 @@ FIRST = 1_700_000_000_123_456_000
 
 def scans(n=3):
     return [
-        Scan(FIRST + s.stamp, s.points, s.times, s.rings) for s in (turns.turn(i) for i in range(n))
+        Scan(FIRST + s.stamp, s.points, s.times, s.rings, s.points[:, 0] % 255.0)
+        for s in (turns.turn(i) for i in range(n))
     ]
 
 
@@ -29,6 +30,7 @@ def test_bags_hold_all_that_scans_hold(tmp_path, layout):
         assert abs(found.stamp - scan.stamp) < 1000
         np.testing.assert_array_equal(found.points, scan.points)
         np.testing.assert_array_equal(found.rings, scan.rings)
+        np.testing.assert_array_equal(found.intensities, scan.intensities)
         np.testing.assert_allclose(found.times, scan.times, atol=1e-6)
     found = sequence.imu()
     np.testing.assert_array_equal(found.stamps, imu.stamps)
@@ -52,3 +54,4 @@ def test_a_kitti_folder(tmp_path):
     for i, (there, scan) in enumerate(zip(found, scans(), strict=True)):
         assert there.stamp == pytest.approx(i * 10**8, abs=1000)
         np.testing.assert_array_equal(there.points, scan.points)
+        np.testing.assert_array_equal(there.intensities, scan.intensities)

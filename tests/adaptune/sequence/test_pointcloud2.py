@@ -106,10 +106,11 @@ def test_any_layout_gives_the_points_written(
         elements=st.sampled_from([0.0, 1.0, -2.5, np.nan, np.inf, -np.inf]),
     )
 )
-def test_points_that_are_not_measurements_are_dropped_with_their_time_and_ring(
+def test_points_that_are_not_measurements_are_dropped_with_all_that_is_theirs(
     rec: Any, points: np.ndarray
 ) -> None:
     raw = rec.velodyne(points)
+    raw["intensity"] = np.where(np.arange(len(points)) % 5, np.arange(len(points)), np.nan)
     keep = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
     scan = decode(rec.cloud(raw))
     assert np.array_equal(scan.points, points[keep])
@@ -117,6 +118,21 @@ def test_points_that_are_not_measurements_are_dropped_with_their_time_and_ring(
     assert scan.rings is not None
     assert np.array_equal(scan.times, raw["time"][keep])
     assert np.array_equal(scan.rings, raw["ring"][keep])
+    assert scan.intensities is not None
+    assert np.array_equal(scan.intensities, np.nan_to_num(raw["intensity"][keep]))
+
+
+@pytest.mark.parametrize(
+    ("field", "kind", "known"),
+    [("intensity", "<u1", True), ("reflectivity", "<u2", True), ("intensity", "(3,)<f4", False)],
+)
+def test_intensities_of_any_kind(rec: Any, field: str, kind: str, known: bool) -> None:
+    values = np.ones((4, 3) if "(" in kind else 4)
+    scan = decode(rec.cloud(raw_of(4, **{field: (kind, values)})))
+    assert (scan.intensities is not None) == known
+    if scan.intensities is not None:
+        assert scan.intensities.dtype == np.float32
+        assert scan.intensities.tolist() == [1.0] * 4
 
 
 def test_a_point_whose_time_is_not_finite_is_dropped(rec: Any) -> None:
