@@ -18,6 +18,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +28,16 @@ from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevat
 from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
 from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
+from adaptune.metrics import cap
 from adaptune.model import (
     RULES,
     PairedExpectedRatio,
+    PairedFusion,
     Rule,
     Selection,
     Settings,
     TrainingData,
+    fusion,
 )
 from adaptune.model.base import complementary
 from adaptune.simulation import Course, simulate
@@ -52,6 +56,7 @@ from offline.validation import (
     leave_one_out,
     training_data,
     tune,
+    tune_bank,
 )
 
 ODOMETRIES = ("gicp", "ndt")
@@ -196,9 +201,7 @@ def validate(paths: list[Path], size: int) -> None:
     sequences, sets = labelled(paths)
     left_out = leave_one_out(sequences, sets, bank=size).left_out
     for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
-        of.errors["bank, even weights"] = evenly(
-            sequence, sequences[:i] + sequences[i + 1 :], sets, size
-        )
+        of.errors |= constantly(sequence, sequences[:i] + sequences[i + 1 :], sets, size)
     validation = Validation(left_out)
     print_summary(validation, validation.ratios)
     for mode in validation.modes:
@@ -208,19 +211,37 @@ def validate(paths: list[Path], size: int) -> None:
     print(f"if the best of 1, 2, ... complementary sets were known: {known}", flush=True)
 
 
-def evenly(
+Errors = dict[str, NDArray[np.float64]]
+"""Of a sequence in several modes, capped, at each frame that has a sub-trajectory."""
+
+
+def constantly(
     sequence: LabelledSequence,
     others: list[LabelledSequence],
     sets: NDArray[np.float64],
     size: int,
-) -> NDArray[np.float64]:
-    """Errors of a bank whose members have the same weight anywhere."""
+) -> Errors:
+    """Errors of a bank whose weights are the same all the way."""
     data, _ = training_data(others, sets)
     members = choose_bank(others, data.fixed, size)
+    assert sequence.vectors is not None
+    vectors, lost = fusion.limited(sequence.vectors[:, members], 0)
+    squares = np.einsum("ijx,ikx->jk", vectors, vectors) + np.diag((lost**2).sum(axis=0))
+    return {
+        "bank, even weights": bank_errors(sequence, members, np.full(size, 1.0 / size)),
+        # Nobody knows them who has not been there.
+        "bank, best weights": bank_errors(sequence, members, fusion.least(squares)),
+    }
+
+
+def bank_errors(
+    sequence: LabelledSequence, members: Sequence[int], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Errors of a bank with weights of shape (n_members,) or (n_periods, n_members)."""
     assert sequence.drive is not None
     n_periods = len(periods(sequence.drive.period)[0])
-    weights = np.full((n_periods, len(members)), 1.0 / len(members))
-    errors = sequence.drive.errors(members, weights)
+    of_periods = np.broadcast_to(weights, (n_periods, len(members)))
+    errors = sequence.drive.errors(members, of_periods)
     return errors[~np.isnan(errors)]
 
 
@@ -344,8 +365,34 @@ class Unafraid(PairedExpectedRatio):
         return np.ones(len(squared))
 
 
-def ablate(paths: list[Path]) -> None:
-    """Leave each sequence out in turn, and from the rule one ingredient after the other."""
+class UnafraidFusion(Unafraid, PairedFusion):
+    """The same, of a bank."""
+
+
+class Between(PairedExpectedRatio):
+    """One that knows each set, but for the fixed one, by its neighbours alone.
+
+    As if it were to be chosen between those that were tried.
+    """
+
+    def _evidence(self) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        fixed, mixed = super()._evidence()
+        sets, errors = self.data_.sets, cap(self.data_.errors)
+        squared = ((sets[:, None] - sets[self.candidates_]) ** 2).sum(axis=2)
+        # Nobody is as near as the set itself would be.
+        kernel = np.exp(-0.5 * (squared - _nearest_other(squared)) / self.settings.width**2)
+        kernel[squared == 0.0] = 0.0
+        alone = (errors @ (kernel / kernel.sum(axis=0))).astype(np.float32)
+        at = self.candidates_ == self.data_.fixed
+        return fixed, np.where(at, mixed, alone)
+
+
+def _nearest_other(squared: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.where(squared > 0.0, squared, np.inf).min(axis=0))
+
+
+def ablate(paths: list[Path], size: int) -> None:
+    """Leave each sequence out in turn, and from the rules one ingredient after the other."""
     sequences, sets = labelled(paths)
     tuned: dict[str, Settings] = {}
 
@@ -376,10 +423,64 @@ def ablate(paths: list[Path]) -> None:
             "familiar everywhere": maker(Unafraid),
             "sharpness 12": maker(paired, n_sets=3, sharpness=12.0),
             "sharpness 48": maker(paired, n_sets=3, sharpness=48.0),
+            "sharpness 12, all sets": maker(paired, n_sets=None, sharpness=12.0),
+            "and by their neighbours alone": maker(Between, n_sets=None, sharpness=12.0),
         },
         bank=0,
     )
+    left_out = validation.left_out
+    for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
+        of.errors |= banks(sequence, sequences[:i] + sequences[i + 1 :], sets, size)
+    validation = Validation(left_out)
     print_summary(validation, [mode for mode in validation.ratios if mode != "baseline"])
+
+
+def banks(
+    sequence: LabelledSequence,
+    others: list[LabelledSequence],
+    sets: NDArray[np.float64],
+    size: int,
+) -> Errors:
+    """Errors of a bank on the sequence left out, and without one ingredient after the other."""
+    data, pca = training_data(others, sets)
+    members = choose_bank(others, data.fixed, size)
+    settings = tune_bank(others, sets, members, data.fixed)
+    vectors = np.concatenate([s.vectors[:, members] for s in others if s.vectors is not None])
+    data = replace(data, candidates=members, vectors=vectors)
+    assert sequence.drive is not None
+    first, _ = periods(sequence.drive.period)
+    features = pca.transform(sequence.drive.descriptors[first])
+
+    def driven(
+        make: type[PairedFusion] = PairedFusion,
+        limit: float = fusion.LIMIT,
+        ridge: float = fusion.RIDGE,
+        last: int = fusion.STEADY,
+        **changed: Any,
+    ) -> NDArray[np.float64]:
+        # A bank that is not worth driving is not driven.
+        if settings.hedge == 1.0:
+            return cap(sequence.errors[:, data.fixed])
+        with patch.multiple(fusion, LIMIT=limit, RIDGE=ridge, STEADY=last):
+            rule = make(settings.model_copy(update=changed)).fit(data)
+            weights = fusion.steady(rule.weigh(rule.near(features))[0])
+        return bank_errors(sequence, members, weights)
+
+    found = {
+        "bank": driven(),
+        "bank, sequences weigh the same": driven(sharpness=0.0),
+        "bank, sharpness 12": driven(sharpness=12.0),
+        "bank, sharpness 48": driven(sharpness=48.0),
+        "bank, nothing kept": driven(hedge=0.0),
+        "bank, half kept": driven(hedge=0.5),
+        "bank, familiar everywhere": driven(make=UnafraidFusion),
+        "bank, the 100 nearest frames": driven(n_frames=100),
+        "bank, errors count in full": driven(limit=1e9),
+        "bank, likes do not share": driven(ridge=0.0),
+        "bank, weights of each second": driven(last=1),
+        "bank, weights of 20 seconds": driven(last=20),
+    }
+    return found | constantly(sequence, others, sets, size)
 
 
 def curve(paths: list[Path]) -> None:
@@ -430,7 +531,7 @@ def main() -> None:
         elif arguments.curve:
             curve(paths)
         elif arguments.ablate:
-            ablate(paths)
+            ablate(paths, arguments.bank)
         else:
             validate(paths, arguments.bank)
 

@@ -728,7 +728,7 @@ def _bank_tried(
     logs = []
     for sharpness in SHARPNESS:
         rule.settings = Settings(sharpness=sharpness, n_frames=BANK_FRAMES)
-        weights, _ = rule.weigh(near)
+        weights = fusion.steady(rule.weigh(near)[0])
         for hedge in HEDGES:
             hedged = (1.0 - hedge) * weights
             hedged[:, 0] += hedge
@@ -783,5 +783,5 @@ def _driven(
         return cap(sequence.errors[:, data.fixed]), 0.0
     rule, near = _fusion(sequence, others, data, pca, members)
     rule.settings = settings
-    weights, _ = rule.weigh(near)
+    weights = fusion.steady(rule.weigh(near)[0])
     return _bank_errors(sequence, members, weights), float(1.0 - weights[:, 0].mean())

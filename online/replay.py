@@ -20,6 +20,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
 from adaptune.model import RULES, ErrorModel, PairedFusion, Selection
+from adaptune.model.fusion import STEADY, steady
 from adaptune.odometry import Bank, Box, HealthCheck
 from adaptune.odometry.health import Guard
 from adaptune.sequence import Scan
@@ -120,6 +121,7 @@ def adaptive(
         )
     foreign = _foreign(model)
     last: deque[NDArray[np.float32]] = deque(maxlen=model.window)
+    weights: deque[tuple[float, ...]] = deque(maxlen=STEADY)
     current: int | None = None
 
     def select(scan: Scan, motion: NDArray[np.float64]) -> Selection:
@@ -129,16 +131,22 @@ def adaptive(
         last.append(described)
         mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
+        if selection.weights is not None and members is not None:
+            weights.append(selection.weights)
+            shares = steady(np.array(weights))[-1]
+            heaviest = members[int(shares.argmax())]
+            selection = selection._replace(set_index=heaviest, weights=tuple(shares.tolist()))
         if fitted.gated and foreign(scan):
             fixed = selection.predicted_fixed
-            weights = tuple(float(i == data.fixed) for i in members or ()) if fused else None
-            selection = Selection(data.fixed, fixed, fixed, 0.0, weights=weights)
+            alone = tuple(float(i == data.fixed) for i in members or ()) if fused else None
+            selection = Selection(data.fixed, fixed, fixed, 0.0, weights=alone)
         current = selection.set_index
         return selection
 
     # The first call loads compiled code; the robot should not wait for that.
     select(Scan(0, np.zeros((0, 3), np.float32)), np.zeros(2))
     last.clear()
+    weights.clear()
     current = None
     return select
 

@@ -15,6 +15,8 @@ LIMIT = 6.0
 track is left out of the mean, and does not cost what it would alone."""
 RIDGE = 0.05
 """Added to mean squares, as a share of the fixed set's, so that like members share the weight."""
+STEADY = 5
+"""Selections whose weights are averaged: errors cancel each other while weights stay the same."""
 POOL = 64
 """A bank's members are sought among so many of the best sets."""
 
@@ -29,6 +31,10 @@ class PairedFusion(PairedExpectedRatio):
 
     For each training sequence S is of the frames nearest to the scan, divided by the fixed set's
     mean square there. Sequences weigh as in `PairedExpectedRatio`, and no weight is negative.
+
+    What is found at one scan is noise in part, and members' errors of some seconds cancel each
+    other only while the weights stay: what is driven with is the mean over a few selections, see
+    `steady`.
 
     Parameters
     ----------
@@ -100,6 +106,24 @@ class PairedFusion(PairedExpectedRatio):
             float(1.0 / (of_sequences @ of_sequences)),
             tuple(weights.tolist()),
         )
+
+
+def steady(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the weights at each selection and at those before it, `STEADY` at most.
+
+    Parameters
+    ----------
+    weights
+        Found at one selection after the other, of shape (n_selections, n_members).
+
+    Returns
+    -------
+    ndarray of shape (n_selections, n_members)
+    """
+    total = weights.copy()
+    for k in range(1, STEADY):
+        total[k:] += weights[:-k]
+    return np.asarray(total / np.minimum(np.arange(1, len(weights) + 1), STEADY)[:, None])
 
 
 def limited(

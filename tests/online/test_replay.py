@@ -7,7 +7,7 @@ import pytest
 
 from adaptune.descriptor.ndt import describe
 from adaptune.errors import AdaptuneError
-from adaptune.model import ErrorModel, Selection
+from adaptune.model import ErrorModel, PairedFusion, Selection
 from adaptune.odometry import HealthCheck, Odometry, OdometryError, Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.sequence import Scan
@@ -207,11 +207,11 @@ def drive_cave(sensor, seed):
     return [Scan(s.stamp, s.points) for s in list(simulate(course))[::10]]
 
 
-def test_scans_of_another_sensor_get_the_fixed_set(caplog):
-    """A cave looks alike to many sensors; what lies lowest does not."""
+def of_two_caves():
+    """Fitted to scans of an HDL-32E."""
     drives = [drive_cave("hdl32e", seed) for seed in (1, 2)]
     trained = [scan for drive in drives for scan in drive]
-    model = ErrorModel(
+    return ErrorModel(
         odometry={"name": "gicp"},
         space=Scripted.space,
         sets=[{"speed": 1.0}, {"speed": 8.0}],
@@ -225,7 +225,14 @@ def test_scans_of_another_sensor_get_the_fixed_set(caplog):
         errors=np.tile(np.float32([1.0, 0.1]), (len(trained), 1)),
         provenance={},
         elevations=[-30.7, -30.7],
+        bank=[0, 1],
+        vectors=np.zeros((len(trained), 2, 3), np.float32),
     )
+
+
+def test_scans_of_another_sensor_get_the_fixed_set(caplog):
+    """A cave looks alike to many sensors; what lies lowest does not."""
+    model = of_two_caves()
     for sensor, chosen in (("hdl32e", 1), ("vlp16", 0)):
         select = adaptive(model, "paired")
         selections = [select(scan, np.zeros(2)) for scan in drive_cave(sensor, 3)]
@@ -236,3 +243,26 @@ def test_scans_of_another_sensor_get_the_fixed_set(caplog):
     # The published rule has no such doubts.
     select = adaptive(model, "paper")
     assert all(select(scan, np.zeros(2)).set_index == 1 for scan in drive_cave("vlp16", 3))
+
+
+def test_a_banks_weights_change_slowly(monkeypatch):
+    found = [(1.0, 0.0), (0.0, 1.0), (0.0, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0)]
+    model, left = of_two_caves(), []
+
+    def select(*_):
+        weights = left.pop(0) if left else (1.0, 0.0)
+        return Selection(int(np.argmax(weights)), 0.2, 1.0, 1.0, 2.0, weights)
+
+    monkeypatch.setattr(PairedFusion, "select", select)
+    policy = adaptive(model, "paired", members=[0, 1])
+    left[:] = found
+    selections = [policy(scan, np.zeros(2)) for scan in drive_cave("hdl32e", 3)[: len(found)]]
+    for i, selection in enumerate(selections):
+        mean = np.mean(found[max(0, i - 4) : i + 1], axis=0)
+        np.testing.assert_allclose(selection.weights, mean)
+        assert selection.set_index == np.argmax(mean)
+    # Another sensor leaves the fixed set all the weight, and at once.
+    policy = adaptive(model, "paired", members=[0, 1])
+    left[:] = found[1:3]
+    for scan in drive_cave("vlp16", 3)[:2]:
+        assert policy(scan, np.zeros(2)).weights == (1.0, 0.0)

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from adaptune.metrics import FAILURE
 from adaptune.model import PairedFusion, Settings, TrainingData
-from adaptune.model.fusion import LIMIT, RIDGE, bank, least, limited
+from adaptune.model.fusion import LIMIT, RIDGE, STEADY, bank, least, limited, steady
 
 
 def places(rng, n_places=6, n=40, n_sets=4):
@@ -123,3 +123,12 @@ def test_a_bank_is_of_sets_whose_errors_cancel():
     # What was not run everywhere is no member.
     errors[3][:, 2] = np.nan
     assert sorted(bank(vectors, errors, 1, 4)) == [0, 1, 3]
+
+
+@given(st.integers(1, 20), st.integers(0, 100))
+def test_steady_weights_are_means_of_the_last(n, seed):
+    weights = np.random.default_rng(seed).dirichlet(np.ones(3), n)
+    found = steady(weights)
+    for i in range(n):
+        np.testing.assert_allclose(found[i], weights[max(0, i + 1 - STEADY) : i + 1].mean(axis=0))
+    assert (steady(np.eye(2)[[0] * n]) == [1.0, 0.0]).all()
