@@ -334,6 +334,9 @@ def validate(
     curve: Annotated[
         bool, typer.Option("--learning-curve", help="Tell what fewer sequences would gain, too.")
     ] = False,
+    sizes: Annotated[
+        bool, typer.Option("--bank-sizes", help="Tell what banks of 2 to 6 would gain, too.")
+    ] = False,
 ) -> None:
     """Tell whether adapting would pay in places that were not trained on.
 
@@ -347,7 +350,7 @@ def validate(
 
     loaded = load_study(study, override, folder)
     with _progress() as progress:
-        validation, rows = validate_study(loaded, curve, progress)
+        validation, rows, learning, banks = validate_study(loaded, curve, sizes, progress)
     console.print(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",
@@ -361,6 +364,13 @@ def validate(
     console.print(
         f"If the best of 1, 2, ... complementary sets were always known: {known}.", highlight=False
     )
+    for title, found in (
+        (f"With fewer training sequences, by `{validation.default}`", learning),
+        ("Banks of so many instances", banks),
+    ):
+        if found:
+            caption = "Ratio to the fixed set's error on sequences left out; 95 % interval."
+            console.print(report.table(title, found, caption))
     for mode in validation.modes:
         console.print(validation.verdict(mode), highlight=False)
     console.print(f"Tables and picture: {loaded.folder / 'validation'}.*", highlight=False)

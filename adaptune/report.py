@@ -216,6 +216,7 @@ def draw_validation(
     gain: NDArray[np.float64],
     portfolio: NDArray[np.float64],
     learning: Sequence[Mapping[str, Any]],
+    banks: Sequence[Mapping[str, Any]],
 ) -> None:
     """Draw what was found on the sequences left out, as PNG.
 
@@ -235,6 +236,8 @@ def draw_validation(
         Ratio if the best of 1, 2, ... sets were known.
     learning
         Rows of a learning curve, or none.
+    banks
+        Rows of banks of several sizes, or none.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -281,21 +284,26 @@ def draw_validation(
         color="#bbbbbb",
         label="of so many sets the best, if known",
     )
-    by_size.set_xlabel("sets")
-    if learning:
-        sizes = [row["sequences"] for row in learning]
-        middle = np.array([row["geometric"] for row in learning])
-        bounds = [[row[key] for row in learning] for key in ("low", "high")]
+    counted = ["sets"]
+    for rows, column, colour, what, label in (
+        (banks, "instances", COLOURS["bank"], "instances", "bank, by its instances"),
+        (learning, "sequences", "#555555", "training sequences", f"{default}, by sequences"),
+    ):
+        if not rows:
+            continue
+        counted.append(what)
+        middle = np.array([row["geometric"] for row in rows])
+        bounds = [[row[key] for row in rows] for key in ("low", "high")]
         by_size.errorbar(
-            sizes,
+            [row[column] for row in rows],
             middle,
             np.abs(bounds - middle),
             fmt="o-",
-            color=COLOURS[default],
+            color=colour,
             capsize=3,
-            label=f"{default}, by training sequences",
+            label=label,
         )
-        by_size.set_xlabel("sets; training sequences")
+    by_size.set_xlabel("; ".join(counted))
     by_size.legend(fontsize="small")
     for axes in (by_sequence, by_novelty, by_size):
         axes.axhline(1.0, color=COLOURS["fixed"], lw=1.0)

@@ -201,7 +201,7 @@ def validate(paths: list[Path], size: int) -> None:
     sequences, sets = labelled(paths)
     left_out = leave_one_out(sequences, sets, bank=size).left_out
     for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
-        of.errors |= constantly(sequence, sequences[:i] + sequences[i + 1 :], sets, size)
+        of.errors.update(constantly(sequence, sequences[:i] + sequences[i + 1 :], sets, size))
     validation = Validation(left_out)
     print_summary(validation, validation.ratios)
     for mode in validation.modes:
@@ -263,7 +263,7 @@ def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
     return paths
 
 
-def by_descriptor(paths: list[Path], described: list[Path]) -> None:
+def by_descriptor(paths: list[Path], described: list[Path], size: int) -> None:
     """Leave each sequence out in turn, scans being described in one way after the other.
 
     As if a scan looked in between as it did at the last full second, in every way the same.
@@ -284,8 +284,7 @@ def by_descriptor(paths: list[Path], described: list[Path]) -> None:
             of_known = {"descriptors": of_frames[known], "blocks": lengths}
             sequences.append(replace(sequence, drive=drive, **of_known))
         print(f"by {' and '.join(names)}: ", end="")
-        validation = leave_one_out(sequences, sets)
-        print_summary(validation, ["paired", "bank"])
+        print_summary(leave_one_out(sequences, sets, {}, bank=size), ["bank"])
 
 
 Take = Callable[[TrainingData], TrainingData]
@@ -430,7 +429,7 @@ def ablate(paths: list[Path], size: int) -> None:
     )
     left_out = validation.left_out
     for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
-        of.errors |= banks(sequence, sequences[:i] + sequences[i + 1 :], sets, size)
+        of.errors.update(banks(sequence, sequences[:i] + sequences[i + 1 :], sets, size))
     validation = Validation(left_out)
     print_summary(validation, [mode for mode in validation.ratios if mode != "baseline"])
 
@@ -525,7 +524,7 @@ def main() -> None:
         courses = training_courses(seed, arguments.length)
         paths = trials(arguments.folder, odometry, courses, seed)
         if arguments.descriptors:
-            by_descriptor(paths, describe(arguments.folder, courses, seed))
+            by_descriptor(paths, describe(arguments.folder, courses, seed), arguments.bank)
         elif arguments.less:
             less(paths)
         elif arguments.curve:

@@ -55,6 +55,8 @@ BANK = "bank"
 """The mode in which a bank is driven."""
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
+BANK_SIZES = (2, 3, 4, 5, 6)
+"""Those that `bank_curve` compares."""
 BANK_FRAMES = 1000
 """Nearest frames of each sequence: products of errors take more to be known than their means."""
 
@@ -237,11 +239,30 @@ def _margin(logs: NDArray[np.float64]) -> float:
     return float(stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs))
 
 
+class Validated(NamedTuple):
+    """What `validate` found.
+
+    Attributes
+    ----------
+    validation : Validation
+    rows : list of dict
+        Ratio to the fixed set's error of every mode on every sequence left out.
+    learning, banks : list of dict
+        See `learning_curve` and `bank_curve`; empty where they were not asked for.
+    """
+
+    validation: Validation
+    rows: list[dict[str, Any]]
+    learning: list[dict[str, Any]]
+    banks: list[dict[str, Any]]
+
+
 def validate(
     study: Study,
     curve: bool = False,
+    sizes: bool = False,
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> tuple[Validation, list[dict[str, Any]]]:
+) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
     Parameters
@@ -251,14 +272,10 @@ def validate(
         ``validation.json`` and ``validation.png``, and its model what was found.
     curve
         Tell, too, what fewer training sequences would gain: ``learning.csv``, ``learning.json``.
+    sizes
+        Tell, too, what banks of other sizes would gain: ``banks.csv``, ``banks.json``.
     progress
         Told what is done, and about every sequence.
-
-    Returns
-    -------
-    validation : Validation
-    rows : list of dict
-        Ratio to the fixed set's error of every mode on every sequence left out.
 
     Raises
     ------
@@ -296,6 +313,10 @@ def validate(
             bank=members,
         )
         report.write_rows(study.folder, "learning", learning)
+    banks = []
+    if sizes:
+        banks = bank_curve(sequences, sets, lambda i, n: progress("sizes of banks", i, n))
+        report.write_rows(study.folder, "banks", banks)
     report.draw_validation(
         study.folder / "validation.png",
         study.name,
@@ -304,10 +325,11 @@ def validate(
         *_by_familiarity(validation),
         validation.portfolio(),
         learning,
+        banks,
     )
     found = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=found).save(study.folder / "model.npz")
-    return validation, rows
+    return Validated(validation, rows, learning, banks)
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
@@ -386,6 +408,31 @@ def learning_curve(
         validation = Validation(left_out)
         rows.append({"sequences": size} | validation.summary(validation.default))
     progress(len(sizes) * len(folds), len(sizes) * len(folds))
+    return rows
+
+
+def bank_curve(
+    sequences: Sequence[LabelledSequence],
+    sets: NDArray[np.float64],
+    progress: Callable[[int, int], None] = lambda *_: None,
+) -> list[dict[str, Any]]:
+    """What banks gain by their number of instances, each sequence left out in turn.
+
+    Returns
+    -------
+    list of dict
+        For each of `BANK_SIZES`, of which there are sets, the ratio to the fixed set's error:
+        geometric mean with its 95 % interval (Student's, over sequences), arithmetic, worst.
+    """
+    few = [size for size in BANK_SIZES if size <= len(sets)]
+    rows = []
+    for i, size in enumerate(few):
+
+        def told(j: int, n: int, i: int = i) -> None:
+            progress(i * n + j, len(few) * n)
+
+        validation = leave_one_out(sequences, sets, {}, told, size)
+        rows.append({"instances": size} | validation.summary(BANK))
     return rows
 
 

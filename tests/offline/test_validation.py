@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adaptune.metrics import sub_trajectory_vectors
-from adaptune.model import ModelError, Selection, Settings
+from adaptune.model import ErrorModel, ModelError, Selection, Settings
 from adaptune.model.base import Rule
 from adaptune.study import load_study
 from offline.campaign import train
@@ -16,6 +16,7 @@ from offline.validation import (
     LeftOut,
     Validation,
     ValidationError,
+    bank_curve,
     learning_curve,
     leave_one_out,
     training_data,
@@ -238,7 +239,7 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
 def test_validates_a_study(study_file, tmp_path):
     study = load_study(study_file, [], tmp_path / "study")
     train(study)
-    validation, rows = validate(study, curve=False)
+    validation, rows, learning, banks = validate(study, curve=True, sizes=True)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
     # Four sub-trajectories tell nothing; a dozen would.
@@ -246,7 +247,14 @@ def test_validates_a_study(study_file, tmp_path):
     summary = validation.summary("bank")
     assert rows[2]["bank, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
-    assert (study.folder / "validation.csv").exists()
+    assert [row["sequences"] for row in learning] == [1]
+    n_sets = len(ErrorModel.load(study.folder / "model.npz").sets)
+    # Two sequences show nothing: no bank is driven, of whatever size.
+    assert [(row["instances"], row["geometric"]) for row in banks] == [
+        (size, 1.0) for size in range(2, 1 + min(6, n_sets))
+    ]
+    for name in ("validation", "learning", "banks"):
+        assert (study.folder / f"{name}.csv").exists()
     for other, text in (
         ("odometry.parameters.keyframe_interval.high=20", "other parameters or ranges"),
         ("training=[one]", "other training sequences"),
@@ -301,6 +309,9 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     # Members that are named: what cancels is not among them.
     named = leave_one_out(sequences, SETS, {}, bank=[0, 1])
     assert 0.5 < named.summary("bank")["geometric"] < 0.9
+    banks = bank_curve(sequences, SETS)
+    assert [row["instances"] for row in banks] == [2, 3, 4, 5]
+    assert banks[1] == {"instances": 3} | validation.summary("bank")
     assert BANK not in leave_one_out(sequences, SETS, bank=0).ratios
     rows = learning_curve(sequences[:6], SETS, bank=2)
     assert [row["sequences"] for row in rows] == [3, 5]
