@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,15 @@ _log = logging.getLogger(__name__)
 SCANS_TO_KNOW = 10
 """A sensor by: the median of so many scans that selections are made from."""
 
-Policy = Callable[[Scan, NDArray[np.float64]], Selection]
-"""Chooses a parameter set for a scan, and speed and turn rate before it, of shape (2,)."""
+STILL = np.zeros(2)
+
+
+class Policy(Protocol):
+    """Chooses a parameter set."""
+
+    def __call__(self, scan: Scan, motion: NDArray[np.float64] = STILL, /) -> Selection:
+        """For a scan, and for speed and turn rate before it where these are descriptors."""
+        ...
 
 
 class Choice(NamedTuple):
@@ -124,7 +131,7 @@ def adaptive(
     weights: deque[tuple[float, ...]] = deque(maxlen=STEADY)
     current: int | None = None
 
-    def select(scan: Scan, motion: NDArray[np.float64]) -> Selection:
+    def select(scan: Scan, motion: NDArray[np.float64] = STILL, /) -> Selection:
         nonlocal current
         described = describe(scan)
         fill_in(described, describe.blocks, motion)
@@ -144,7 +151,7 @@ def adaptive(
         return selection
 
     # The first call loads compiled code; the robot should not wait for that.
-    select(Scan(0, np.zeros((0, 3), np.float32)), np.zeros(2))
+    select(Scan(0, np.zeros((0, 3), np.float32)))
     last.clear()
     weights.clear()
     current = None
@@ -282,7 +289,7 @@ def replay(
 def _motion(stamps: list[int], poses: list[Poses]) -> NDArray[np.float64]:
     """Speed and turn rate at the last pose, of shape (2,)."""
     if not stamps:
-        return np.zeros(2)
+        return STILL
     begin = max(bisect_right(stamps, stamps[-1] - SECOND) - 1, 0)
     recent = np.array(stamps[begin:], np.int64), np.array(poses[begin:])
     return np.asarray(speed_and_turn_rate(*recent)[-1])

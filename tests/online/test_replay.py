@@ -235,14 +235,14 @@ def test_scans_of_another_sensor_get_the_fixed_set(caplog):
     model = of_two_caves()
     for sensor, chosen in (("hdl32e", 1), ("vlp16", 0)):
         select = adaptive(model, "paired")
-        selections = [select(scan, np.zeros(2)) for scan in drive_cave(sensor, 3)]
+        selections = [select(scan) for scan in drive_cave(sensor, 3)]
         assert np.mean([s.set_index == chosen for s in selections]) > 0.9
     assert [r.levelname for r in caplog.records] == ["WARNING"]
     assert "-15 degrees, those of training at -31" in caplog.text
     assert all(s.set_index == 0 and s.familiarity == 0.0 for s in selections)
     # The published rule has no such doubts.
     select = adaptive(model, "paper")
-    assert all(select(scan, np.zeros(2)).set_index == 1 for scan in drive_cave("vlp16", 3))
+    assert all(select(scan).set_index == 1 for scan in drive_cave("vlp16", 3))
 
 
 def test_a_banks_weights_change_slowly(monkeypatch):
@@ -256,7 +256,7 @@ def test_a_banks_weights_change_slowly(monkeypatch):
     monkeypatch.setattr(PairedFusion, "select", select)
     policy = adaptive(model, "paired", members=[0, 1])
     left[:] = found
-    selections = [policy(scan, np.zeros(2)) for scan in drive_cave("hdl32e", 3)[: len(found)]]
+    selections = [policy(scan) for scan in drive_cave("hdl32e", 3)[: len(found)]]
     for i, selection in enumerate(selections):
         mean = np.mean(found[max(0, i - 4) : i + 1], axis=0)
         np.testing.assert_allclose(selection.weights, mean)
@@ -265,4 +265,4 @@ def test_a_banks_weights_change_slowly(monkeypatch):
     policy = adaptive(model, "paired", members=[0, 1])
     left[:] = found[1:3]
     for scan in drive_cave("vlp16", 3)[:2]:
-        assert policy(scan, np.zeros(2)).weights == (1.0, 0.0)
+        assert policy(scan).weights == (1.0, 0.0)
