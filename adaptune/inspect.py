@@ -440,6 +440,11 @@ def _scan_text(scan: ScanSummary) -> str:
         words.append(f"{near:.2f} to {far:.2f} m away, half of them within {middle:.2f} m")
     words.append("no times" if scan.span is None else f"times spanning {scan.span:.4f} s")
     words.append("no rings" if scan.rings is None else f"{scan.rings} rings")
+    light = scan.scan.intensities
+    if light is None or not len(light):
+        words.append("no intensities")
+    else:
+        words.append(f"intensities from {light.min():g} to {light.max():g}")
     return ", ".join(words)
 
 

@@ -407,6 +407,7 @@ def ablate(paths: list[Path], size: int) -> None:
         return with_its_settings
 
     paired = PairedExpectedRatio
+    undoubting = {"n_sets": None, "sharpness": 12.0, "caution": 0.0, "threshold": 0.0}
     validation = leave_one_out(
         sequences,
         sets,
@@ -422,8 +423,8 @@ def ablate(paths: list[Path], size: int) -> None:
             "familiar everywhere": maker(Unafraid),
             "sharpness 12": maker(paired, n_sets=3, sharpness=12.0),
             "sharpness 48": maker(paired, n_sets=3, sharpness=48.0),
-            "sharpness 12, all sets": maker(paired, n_sets=None, sharpness=12.0),
-            "and by their neighbours alone": maker(Between, n_sets=None, sharpness=12.0),
+            "all sets, without doubt": maker(paired, **undoubting),
+            "by their neighbours alone": maker(Between, **undoubting),
         },
         bank=0,
     )

@@ -189,10 +189,16 @@ def test_the_cache_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("botanic_garden_scan.bag", SimpleNamespace(points=24_859, rings=16, reference=False)),
-        ("hilti_2022_scan.bag", SimpleNamespace(points=57_456, rings=32, reference=False)),
-        ("hall.bag", SimpleNamespace(points=36_726, rings=None, reference=True)),
-        ("street.bag", SimpleNamespace(points=21_658, rings=32, reference=False)),
+        (
+            "botanic_garden_scan.bag",
+            SimpleNamespace(points=24_859, rings=16, brightest=158, reference=False),
+        ),
+        (
+            "hilti_2022_scan.bag",
+            SimpleNamespace(points=57_456, rings=32, brightest=255, reference=False),
+        ),
+        ("hall.bag", SimpleNamespace(points=36_726, rings=None, brightest=None, reference=True)),
+        ("street.bag", SimpleNamespace(points=21_658, rings=32, brightest=0, reference=False)),
     ],
 )
 def test_recorded_data(name: str, expected: Any) -> None:
@@ -203,6 +209,8 @@ def test_recorded_data(name: str, expected: Any) -> None:
     assert inspection.scan is not None
     assert len(inspection.scan.scan) == expected.points
     assert inspection.scan.rings == expected.rings
+    light = inspection.scan.scan.intensities
+    assert (None if light is None else light.max()) == expected.brightest
     assert (inspection.reference is not None) == expected.reference
     assert not inspection.problems
     open_sequence(next(iter(entry(inspection).values())))
