@@ -458,6 +458,8 @@ class Study:
         course = self.config.courses.get(name)
         config = self.sequence_config(name)
         about = {
+            # 2: with intensities.
+            "version": 2,
             "input": self.settings.input,
             "sequence": config.model_dump(mode="json"),
             "course": None if course is None else course.model_dump(mode="json"),

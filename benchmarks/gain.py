@@ -252,7 +252,9 @@ def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
         path = folder / f"descriptors-{seed}-{course.length:.0f}-{name}.npz"
         paths.append(path)
         if path.exists():
-            continue
+            with np.load(path) as found:
+                if set(DESCRIPTORS) <= set(found.files):
+                    continue
         scans = list(simulate(course))[::PERIOD]
         of = {d: np.array([descriptor(d)(s) for s in scans], np.float32) for d in DESCRIPTORS}
         stamps, poses = zip(*((scan.stamp, scan.T_world_sensor) for scan in scans), strict=True)
@@ -266,7 +268,8 @@ def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
 def by_descriptor(paths: list[Path], described: list[Path], size: int) -> None:
     """Leave each sequence out in turn, scans being described in one way after the other.
 
-    As if a scan looked in between as it did at the last full second, in every way the same.
+    As if a scan looked in between as it did at the last full second, in every way the same; its
+    motion is known at once.
     """
     of_ndt, sets = labelled(paths)
     pairs = (("ndt", name) for name in DESCRIPTORS if name != "ndt")
@@ -453,7 +456,6 @@ def banks(
 
     def driven(
         make: type[PairedFusion] = PairedFusion,
-        limit: float = fusion.LIMIT,
         ridge: float = fusion.RIDGE,
         last: int = fusion.STEADY,
         **changed: Any,
@@ -461,9 +463,10 @@ def banks(
         # A bank that is not worth driving is not driven.
         if settings.hedge == 1.0:
             return cap(sequence.errors[:, data.fixed])
-        with patch.multiple(fusion, LIMIT=limit, RIDGE=ridge, STEADY=last):
+        with patch.multiple(fusion, RIDGE=ridge, STEADY=last):
             rule = make(settings.model_copy(update=changed)).fit(data)
-            weights = fusion.steady(rule.weigh(rule.near(features))[0])
+            near = rule.near(features)
+            weights = fusion.steady(rule.weigh(near)[0], near.familiarity)
         return bank_errors(sequence, members, weights)
 
     found = {
@@ -475,6 +478,8 @@ def banks(
         "bank, half kept": driven(hedge=0.5),
         "bank, familiar everywhere": driven(make=UnafraidFusion),
         "bank, the 100 nearest frames": driven(n_frames=100),
+        "bank, limit 6": driven(limit=6.0),
+        "bank, limit 18": driven(limit=18.0),
         "bank, errors count in full": driven(limit=1e9),
         "bank, likes do not share": driven(ridge=0.0),
         "bank, weights of each second": driven(last=1),

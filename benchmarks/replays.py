@@ -25,7 +25,7 @@ from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
-from adaptune.model.fusion import STEADY, steady
+from adaptune.model.fusion import Steady
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
 from adaptune.sequence import Scan
@@ -51,16 +51,15 @@ def asking(rule: Rule, pca: ScaledPCA) -> Policy:
     """A policy that asks a rule."""
     current: int | None = None
     last: deque[NDArray[Any]] = deque(maxlen=WINDOW)
-    weights: deque[tuple[float, ...]] = deque(maxlen=STEADY)
+    steadied = Steady()
 
     def select(scan: Scan, *_: object) -> Selection:
         nonlocal current
         last.append(ndt_histogram(scan.points))
         selection = rule.select(pca.transform(np.mean(last, axis=0)[None])[0], current)
         current = selection.set_index
-        if selection.weights is not None:
-            weights.append(selection.weights)
-            selection = selection._replace(weights=tuple(steady(np.array(weights))[-1].tolist()))
+        if isinstance(rule, PairedFusion):
+            return steadied(selection, rule.candidates_.tolist())
         return selection
 
     return select

@@ -100,7 +100,7 @@ def adaptive_replay(study: Study, model: ErrorModel) -> None:
 
     select = adaptive(model, "paired")
 
-    def fixed_after_all(scan: Scan) -> Selection:
+    def fixed_after_all(scan: Scan, *_: object) -> Selection:
         # All the work of a selection, but the same parameters as the bare loop's.
         return select(scan)._replace(set_index=model.fixed)
 

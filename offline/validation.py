@@ -48,9 +48,11 @@ TINY = 1e-6
 MOST_SETS = 6
 """Complementary sets whose worth is told."""
 SHARPNESS = (6.0, 12.0, 24.0, 48.0)
-"""What `tune` and `tune_bank` choose from; of equally good ones the first."""
+"""What `tune` chooses from; of equally good ones the first."""
+BANK_SHARPNESS = (12.0, 48.0)
 HEDGES = (0.0, 0.25, 0.5)
-"""Shares of the weight that the fixed set keeps in a bank; `tune_bank` chooses from them."""
+BANK_LIMITS = (6.0, 18.0)
+"""What `tune_bank` chooses from, besides."""
 BANK = "bank"
 """The mode in which a bank is driven."""
 BANK_SIZE = 4
@@ -753,11 +755,17 @@ def tune_bank(
             [_bank_tried(sequence, others, sets, members, fixed) for sequence, others in folds]
         )
     best = _paying(logs)
-    return Settings(hedge=1.0) if best is None else _BANK_SETTINGS[best]
+    tried = [settings for of_limit in _BANK_SETTINGS for settings in of_limit]
+    return Settings(hedge=1.0) if best is None else tried[best]
 
 
 _BANK_SETTINGS = [
-    Settings(sharpness=s, hedge=h, n_frames=BANK_FRAMES) for s in SHARPNESS for h in HEDGES
+    [
+        Settings(sharpness=sharpness, hedge=hedge, limit=limit, n_frames=BANK_FRAMES)
+        for sharpness in BANK_SHARPNESS
+        for hedge in HEDGES
+    ]
+    for limit in BANK_LIMITS
 ]
 
 
@@ -770,16 +778,12 @@ def _bank_tried(
 ) -> list[float]:
     """With each of `_BANK_SETTINGS`, logarithm of the ratio to the fixed set's error."""
     data, pca = training_data(others, sets)
-    rule, near = _fusion(sequence, others, data, pca, members)
     of_fixed = cap(sequence.errors[:, fixed]).mean() + TINY
     logs = []
-    for sharpness in SHARPNESS:
-        rule.settings = Settings(sharpness=sharpness, n_frames=BANK_FRAMES)
-        weights = fusion.steady(rule.weigh(near)[0])
-        for hedge in HEDGES:
-            hedged = (1.0 - hedge) * weights
-            hedged[:, 0] += hedge
-            errors = _bank_errors(sequence, members, hedged)
+    for of_limit in _BANK_SETTINGS:
+        rule, near = _fusion(sequence, others, data, pca, members, of_limit[0])
+        for rule.settings in of_limit:
+            errors = _bank_errors(sequence, members, _driven_with(rule, near))
             logs.append(float(np.log((errors.mean() + TINY) / of_fixed)))
     return logs
 
@@ -790,10 +794,11 @@ def _fusion(
     data: TrainingData,
     pca: ScaledPCA,
     members: Sequence[int],
+    settings: Settings,
 ) -> tuple[PairedFusion, Near]:
     """A rule that is fitted on the others, and what it finds near to this sequence's scans."""
     vectors = [s.vectors[:, members] for s in others if s.vectors is not None]
-    rule = PairedFusion(_BANK_SETTINGS[0]).fit(
+    rule = PairedFusion(settings).fit(
         replace(
             data,
             fixed=members[0],
@@ -804,6 +809,12 @@ def _fusion(
     assert sequence.drive is not None
     first, _ = periods(sequence.drive.period)
     return rule, rule.near(pca.transform(sequence.drive.descriptors[first]))
+
+
+def _driven_with(rule: PairedFusion, near: Near) -> NDArray[np.float64]:
+    """Weights along a sequence, of shape (n_periods, n_members)."""
+    weights, _ = rule.weigh(near)
+    return fusion.steady(weights, near.familiarity)
 
 
 def _bank_errors(
@@ -828,7 +839,6 @@ def _driven(
     settings = tune_bank(others, sets, members, data.fixed)
     if settings.hedge == 1.0:
         return cap(sequence.errors[:, data.fixed]), 0.0
-    rule, near = _fusion(sequence, others, data, pca, members)
-    rule.settings = settings
-    weights = fusion.steady(rule.weigh(near)[0])
+    rule, near = _fusion(sequence, others, data, pca, members, settings)
+    weights = _driven_with(rule, near)
     return _bank_errors(sequence, members, weights), float(1.0 - weights[:, 0].mean())

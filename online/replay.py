@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
-from adaptune.descriptor.motion import SECOND, fill_in, speed_and_turn_rate
+from adaptune.descriptor.motion import MOTION, SECOND, fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
 from adaptune.model import RULES, ErrorModel, PairedFusion, Selection
-from adaptune.model.fusion import STEADY, steady
+from adaptune.model.fusion import Steady
 from adaptune.odometry import Bank, Box, HealthCheck
 from adaptune.odometry.health import Guard
 from adaptune.sequence import Scan
@@ -38,8 +38,8 @@ STILL = np.zeros(2)
 class Policy(Protocol):
     """Chooses a parameter set."""
 
-    def __call__(self, scan: Scan, motion: NDArray[np.float64] = STILL, /) -> Selection:
-        """For a scan, and for speed and turn rate before it where these are descriptors."""
+    def __call__(self, scan: Scan, motion: NDArray[np.float64] | None = None, /) -> Selection:
+        """For a scan, and for speed and turn rate before it, of shape (2,), if it asks for them."""
         ...
 
 
@@ -128,32 +128,34 @@ def adaptive(
         )
     foreign = _foreign(model)
     last: deque[NDArray[np.float32]] = deque(maxlen=model.window)
-    weights: deque[tuple[float, ...]] = deque(maxlen=STEADY)
+    steadied = Steady()
     current: int | None = None
 
-    def select(scan: Scan, motion: NDArray[np.float64] = STILL, /) -> Selection:
+    def select(scan: Scan, motion: NDArray[np.float64] | None = None, /) -> Selection:
         nonlocal current
         described = describe(scan)
-        fill_in(described, describe.blocks, motion)
+        if motion is not None:
+            fill_in(described, describe.blocks, motion)
+        elif MOTION in describe.blocks:
+            raise DescriptorError(
+                f"the model knows places by `{MOTION}`, too: tell speed and turn rate with the scan"
+            )
         last.append(described)
         mean = np.stack(last).mean(axis=0, dtype=np.float64, keepdims=True)
         selection = fitted.select(pca.transform(mean.astype(np.float32))[0], current)
         if selection.weights is not None and members is not None:
-            weights.append(selection.weights)
-            shares = steady(np.array(weights))[-1]
-            heaviest = members[int(shares.argmax())]
-            selection = selection._replace(set_index=heaviest, weights=tuple(shares.tolist()))
+            selection = steadied(selection, members)
         if fitted.gated and foreign(scan):
             fixed = selection.predicted_fixed
-            alone = tuple(float(i == data.fixed) for i in members or ()) if fused else None
-            selection = Selection(data.fixed, fixed, fixed, 0.0, weights=alone)
+            weights = tuple(float(i == data.fixed) for i in members or ()) if fused else None
+            selection = Selection(data.fixed, fixed, fixed, 0.0, weights=weights)
         current = selection.set_index
         return selection
 
     # The first call loads compiled code; the robot should not wait for that.
-    select(Scan(0, np.zeros((0, 3), np.float32)))
+    select(Scan(0, np.zeros((0, 3), np.float32)), STILL)
     last.clear()
-    weights.clear()
+    steadied = Steady()
     current = None
     return select
 

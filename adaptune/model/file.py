@@ -23,7 +23,7 @@ from adaptune.model.paired import Settings
 from adaptune.sequence.views import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
-FORMAT = 3
+FORMAT = 4
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 SAME_SENSOR = 3.0

@@ -1,5 +1,6 @@
 """Weights of the instances in a bank, whose motions are averaged."""
 
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,11 +9,8 @@ from scipy.optimize import nnls
 
 from adaptune.metrics import FAILURE
 from adaptune.model.base import Selection, mean_errors
-from adaptune.model.paired import ERROR_FLOOR, NOVEL, Near, PairedExpectedRatio
+from adaptune.model.paired import ERROR_FLOOR, NOVEL, Near, PairedExpectedRatio, Settings
 
-LIMIT = 6.0
-"""Errors count up to so many times the fixed set's root mean square in the sequence: who has lost
-track is left out of the mean, and does not cost what it would alone."""
 RIDGE = 0.05
 """Added to mean squares, as a share of the fixed set's, so that like members share the weight."""
 STEADY = 5
@@ -39,7 +37,7 @@ class PairedFusion(PairedExpectedRatio):
     Parameters
     ----------
     settings
-        `sharpness`, `n_frames` and `hedge` are heeded.
+        `sharpness`, `n_frames`, `hedge` and `limit` are heeded; `limit` not after the fit.
     """
 
     def _candidates(self) -> NDArray[np.intp]:
@@ -54,7 +52,7 @@ class PairedFusion(PairedExpectedRatio):
         products = np.empty((len(self.data_.features), *2 * [len(self.candidates_)]), np.float32)
         for s in np.unique(self.data_.sequence):
             members = self.data_.sequence == s
-            vectors, lost = limited(self.data_.vectors[members], 0)
+            vectors, lost = limited(self.data_.vectors[members], 0, self.settings.limit)
             products[members] = np.einsum("ijx,ikx->ijk", vectors, vectors)
             products[members] += lost[:, :, None] ** 2 * np.eye(len(self.candidates_))
         return products[:, 0, 0].astype(np.float64), products
@@ -108,13 +106,41 @@ class PairedFusion(PairedExpectedRatio):
         )
 
 
-def steady(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+class Steady:
+    """Averages the weights of the last selections, see `steady`."""
+
+    def __init__(self) -> None:
+        self._last: deque[Selection] = deque(maxlen=STEADY)
+
+    def __call__(self, selection: Selection, members: Sequence[int]) -> Selection:
+        """The selection with the weights to be driven with; what it predicts stays as it is.
+
+        Parameters
+        ----------
+        selection
+            By `PairedFusion`.
+        members
+            Numbers of the sets in the bank.
+        """
+        self._last.append(selection)
+        found = np.array([s.weights for s in self._last])
+        weights = steady(found, np.array([s.familiarity for s in self._last]))[-1]
+        heaviest = members[int(weights.argmax())]
+        return selection._replace(set_index=heaviest, weights=tuple(weights.tolist()))
+
+
+def steady(weights: NDArray[np.float64], familiarity: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of the weights at each selection and at those before it, `STEADY` at most.
+
+    Doubt does not wait: where a scan is unlike all training, the fixed set has as much weight at
+    once as it allows.
 
     Parameters
     ----------
     weights
         Found at one selection after the other, of shape (n_selections, n_members).
+    familiarity
+        Of each scan, of shape (n_selections,).
 
     Returns
     -------
@@ -123,13 +149,18 @@ def steady(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     total = weights.copy()
     for k in range(1, STEADY):
         total[k:] += weights[:-k]
-    return np.asarray(total / np.minimum(np.arange(1, len(weights) + 1), STEADY)[:, None])
+    mean = total / np.minimum(np.arange(1, len(weights) + 1), STEADY)[:, None]
+    trust = np.minimum(1.0, familiarity / NOVEL)
+    others = np.maximum(mean[:, 1:].sum(axis=1), 1e-12)
+    mean[:, 1:] *= np.minimum(1.0, trust / others)[:, None]
+    mean[:, 0] = 1.0 - mean[:, 1:].sum(axis=1)
+    return np.asarray(mean)
 
 
 def limited(
-    vectors: NDArray[np.float32], fixed: int
+    vectors: NDArray[np.float32], fixed: int, limit: float = Settings().limit
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Errors on the frames of a sequence, none of them beyond `LIMIT`.
+    """Errors on the frames of a sequence, none of them beyond a limit.
 
     Parameters
     ----------
@@ -137,6 +168,8 @@ def limited(
         Percent, of shape (n_frames, n_sets, 3); not finite where the track was lost.
     fixed
         Number of the fixed set.
+    limit
+        See `Settings`.
 
     Returns
     -------
@@ -148,10 +181,10 @@ def limited(
     lengths = np.linalg.norm(vectors, axis=-1)
     lost = ~(lengths <= FAILURE)
     of_fixed = np.where(lost[:, fixed], FAILURE, lengths[:, fixed])
-    limit = LIMIT * np.sqrt((of_fixed**2).mean() + ERROR_FLOOR**2)
-    share = np.minimum(1.0, limit / np.maximum(lengths, 1e-9))
+    most = limit * np.sqrt((of_fixed**2).mean() + ERROR_FLOOR**2)
+    share = np.minimum(1.0, most / np.maximum(lengths, 1e-9))
     kept = np.where(lost[..., None], 0.0, vectors) * np.where(lost, 0.0, share)[..., None]
-    return kept.astype(np.float32), np.where(lost, limit, 0.0).astype(np.float32)
+    return kept.astype(np.float32), np.where(lost, most, 0.0).astype(np.float32)
 
 
 def least(squares: NDArray[np.float64]) -> NDArray[np.float64]:

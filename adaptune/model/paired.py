@@ -38,6 +38,9 @@ class Settings(BaseModel):
         How many standard errors, by how much the sequences differ, are added to a ratio first.
     hedge : float
         In a bank, share of the weight that the fixed set keeps; with 1 it always has all.
+    limit : float
+        In a bank, errors count up to so many times the fixed set's root mean square in the
+        sequence: who has lost track is left out of the mean, and does not cost what it would alone.
     """
 
     # A file of a later version may say more.
@@ -50,6 +53,7 @@ class Settings(BaseModel):
     threshold: Annotated[float, Field(le=0.0, allow_inf_nan=False)] = -0.1
     caution: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.5
     hedge: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    limit: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
 
 
 class Near(NamedTuple):

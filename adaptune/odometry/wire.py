@@ -154,7 +154,7 @@ def to_scan(message: Message) -> Scan:
         noise = ImuNoise(*arrays["imu_noise"].tolist())
         imu = Imu(arrays["imu_stamps"], gyro, acceleration, arrays["imu_pose"], noise)
     times, rings, intensities = map(arrays.get, ("times", "rings", "intensities"))
-    return Scan(message.header["stamp"], arrays["points"], times, rings, intensities, imu)
+    return Scan(message.header["stamp"], arrays["points"], times, rings, imu, intensities)
 
 
 Make = Callable[[str, ParameterSet, BaseSettings], Box]

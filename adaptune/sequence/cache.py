@@ -121,7 +121,7 @@ class CachedScans:
         part = slice(self._ends[i - 1] if i else 0, end)
         columns = zip(self._optional, given, strict=True)
         times, rings, intensities = (column[part] if there else None for column, there in columns)
-        return Scan(stamp, self._points[part], times, rings, intensities)
+        return Scan(stamp, self._points[part], times, rings, intensities=intensities)
 
     def __iter__(self) -> Iterator[Scan]:
         return (self[i] for i in range(len(self)))

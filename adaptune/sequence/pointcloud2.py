@@ -215,7 +215,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         points,
         seconds,
         None if ring is None else rings,
-        None if intensity is None else intensities,
+        intensities=None if intensity is None else intensities,
     )
 
 

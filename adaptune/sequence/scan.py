@@ -23,20 +23,20 @@ class Scan:
         float32 seconds since `stamp` at which each point was measured.
     rings : ndarray of shape (n,), optional
         uint16 number of the laser that measured each point.
-    intensities : ndarray of shape (n,), optional
-        float32 share of the light that came back from each point, on the sensor's own scale;
-        finite.
     imu : Imu, optional
         What the IMU measured since the scan before, to the first measurement at the scan's end or
         after it.
+    intensities : ndarray of shape (n,), optional
+        float32 share of the light that came back from each point, on the sensor's own scale;
+        finite.
     """
 
     stamp: int
     points: NDArray[np.float32]
     times: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
-    intensities: NDArray[np.float32] | None = None
     imu: Imu | None = None
+    intensities: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         # Decoded scans may be shared by all who use them, as those from the cache are.
@@ -55,8 +55,8 @@ class Scan:
             self.points.take(index, axis=0),
             None if self.times is None else self.times.take(index),
             None if self.rings is None else self.rings.take(index),
-            None if self.intensities is None else self.intensities.take(index),
             self.imu,
+            None if self.intensities is None else self.intensities.take(index),
         )
 
     @property

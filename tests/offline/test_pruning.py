@@ -102,7 +102,7 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
     assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
     before = (study.folder / "model.npz").read_bytes()
-    validation, _ = validate(study)
+    validation = validate(study).validation
     assert len(validation.left_out) == 4
 
     # Some of it lost, as to a killed driver, and made again.

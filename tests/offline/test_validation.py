@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adaptune.metrics import sub_trajectory_vectors
-from adaptune.model import ErrorModel, ModelError, Selection, Settings
+from adaptune.model import ErrorModel, ModelError, PairedFusion, Selection, Settings
 from adaptune.model.base import Rule
 from adaptune.study import load_study
 from offline.campaign import train
@@ -316,6 +316,31 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     rows = learning_curve(sequences[:6], SETS, bank=2)
     assert [row["sequences"] for row in rows] == [3, 5]
     assert all(row["geometric"] == 1.0 for row in rows)  # too few to show anything
+
+
+def test_a_bank_is_driven_with_steady_weights(monkeypatch):
+    rng = np.random.default_rng(8)
+    sequences = [with_drive(f"s{i}", rng) for i in range(7)]
+    seen = []
+
+    def errors(self, _, weights):
+        seen.append(weights)
+        return np.full(len(self.stamps), 0.1)
+
+    def weigh(self, near):
+        weights = np.zeros((len(near.squared), len(self.candidates_)))
+        weights[::2, 0] = weights[1::2, 1] = 1.0
+        return weights, np.ones(len(weights))
+
+    monkeypatch.setattr(Drive, "errors", errors)
+    monkeypatch.setattr(PairedFusion, "weigh", weigh)
+    monkeypatch.setattr(PairedFusion, "_familiarity", lambda _, squared: np.ones(len(squared)))
+    leave_one_out(sequences, SETS, {}, bank=2)
+    # With each setting on each of the others, and then on the one left out.
+    assert len(seen) == 7 * (6 * 12 + 1)
+    for weights in seen:
+        np.testing.assert_allclose(weights[:2], [[1.0, 0.0], [0.5, 0.5]], atol=0.01)
+        assert np.abs(weights[5:] - 0.5).max() < 0.11
 
 
 def test_a_bank_that_does_not_pay_keeps_the_fixed_set():

@@ -1,10 +1,12 @@
 import csv
 import json
+from dataclasses import replace
 
 import drives
 import numpy as np
 import pytest
 
+from adaptune.descriptor import DescriptorError
 from adaptune.descriptor.ndt import describe
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, PairedFusion, Selection
@@ -245,6 +247,25 @@ def test_scans_of_another_sensor_get_the_fixed_set(caplog):
     assert all(select(scan).set_index == 1 for scan in drive_cave("vlp16", 3))
 
 
+def test_motion_tells_places_apart():
+    model = of_two_caves()
+    # The one was driven through slowly, the other fast, and what is better differs.
+    slowly = model.sequence == 0
+    motion = np.column_stack([np.where(slowly, 0.5, 5.0), np.zeros(len(slowly))])
+    model = replace(
+        model,
+        descriptors=np.hstack([model.descriptors, motion]).astype(np.float32),
+        blocks={"ndt": 90, "motion": 2},
+        errors=np.where(slowly[:, None], [0.1, 1.0], [1.0, 0.1]).astype(np.float32),
+    )
+    select = adaptive(model, "paper")
+    (scan, *_) = drive_cave("hdl32e", 3)
+    chosen = [select(scan, np.array([speed, 0.0])).set_index for speed in (0.5, 5.0)]
+    assert chosen == [0, 1]
+    with pytest.raises(DescriptorError, match="`motion`, too: tell speed and turn rate"):
+        select(scan)
+
+
 def test_a_banks_weights_change_slowly(monkeypatch):
     found = [(1.0, 0.0), (0.0, 1.0), (0.0, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0)]
     model, left = of_two_caves(), []
@@ -261,6 +282,13 @@ def test_a_banks_weights_change_slowly(monkeypatch):
         mean = np.mean(found[max(0, i - 4) : i + 1], axis=0)
         np.testing.assert_allclose(selection.weights, mean)
         assert selection.set_index == np.argmax(mean)
+    # So does a place that is unlike all training, though not for long.
+    strange = Selection(0, 1.0, 1.0, 0.0, 2.0, (1.0, 0.0))
+    monkeypatch.setattr(PairedFusion, "select", lambda *_: strange)
+    assert policy(drive_cave("hdl32e", 3)[0]).weights == (1.0, 0.0)
+    monkeypatch.setattr(PairedFusion, "select", select)
+    left[:] = [(0.0, 1.0)]
+    np.testing.assert_allclose(policy(drive_cave("hdl32e", 3)[0]).weights, [0.2, 0.8])
     # Another sensor leaves the fixed set all the weight, and at once.
     policy = adaptive(model, "paired", members=[0, 1])
     left[:] = found[1:3]

@@ -131,8 +131,8 @@ def check(scan: Scan) -> None:
     """Make sure that a scan can be one."""
     assert np.isfinite(scan.points).all()
     assert (scan.points != 0).any(axis=1).all()
-    for values in (scan.times, scan.rings):
-        assert values is None or len(values) == len(scan)
+    for values in (scan.times, scan.rings, scan.intensities):
+        assert values is None or (len(values) == len(scan) and np.isfinite(values).all())
     if scan.times is not None and len(scan):
         assert scan.times.min() >= 0
         assert scan.times.max() <= 10.001

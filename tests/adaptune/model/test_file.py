@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from adaptune.model import RULES, ErrorModel, ModelError, Settings
+from adaptune.model.file import FORMAT
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 
 SPACE = ParameterSpace(
@@ -263,13 +264,13 @@ def test_a_pickle_is_refused(tmp_path):
 
 def test_an_older_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
-    rewrite(path, adaptune="0.0.1", format=1)
+    rewrite(path, adaptune="0.0.1", format=FORMAT - 1)
     assert "older adaptune (0.0.1)" in refused(path)
 
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
-    rewrite(path, adaptune="7.8.9", format=4)
+    rewrite(path, adaptune="7.8.9", format=FORMAT + 1)
     message = refused(path)
     assert "7.8.9" in message
     assert "newer" in message

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from adaptune.metrics import FAILURE
 from adaptune.model import PairedFusion, Settings, TrainingData
-from adaptune.model.fusion import LIMIT, RIDGE, STEADY, bank, least, limited, steady
+from adaptune.model.fusion import RIDGE, STEADY, bank, least, limited, steady
 
 
 def places(rng, n_places=6, n=40, n_sets=4):
@@ -103,15 +103,19 @@ def test_no_error_counts_more_than_its_limit():
     vectors[:, 0, 0] = 1.0
     vectors[:, 1, 1] = [0.5, 5.0, 7.0, 29.0, 31.0, np.inf, np.nan, 0.0, 6.0, 1.0]
     kept, lost = limited(vectors, 0)
-    limit = LIMIT * np.sqrt(1.0 + 0.02**2)
+    limit = 6.0 * np.sqrt(1.0 + 0.02**2)
     np.testing.assert_allclose(kept[:, 0], vectors[:, 0])
     expected = [0.5, 5.0, limit, limit, 0.0, 0.0, 0.0, 0.0, 6.0, 1.0]
     np.testing.assert_allclose(kept[:, 1, 1], expected, rtol=1e-6)
     np.testing.assert_allclose(lost[:, 1], [0, 0, 0, 0, limit, limit, limit, 0, 0, 0], rtol=1e-6)
+    kept, lost = limited(vectors, 0, 18.0)
+    expected = [0.5, 5.0, 7.0, 3.0 * limit, 0.0, 0.0, 0.0, 0.0, 6.0, 1.0]
+    np.testing.assert_allclose(kept[:, 1, 1], expected, rtol=1e-6)
+    assert lost.max() == pytest.approx(3.0 * limit)
     # A fixed set that fails itself allows others more.
     vectors[:5, 0] = np.inf
     _, lost = limited(vectors, 0)
-    assert lost[0, 0] == pytest.approx(LIMIT * np.sqrt((5 * FAILURE**2 + 5) / 10), rel=1e-5)
+    assert lost[0, 0] == pytest.approx(6.0 * np.sqrt((5 * FAILURE**2 + 5) / 10), rel=1e-5)
 
 
 def test_a_bank_is_of_sets_whose_errors_cancel():
@@ -128,7 +132,17 @@ def test_a_bank_is_of_sets_whose_errors_cancel():
 @given(st.integers(1, 20), st.integers(0, 100))
 def test_steady_weights_are_means_of_the_last(n, seed):
     weights = np.random.default_rng(seed).dirichlet(np.ones(3), n)
-    found = steady(weights)
+    found = steady(weights, np.ones(n))
     for i in range(n):
         np.testing.assert_allclose(found[i], weights[max(0, i + 1 - STEADY) : i + 1].mean(axis=0))
-    assert (steady(np.eye(2)[[0] * n]) == [1.0, 0.0]).all()
+    assert (steady(np.eye(2)[[0] * n], np.ones(n)) == [1.0, 0.0]).all()
+
+
+def test_doubt_does_not_wait():
+    weights = np.array([[0.0, 0.6, 0.4]] * 4)
+    # As they are found there: the more is kept by the fixed set, the less is familiar.
+    weights[2], weights[3] = [0.5, 0.3, 0.2], [1.0, 0.0, 0.0]
+    found = steady(weights, np.array([1.0, 0.1, 0.05, 0.0]))
+    np.testing.assert_allclose(found[:2], weights[:2])
+    np.testing.assert_allclose(found[2], [0.5, 0.3, 0.2])
+    np.testing.assert_allclose(found[3], [1.0, 0.0, 0.0], atol=1e-12)

@@ -168,7 +168,7 @@ def test_it_chooses_among_those_named_on_the_evidence_of_all(seed, n_frames, n_s
 
 
 def test_its_constants():
-    assert tuple(Settings().model_dump().values()) == (3, 6.0, 0.12, 300, -0.1, 0.5, 0.0)
+    assert tuple(Settings().model_dump().values()) == (3, 6.0, 0.12, 300, -0.1, 0.5, 0.0, 6.0)
     assert next(iter(RULES)) == "paired"
     assert isinstance(RULES["paired"](Settings(), 0.0), PairedExpectedRatio)
 

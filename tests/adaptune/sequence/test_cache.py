@@ -91,7 +91,7 @@ def test_scans_without_times_rings_intensities_or_points_are_kept_as_they_are() 
         Scan(4, points + 2, None, rings),
         Scan(5, points + 3, times + 1, rings + 1),
         Scan(6, points[:0], times[:0], rings[:0]),
-        Scan(7, points + 4, None, None, times + 2),
+        Scan(7, points + 4, intensities=times + 2),
     ]
     list(cache.tee(scans, "key", {"name": "a"}))
     kept = cache.find("key")

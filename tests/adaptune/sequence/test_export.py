@@ -10,7 +10,7 @@ FIRST = 1_700_000_000_123_456_000
 
 def scans(n=3):
     return [
-        Scan(FIRST + s.stamp, s.points, s.times, s.rings, s.points[:, 0] % 255.0)
+        Scan(FIRST + s.stamp, s.points, s.times, s.rings, intensities=s.points[:, 0] % 255.0)
         for s in (turns.turn(i) for i in range(n))
     ]
 

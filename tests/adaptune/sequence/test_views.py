@@ -100,10 +100,12 @@ def test_folders_are_reversed_without_a_cache(rec: Any, tmp_path: Path) -> None:
 
 
 def test_rings_are_thinned(rec: Any, bag: Path) -> None:
+    """All that is told of a point goes with it."""
     for plain, thin in zip(seen(bag), seen(bag, {"rings": 4}), strict=True):
         which = plain.rings % 4 == 0
         assert np.array_equal(thin.points, plain.points[which])
         assert np.array_equal(thin.times, plain.times[which])
+        assert np.array_equal(thin.intensities, plain.intensities[which])
     without = rec.velodyne(rec.scans(1)[0])[["x", "y", "z"]]
     path = rec.write_bag(bag.parent / "b.bag", [("/p", 1, rec.cloud(without, rec.START, rec.ROS1))])
     with pytest.raises(SequenceError, match="have no ring"):
