@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Frames, Trial
-from adaptune.descriptor import Describer, lowest_elevation
+from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
@@ -108,7 +108,7 @@ class PreparedSequence:
 def _described(describe: Describer, scan: Scan, name: str) -> NDArray[np.float32]:
     try:
         return describe(scan)
-    except AdaptuneError as error:
+    except DescriptorError as error:
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 

@@ -58,7 +58,7 @@ BANK = "bank"
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
 BANK_SIZES = (2, 3, 4, 5, 6)
-"""Those that `bank_curve` compares."""
+"""Those that a study may ask for."""
 BANK_FRAMES = 1000
 """Nearest frames of each sequence: products of errors take more to be known than their means."""
 

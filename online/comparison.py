@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import report
+from adaptune.descriptor import DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import KittiError, bootstrap, kitti_error, span, sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
@@ -93,15 +94,18 @@ def run_replays(
                 progress(what, done, n)
 
             box, policy = driven(study, model, mode, name)
-            result = replay(
-                sequence,
-                box,
-                study.config.health,
-                policy,
-                model.sets,
-                study.config.online.period,
-                step,
-            )
+            try:
+                result = replay(
+                    sequence,
+                    box,
+                    study.config.health,
+                    policy,
+                    model.sets,
+                    study.config.online.period,
+                    step,
+                )
+            except DescriptorError as error:
+                raise ComparisonError(f"sequences.{name}: {error}") from error
             progress(what, n, n)
             if not made_here:
                 _write_reference(folder, sequence.reference(), result.trajectory)

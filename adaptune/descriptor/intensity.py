@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.errors import AdaptuneError
+from adaptune.descriptor.base import DescriptorError
 from adaptune.sequence import Scan
 
 RING = 3.0
@@ -24,13 +24,13 @@ def intensity(scan: Scan) -> NDArray[np.float64]:
 
     Raises
     ------
-    AdaptuneError
+    DescriptorError
         If the scan's points have no intensities.
     """
     if not len(scan):
         return np.zeros(N_QUANTILES + 2 * N_RINGS)
     if scan.intensities is None:
-        raise AdaptuneError(
+        raise DescriptorError(
             f"the points of scan {scan.stamp} have no intensity to be described by: leave "
             f"`intensity` out of `descriptor`"
         )

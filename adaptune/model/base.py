@@ -127,7 +127,7 @@ class Selection(NamedTuple):
     set_index : int
         Of the parameter set.
     predicted_error : float
-        Percent.
+        Percent. In a bank, with the weights that are found at this scan alone.
     predicted_fixed : float
         Percent, what the fixed set is predicted to have here.
     familiarity : float
@@ -137,7 +137,8 @@ class Selection(NamedTuple):
         How many training sequences this rests on: one over the sum of their squared weights; NaN
         where they have none.
     weights : tuple of float, optional
-        Of the members of a bank, which are all driven; the set chosen is then the heaviest.
+        Of the members of a bank, which are all driven; the set chosen is then the heaviest. What is
+        driven with is their mean over the last selections, see `adaptune.model.fusion.steady`.
     """
 
     set_index: int

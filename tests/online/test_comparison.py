@@ -67,6 +67,19 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
             assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
 
 
+def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
+    model = ErrorModel.load(trained.folder / "model.npz")
+    lit = np.zeros((len(model.descriptors), 29), np.float32)
+    model = replace(
+        model,
+        blocks=model.blocks | {"intensity": 29},
+        descriptors=np.hstack([model.descriptors, lit]),
+    )
+    model.save(tmp_path / "lit.npz")
+    with pytest.raises(ComparisonError, match=r"sequences\.three: the points of scan .* no intens"):
+        run_replays(trained, tmp_path / "lit.npz", again=True)
+
+
 @pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
 def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism):
     model = ErrorModel.load(trained.folder / "model.npz")

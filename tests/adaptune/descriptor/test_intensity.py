@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from adaptune.descriptor import DescriptorError
 from adaptune.descriptor.intensity import intensity
-from adaptune.errors import AdaptuneError
 from adaptune.sequence import Scan
 
 
@@ -20,5 +20,5 @@ def test_deciles_and_rings():
 
 
 def test_points_without_intensities():
-    with pytest.raises(AdaptuneError, match=r"scan 7 have no intensity.*leave `intensity` out"):
+    with pytest.raises(DescriptorError, match=r"scan 7 have no intensity.*leave `intensity` out"):
         intensity(Scan(7, np.ones((3, 3), np.float32)))
