@@ -304,7 +304,7 @@ def draw_validation(
             label=label,
         )
     by_size.set_xlabel("; ".join(counted))
-    by_size.legend(fontsize="small")
+    by_size.legend(fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
     for axes in (by_sequence, by_novelty, by_size):
         axes.axhline(1.0, color=COLOURS["fixed"], lw=1.0)
         axes.grid(alpha=0.3)

@@ -34,6 +34,7 @@ FIELDS = (
     ("ring", 16, 4),
     ("time", 18, 7),
 )
+KINDS = ("<f4", "<f4", "<f4", "<f4", "<u2", "<f4")
 STORE = get_typestore(Stores.ROS1_NOETIC)
 KIND = "sensor_msgs/msg/PointCloud2"
 
@@ -69,7 +70,7 @@ def least(path: Path) -> None:
             # As with any reader, a scan lives until the next one is there.
             scan = [
                 np.ndarray(POINTS, kind, message.data, offset, (STEP,)).copy()
-                for offset, kind in ((0, "<f4"), (4, "<f4"), (8, "<f4"), (16, "<u2"), (18, "<f4"))
+                for offset, kind in zip((0, 4, 8, 12, 16, 18), KINDS, strict=True)
             ]
     assert scan is not None
 
