@@ -89,7 +89,13 @@ def test_ctrl_c_leaves_a_study_that_resumes(study_file, tmp_path):
     command = [sys.executable, "-m", "adaptune.cli", "offline", str(study_file)]
     many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
     process = subprocess.Popen(
-        command + many, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command + many,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # What runs in a shell's background is told to ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
     archive = Archive(tmp_path / "runs/small/trials")
     deadline = time.monotonic() + 60
