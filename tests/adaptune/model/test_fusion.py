@@ -146,3 +146,13 @@ def test_doubt_does_not_wait():
     np.testing.assert_allclose(found[:2], weights[:2])
     np.testing.assert_allclose(found[2], [0.5, 0.3, 0.2])
     np.testing.assert_allclose(found[3], [1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_the_limit_tells_what_a_lost_track_counts():
+    data = places(np.random.default_rng(9))
+    of = {
+        limit: PairedFusion(Settings(limit=limit)).fit(data).predict(data.features[0])
+        for limit in (6.0, 18.0)
+    }
+    np.testing.assert_allclose(of[18.0][3], 3.0 * of[6.0][3], rtol=1e-6)
+    np.testing.assert_allclose(of[18.0][:3], of[6.0][:3])
