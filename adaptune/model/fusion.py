@@ -153,7 +153,7 @@ def steady(weights: NDArray[np.float64], familiarity: NDArray[np.float64]) -> ND
     trust = np.minimum(1.0, familiarity / NOVEL)
     others = np.maximum(mean[:, 1:].sum(axis=1), 1e-12)
     mean[:, 1:] *= np.minimum(1.0, trust / others)[:, None]
-    mean[:, 0] = 1.0 - mean[:, 1:].sum(axis=1)
+    mean[:, 0] = np.maximum(0.0, 1.0 - mean[:, 1:].sum(axis=1))
     return np.asarray(mean)
 
 
