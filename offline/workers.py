@@ -113,7 +113,8 @@ def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result, in
     failure: AdaptuneError | None = None
     deaths: dict[int, int] = {}
     near: dict[W, set[str]] = {}
-    while waiting or running or finished:
+    # What the last task raises is still to be told when nothing runs.
+    while waiting or running or finished or failure is not None:
         for worker in pool.workers() if waiting and failure is None else ():
             if waiting and worker not in running:
                 task = _pick(waiting, near, worker)
