@@ -202,7 +202,9 @@ def validate(paths: list[Path], size: int) -> None:
     sequences, sets = labelled(paths)
     left_out = leave_one_out(sequences, sets, bank=size).left_out
     for i, (of, sequence) in enumerate(zip(left_out, sequences, strict=True)):
-        of.errors.update(constantly(sequence, sequences[:i] + sequences[i + 1 :], sets, size))
+        others = sequences[:i] + sequences[i + 1 :]
+        data, _ = training_data(others, sets)
+        of.errors.update(constantly(sequence, choose_bank(others, data.fixed, size)))
     validation = Validation(left_out)
     print_summary(validation, validation.ratios)
     for mode in validation.modes:
@@ -216,20 +218,15 @@ Errors = dict[str, NDArray[np.float64]]
 """Of a sequence in several modes, capped, at each frame that has a sub-trajectory."""
 
 
-def constantly(
-    sequence: LabelledSequence,
-    others: list[LabelledSequence],
-    sets: NDArray[np.float64],
-    size: int,
-) -> Errors:
+def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     """Errors of a bank whose weights are the same all the way."""
-    data, _ = training_data(others, sets)
-    members = choose_bank(others, data.fixed, size)
     assert sequence.vectors is not None
     vectors, lost = fusion.limited(sequence.vectors[:, members], 0)
     squares = np.einsum("ijx,ikx->jk", vectors, vectors) + np.diag((lost**2).sum(axis=0))
     return {
-        "bank, even weights": bank_errors(sequence, members, np.full(size, 1.0 / size)),
+        "bank, even weights": bank_errors(
+            sequence, members, np.full(len(members), 1.0 / len(members))
+        ),
         # Nobody knows them who has not been there.
         "bank, best weights": bank_errors(sequence, members, fusion.least(squares)),
     }
@@ -486,7 +483,7 @@ def banks(
         "bank, weights of each second": driven(last=1),
         "bank, weights of 20 seconds": driven(last=20),
     }
-    return found | constantly(sequence, others, sets, size)
+    return found | constantly(sequence, members)
 
 
 def curve(paths: list[Path]) -> None:

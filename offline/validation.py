@@ -52,7 +52,7 @@ SHARPNESS = (6.0, 12.0, 24.0, 48.0)
 BANK_SHARPNESS = (12.0, 48.0)
 HEDGES = (0.0, 0.25, 0.5)
 BANK_LIMITS = (6.0, 18.0)
-"""What `tune_bank` chooses from, besides."""
+"""What `tune_bank` chooses from, every one with every other."""
 BANK = "bank"
 """The mode in which a bank is driven."""
 BANK_SIZE = 4
