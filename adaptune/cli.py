@@ -132,7 +132,7 @@ def inspect(
 ) -> None:
     """Tell what is in a recording, what each stage lacks, and how to name it in a study."""
     from adaptune.inspect import inspect as inspect_file
-    from adaptune.inspect import render_inspection, write_inspection_png
+    from adaptune.rendering import render_inspection, write_inspection_png
 
     found = inspect_file(file)
     console.print(render_inspection(found))
@@ -157,7 +157,7 @@ def cache(
     Bags are decoded once and mapped into memory from then on. `ADAPTUNE_CACHE` names another
     folder; `ADAPTUNE_CACHE_GB` bounds its size (50), and 0 turns it off.
     """
-    from adaptune.inspect import render_cache
+    from adaptune.rendering import render_cache
     from adaptune.sequence.cache import clear_cache
 
     if action is CacheAction.CLEAR:
@@ -207,7 +207,7 @@ def simulate(
     Each course under `courses:` becomes a bag in the BotanicGarden layout, with its truth in a TUM
     file and a picture beside it.
     """
-    from adaptune.simulation import record
+    from adaptune.simulation.recording import record
 
     loaded = load_study(study, override, folder)
     if not loaded.config.courses:

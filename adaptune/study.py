@@ -27,7 +27,7 @@ from pydantic import (
 
 from adaptune import yaml
 from adaptune.cores import available
-from adaptune.descriptor import DescriptorError, descriptor
+from adaptune.descriptor import DescriptorError, check_descriptor
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.odometry import (
@@ -45,11 +45,14 @@ from adaptune.odometry import (
 )
 from adaptune.odometry.command import Material, material
 from adaptune.sampling import NAMES, SETTINGS, SINGLE, SamplerError, check_sampler, optuna_class
-from adaptune.sequence import SequenceConfig, open_sequence
-from adaptune.sequence.bag import bag_paths
-from adaptune.sequence.config import ViewConfig, check_sequence, expand
-from adaptune.sequence.views import OF_VIEW, WithImu, origin
-from adaptune.simulation import Course, as_sequence
+from adaptune.sequence import SequenceConfig
+from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.config import ViewConfig, expand
+from adaptune.sequence.names import OF_VIEW, origin
+from adaptune.sequence.opening import check_sequence, open_sequence
+from adaptune.sequence.views import WithImu
+from adaptune.simulation.course import Course
+from adaptune.simulation.rig import as_sequence
 from adaptune.space import (
     Categorical,
     Float,
@@ -228,7 +231,7 @@ class OfflineConfig(_Section):
 
 def _known_descriptor(name: str) -> str:
     try:
-        descriptor(name)
+        check_descriptor(name)
     except DescriptorError as error:
         raise ValueError(str(error)) from error
     return name

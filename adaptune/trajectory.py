@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
@@ -265,6 +264,8 @@ def read_oxts(files: list[Path]) -> Poses:
     TrajectoryError
         Naming the file that cannot be read.
     """
+    from scipy.spatial.transform import Rotation
+
     values = np.empty((len(files), 6))
     for i, path in enumerate(files):
         rows = _rows(path, 6, "OXTS", or_more=True)

@@ -33,7 +33,7 @@ import drives
 
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.gicp import crop
-from adaptune.simulation import record
+from adaptune.simulation.recording import record
 from adaptune.study import Study, load_study
 from offline import campaign
 from offline.workers import Result, Task

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from adaptune.archive import Frames
 from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
 from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
-from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
+from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
 from adaptune.metrics import cap
 from adaptune.model import (
@@ -41,7 +41,8 @@ from adaptune.model import (
     fusion,
 )
 from adaptune.model.base import complementary
-from adaptune.simulation import Course, simulate
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
 from adaptune.study import Study, StudyConfig
 from offline.fusion import Drive, error_vectors, periods, recorded_motions
 from offline.samplers import make_sampler

@@ -26,9 +26,11 @@ from adaptune import cores, open3d
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry import BOXES, Box, HandOver, Isolated, Limits, WarmUp, box_class
-from adaptune.sequence import Scan, SequenceError, open_sequence
+from adaptune.sequence import Scan, SequenceError
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.views import WithImu
-from adaptune.simulation import Course, as_sequence
+from adaptune.simulation import Course
+from adaptune.simulation.rig import as_sequence
 
 LENGTH = 25.0
 WARM_UPS = (

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from adaptune import yaml
 from adaptune.archive import Archive
-from adaptune.simulation import record
+from adaptune.simulation.recording import record
 from adaptune.study import Study, load_study
 from offline.campaign import run_batches, train
 from offline.objective import choose_fixed

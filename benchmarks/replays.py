@@ -21,7 +21,7 @@ import numpy as np
 from gain import ODOMETRIES, WINDOW, labelled, study_of, training_courses, trials
 from numpy.typing import NDArray
 
-from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
@@ -29,7 +29,8 @@ from adaptune.model.fusion import Steady
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
 from adaptune.sequence import Scan
-from adaptune.simulation import Course, simulate
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
 from adaptune.space import ParameterSet
 from offline.validation import choose_bank, training_data, tune, tune_bank
 from online.replay import Policy, replay

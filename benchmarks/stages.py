@@ -17,13 +17,14 @@ import numpy as np
 import small_gicp
 
 from adaptune import cores
-from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
 from adaptune.odometry import HealthCheck
 from adaptune.odometry.gicp import crop
-from adaptune.sequence import Scan, SequenceConfig, open_sequence
+from adaptune.sequence import Scan, SequenceConfig
+from adaptune.sequence.opening import open_sequence
 from adaptune.study import Study, load_study
 from adaptune.trajectory import read_kitti
 from offline.campaign import train

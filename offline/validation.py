@@ -33,7 +33,7 @@ from adaptune.model import (
 from adaptune.model.base import complementary, mean_errors
 from adaptune.model.fusion import PairedFusion
 from adaptune.model.paired import ERROR_FLOOR, Near
-from adaptune.sequence.views import origin, places
+from adaptune.sequence.names import origin, places
 from adaptune.study import Study
 from offline.fusion import Drive, drive, error_vectors, periods
 from offline.objective import weighted

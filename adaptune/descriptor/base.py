@@ -18,7 +18,7 @@ ENTRY_POINTS = "adaptune.descriptors"
 """Group in which other packages announce their descriptors, each by its name."""
 
 DESCRIPTORS = {
-    "ndt": "adaptune.descriptor.ndt:describe",
+    "ndt": "adaptune.descriptor.ndt_histogram:describe",
     "ring_heights": "adaptune.descriptor.polar:ring_heights",
     "range_image": "adaptune.descriptor.polar:range_image",
     "fpfh": "adaptune.descriptor.fpfh:fpfh",
@@ -52,6 +52,17 @@ def descriptor(name: str) -> Descriptor:
         raise DescriptorError(f"{name}: is not a function from a scan to an array")
     describe: Descriptor = found
     return describe
+
+
+def check_descriptor(name: str) -> None:
+    """Refuse a name that leads to no descriptor, without importing one of `DESCRIPTORS`.
+
+    Raises
+    ------
+    DescriptorError
+    """
+    if name not in DESCRIPTORS:
+        descriptor(name)
 
 
 class Describer:

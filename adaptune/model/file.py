@@ -20,7 +20,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.model.base import TrainingData
 from adaptune.model.paired import Settings
-from adaptune.sequence.views import places
+from adaptune.sequence.names import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
 FORMAT = 4

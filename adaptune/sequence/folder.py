@@ -16,7 +16,8 @@ from adaptune.geometry import Poses
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloudError, from_fields
 from adaptune.sequence.scan import Scan
-from adaptune.sequence.sequence import Frame, SequenceError
+from adaptune.sequence.sequence import SequenceError
+from adaptune.sequence.source import Frame
 from adaptune.sequence.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
 

@@ -16,31 +16,17 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.geometry import Poses
+from adaptune.sequence.compensation import compensate_neighbours, compensate_rotation
 from adaptune.sequence.imu import Imu
-from adaptune.sequence.motion import compensate_neighbours, compensate_rotation
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence, SequenceError
 from adaptune.trajectory import Trajectory
-
-OF_VIEW = "+"
-"""Between the name of a sequence and that of a view of it; in no name that a user gives."""
 
 # Nanoseconds after the first scan at which an IMU that is on the same clock has begun.
 _LATE = 10 * 10**9
 
 Part = tuple[float, float | None]
 """Seconds since the first scan: [start, stop), to the end where stop is None."""
-
-
-def origin(name: str) -> str:
-    """Name of the sequence that a training sequence is, or is a view of."""
-    return name.partition(OF_VIEW)[0]
-
-
-def places(names: Items[str]) -> NDArray[np.intp]:
-    """Number the places that sequences are of, of shape (n,): a view is of its origin's."""
-    number = {place: i for i, place in enumerate(dict.fromkeys(map(origin, names)))}
-    return np.array([number[origin(name)] for name in names], np.intp)
 
 
 class Reversible(Sequence, Protocol):

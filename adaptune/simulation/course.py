@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from adaptune.errors import AdaptuneError
-from adaptune.simulation.motion import MOTIONS
+from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import SENSORS
 from adaptune.simulation.weather import WEATHERS

@@ -12,10 +12,10 @@ from rosbags.rosbag2 import StoragePlugin
 
 from adaptune import geometry
 from adaptune.files import replacing, replacing_folder
-from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.export import Message, Messages, write_kitti_times
-from adaptune.simulation import imu
 from adaptune.simulation.course import Course, SimulationError
+from adaptune.simulation.inertial import Inertial, measure
+from adaptune.simulation.rig import IMU, POINTS, POSES
 from adaptune.simulation.simulate import Drive, SimulatedScan
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
 
@@ -26,9 +26,6 @@ Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
 
 Progress = Callable[[int, int], None]
-
-POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"
-"""Topics, named as BotanicGarden names them."""
 
 CLOUD = np.dtype(
     [
@@ -105,26 +102,6 @@ def record(
         picture.save(preview_beside)
 
 
-def as_sequence(course: Course, path: Path) -> SequenceConfig:
-    """How a study names what was recorded of a course.
-
-    Parameters
-    ----------
-    course
-        What was simulated.
-    path
-        The bag.
-    """
-    measured: dict[str, Any] | None = None
-    if course.imu is not None:
-        measured = {
-            "topic": IMU,
-            "extrinsic": geometry.invert(imu.T_IMU_LIDAR).tolist(),
-            "noise": imu.NOISE._asdict(),
-        }
-    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=measured)
-
-
 def _layout(path: Path) -> Layout:
     return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix, "ros2")  # type: ignore[return-value]
 
@@ -185,14 +162,14 @@ class _Composer(Messages):
             yield POSES, end, self._pose(end, T_world_sensor[i + 1], quaternions[i + 1])
             yield POINTS, end, self._cloud(scan, end)
 
-    def _inertial(self, end: int) -> tuple[imu.Inertial, NDArray[np.int64]]:
+    def _inertial(self, end: int) -> tuple[Inertial, NDArray[np.int64]]:
         drive, rate = self._drive, self._drive.course.imu
         if rate is None:
             empty = np.empty((0, 3))
-            return imu.Inertial(np.empty(0), empty, empty), np.empty(0, np.int64)
+            return Inertial(np.empty(0), empty, empty), np.empty(0, np.int64)
         start = int(drive.stamps()[0])
         stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
-        return imu.measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
+        return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
 
     def _pose(self, stamp: int, T: geometry.Poses, quaternion: NDArray[np.float64]) -> Any:
         t = self.types

@@ -13,10 +13,11 @@ from adaptune.sequence.scan import Scan
 from adaptune.simulation import rays as kernels
 from adaptune.simulation.course import Course
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
-from adaptune.simulation.motion import MOTIONS, Ride
+from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.movers import RADIUS, model, populate
+from adaptune.simulation.ride import Ride
 from adaptune.simulation.road import Road
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.scenes import scene
 from adaptune.simulation.scenes.base import TILE
 from adaptune.simulation.sensors import SENSORS, directions
 from adaptune.simulation.weather import WEATHERS
@@ -66,7 +67,7 @@ class Drive:
 
     def __init__(self, course: Course) -> None:
         self.course = course
-        self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
+        self.road = Road([(scene(name), length) for name, length in course.legs], course.seed)
         self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
 
     def __len__(self) -> int:

@@ -30,6 +30,11 @@ class World:
     road
         The road along which it is built.
 
+    Attributes
+    ----------
+    tiles : dict
+        Meshes of the tiles in reach, by index.
+
     Notes
     -----
     Every tile has its own source of randomness, so that it looks the same whenever it is built.
@@ -38,7 +43,7 @@ class World:
 
     def __init__(self, road: Road) -> None:
         self._road = road
-        self._tiles: dict[int, Mesh] = {}
+        self.tiles: dict[int, Mesh] = {}
         self._last = int(np.floor((road.length + APRON) / TILE))
 
     def around(self, station: float, reach: float) -> Mesh:
@@ -46,8 +51,8 @@ class World:
         first = max(int(np.floor((station - reach) / TILE)), int(-APRON // TILE))
         last = min(int(np.floor((station + reach) / TILE)), self._last)
         wanted = range(first, last + 1)
-        self._tiles = {i: self._tiles[i] if i in self._tiles else self.tile(i) for i in wanted}
-        return merge(list(self._tiles.values()))
+        self.tiles = {i: self.tiles[i] if i in self.tiles else self.tile(i) for i in wanted}
+        return merge(list(self.tiles.values()))
 
     def tile(self, index: int) -> Mesh:
         """Build the tile that begins at station ``index * TILE``."""

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from adaptune.descriptor import DescriptorError
-from adaptune.descriptor.ndt import describe
+from adaptune.descriptor.ndt_histogram import describe
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, PairedFusion, Selection
 from adaptune.odometry import HealthCheck, Odometry, OdometryError, Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.sequence import Scan
-from adaptune.simulation import Course, simulate
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
 from adaptune.space import Float, ParameterSpace
 from adaptune.trajectory import read_tum
 from online.replay import adaptive, replay, write_replay

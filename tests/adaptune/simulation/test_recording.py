@@ -5,10 +5,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert, rotation_angle, steps
-from adaptune.sequence.config import SequenceConfig, open_sequence
-from adaptune.simulation import Course, SimulationError, record, simulate
-from adaptune.simulation.recording import CLOUD, undistort
-from adaptune.simulation.simulate import Drive
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import open_sequence
+from adaptune.simulation import Course, SimulationError
+from adaptune.simulation.recording import CLOUD, record, undistort
+from adaptune.simulation.simulate import Drive, simulate
 from adaptune.trajectory import read_kitti, read_tum
 
 COURSE = Course(

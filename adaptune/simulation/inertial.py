@@ -5,25 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert
-from adaptune.sequence.imu import ImuNoise
-from adaptune.simulation.motion import Ride
+from adaptune.geometry import invert
+from adaptune.simulation.ride import Ride
+from adaptune.simulation.rig import NOISE, T_IMU_LIDAR
 
 GRAVITY = 9.80665
 """m/s^2, downwards along the world's z axis."""
-
-T_IMU_LIDAR: Poses = np.array(
-    [
-        [0.9996789, 0.0252866, 0.0015042, 0.058487],
-        [-0.0252723, 0.9996494, -0.0078025, 0.008404],
-        [-0.0017010, 0.0077630, 0.9999700, 0.168916],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
-"""Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
-
-NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
-"""Of an Xsens MTi-680G."""
 
 
 @dataclass(frozen=True, eq=False)

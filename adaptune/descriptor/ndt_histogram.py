@@ -5,13 +5,9 @@ data using the normal distributions transform*, ICRA 2009, and Koide et al., IRO
 leave the constants open; they are set here.
 """
 
-from collections.abc import Iterable
-from typing import Any, Self
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
 
 from adaptune.sequence import Scan
 
@@ -201,28 +197,3 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
 def describe(scan: Scan) -> NDArray[np.float64]:
     """`ndt_histogram` of a scan."""
     return ndt_histogram(scan.points)
-
-
-class NdtHistogram(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """`ndt_histogram` of many scans, as a scikit-learn transformer without state."""
-
-    def fit(self, X: Any = None, y: Any = None) -> Self:  # noqa: ARG002
-        """Do nothing: there is nothing to learn."""
-        return self
-
-    def transform(self, X: Iterable[NDArray[np.float32]]) -> NDArray[np.float64]:
-        """Describe scans.
-
-        Parameters
-        ----------
-        X
-            Point clouds of shape (n_points, 3).
-
-        Returns
-        -------
-        ndarray of shape (n_scans, 90)
-        """
-        return np.array([ndt_histogram(points) for points in X]).reshape(-1, N_FEATURES)
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return True

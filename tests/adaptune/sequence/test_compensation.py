@@ -6,9 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
-from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError
+from adaptune.sequence.compensation import compensate, compensate_neighbours, compensate_rotation
 from adaptune.sequence.imu import clock_offset
-from adaptune.sequence.motion import compensate, compensate_neighbours, compensate_rotation
+from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import Trajectory
 
 RATE = np.array([0.3, -0.2, 1.5])

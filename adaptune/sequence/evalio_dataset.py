@@ -10,10 +10,12 @@ import numpy as np
 
 from adaptune import geometry
 from adaptune.geometry import Poses
-from adaptune.sequence.bag import BagSource, bag_paths
+from adaptune.sequence.bag import BagSource
+from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
-from adaptune.sequence.sequence import Frame, SequenceError, Source
+from adaptune.sequence.sequence import SequenceError
+from adaptune.sequence.source import Frame, Source
 from adaptune.sequence.timing import Timing
 from adaptune.trajectory import Trajectory
 
@@ -51,8 +53,8 @@ def evalio_source(name: str) -> Source:
         )
     recording = dataset.data_iter()
     if isinstance(recording, datasets.RosbagIter):
-        return _EvalioBag(dataset, recording)
-    return _EvalioFiles(dataset)
+        return EvalioBag(dataset, recording)
+    return EvalioFiles(dataset)
 
 
 def _poses(dataset: Any) -> Trajectory | None:
@@ -72,7 +74,7 @@ def _place_of_imu(dataset: Any) -> Poses:
     return geometry.invert(np.asarray(dataset.imu_T_lidar().to_mat(), np.float64))
 
 
-class _EvalioBag(BagSource):
+class EvalioBag(BagSource):
     """A data set kept in bags: evalio tells the topics, the stamps and the poses."""
 
     def __init__(self, dataset: Any, recording: Any):
@@ -99,7 +101,7 @@ class _EvalioBag(BagSource):
         )
 
 
-class _EvalioFiles:
+class EvalioFiles:
     """A data set kept in files of its own, which evalio converts point by point."""
 
     random_access: ClassVar[bool] = False
