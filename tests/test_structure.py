@@ -3,6 +3,7 @@
 import ast
 import subprocess
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -50,9 +51,7 @@ def n_parameters(function: Function, method: bool) -> int:
     given = function.args
     n = len(given.posonlyargs) + len(given.args) + len(given.kwonlyargs)
     n += (given.vararg is not None) + (given.kwarg is not None)
-    static = any(
-        isinstance(d, ast.Name) and d.id == "staticmethod" for d in function.decorator_list
-    )
+    static = "staticmethod" in map(ast.unparse, function.decorator_list)
     return n - (method and not static)
 
 
@@ -89,15 +88,21 @@ def breaches(file: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("folder", (*SOURCES, "tests"))
+def report(breaches: Iterable[str]) -> None:
+    """Fail and list all breaches, if there are any."""
+    if text := "\n".join(breaches):
+        pytest.fail(text, pytrace=False)
+
+
+@pytest.mark.parametrize("folder", [*SOURCES, "tests"])
 def test_files_are_short(folder: str) -> None:
-    lines = {file: len((ROOT / file).read_text("utf-8").splitlines()) for file in tracked(folder)}
-    assert not {file: n for file, n in lines.items() if n > MAX_FILE_LINES}
+    lines = {file: (ROOT / file).read_text("utf-8").count("\n") for file in tracked(folder)}
+    report(f"{file}: {n} lines" for file, n in lines.items() if n > MAX_FILE_LINES)
 
 
 @pytest.mark.parametrize("folder", SOURCES)
 def test_functions_are_short_and_flat(folder: str) -> None:
-    assert not [breach for file in tracked(folder) for breach in breaches(file)]
+    report(breach for file in tracked(folder) for breach in breaches(file))
 
 
 def test_no_two_modules_share_a_name() -> None:
@@ -107,7 +112,12 @@ def test_no_two_modules_share_a_name() -> None:
             places[file.parent.name].add(str(file.parent))
         elif file.stem not in SHARED_NAMES and file.stem != file.parent.name:
             places[file.stem].add(str(file))
-    assert not {name: files for name, files in places.items() if len(files) > 1}
+    report(" and ".join(sorted(files)) for files in places.values() if len(files) > 1)
+
+
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.is_dir() or path.with_suffix(".py").exists()
 
 
 def private_names(file: str) -> list[str]:
@@ -116,19 +126,18 @@ def private_names(file: str) -> list[str]:
     modules: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            ours = [alias for alias in node.names if alias.name.split(".")[0] in PACKAGES]
-            modules |= {alias.asname or alias.name for alias in ours}
-            names = [part for alias in ours for part in alias.name.split(".")]
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
-            modules |= {alias.asname or alias.name for alias in node.names}
-            names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+            imported = {alias.name: alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported = {f"{node.module}.{a.name}": a.asname or a.name for a in node.names}
         else:
             continue
-        found += [f"{file}:{node.lineno} {name}" for name in names if is_private(name)]
+        ours = {name: local for name, local in imported.items() if name.split(".")[0] in PACKAGES}
+        modules |= {local for name, local in ours.items() if is_module(name)}
+        found += [f"{file}:{node.lineno} {n}" for n in ours if any(map(is_private, n.split(".")))]
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and is_private(node.attr):
-            if ast.unparse(node.value) in modules:
-                found.append(f"{file}:{node.lineno} {ast.unparse(node)}")
+            name = ast.unparse(node)
+            found += [f"{file}:{node.lineno} {name}"] * (name.rpartition(".")[0] in modules)
     return found
 
 
@@ -137,7 +146,7 @@ def is_private(name: str) -> bool:
 
 
 def test_tests_use_no_private_names_of_ours() -> None:
-    assert not [name for file in tracked("tests") for name in private_names(file)]
+    report(name for file in tracked("tests") for name in private_names(file))
 
 
 @pytest.mark.parametrize(
