@@ -70,15 +70,15 @@ def _tilt(c: NDArray[np.float64], value: float) -> float:
 
 
 @numba.njit(cache=True)
-def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sum up the points of every cell.
 
     Returns
     -------
     sums : ndarray of shape (n_cells, 10)
         Count, x, y, z, xx, yy, zz, xy, xz, yz, about the cell's centre.
-    centres : ndarray of shape (n_cells, 2)
-        x and y.
+    keys : ndarray of shape (n_cells,)
+        Number of each cell.
     """
     n = len(points)
     size = 1024
@@ -130,17 +130,13 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
         s[7] += x * y
         s[8] += x * z
         s[9] += y * z
-    centres = np.empty((cells, 2), np.float64)
-    for cell in range(cells):
-        centres[cell, 0] = (keys[cell] % SPAN - SPAN // 2 + 0.5) * CELL_SIZE
-        centres[cell, 1] = (keys[cell] // SPAN % SPAN - SPAN // 2 + 0.5) * CELL_SIZE
-    return sums[:cells], centres
+    return sums[:cells], keys[:cells]
 
 
 @numba.njit(cache=True)
 def _histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     counts = np.zeros(N_FEATURES)
-    sums, centres = _accumulate(points)
+    sums, keys = _accumulate(points)
     c = np.empty(6)
     for cell in range(len(sums)):
         s = sums[cell]
@@ -148,7 +144,9 @@ def _histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
         if n < MIN_POINTS:
             continue
         mx, my, mz = s[1] / n, s[2] / n, s[3] / n
-        distance = np.hypot(centres[cell, 0] + mx, centres[cell, 1] + my)
+        x = (keys[cell] % SPAN - SPAN // 2 + 0.5) * CELL_SIZE + mx
+        y = (keys[cell] // SPAN % SPAN - SPAN // 2 + 0.5) * CELL_SIZE + my
+        distance = np.hypot(x, y)
         distance_bin = int(distance / DISTANCE_BIN)
         if distance_bin >= N_DISTANCES:
             continue

@@ -91,25 +91,21 @@ class Drive:
         rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
         offsets = np.arange(columns) / (columns * course.turns)
         times = np.repeat(offsets, sensor.rings).astype(np.float32)
+        receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
             start = (stamp - EPOCH) * 1e-9
             T_world_sensor = self.ride.poses(start + offsets)
             looks = directions(course.sensor, columns, start, course.turns)
-            rays, hits, normals, reflectivity = caster.cast(looks, T_world_sensor, start + offsets)
+            cast = caster.cast(looks, T_world_sensor, start + offsets)
             rng = np.random.default_rng([course.seed, 6, number])
             points, intensities, kept = kernels.receive(
                 looks.reshape(-1, 3),
-                rays,
-                hits,
-                normals,
-                reflectivity,
-                sensor.range,
-                sensor.noise,
-                sensor.dropout,
+                cast,
+                receiver,
                 (air.extinction, air.backscatter, air.reach),
-                rng.random((2, len(rays)), np.float32),
-                rng.standard_normal(len(rays), np.float32),
+                rng.random((2, len(cast.rays)), np.float32),
+                rng.standard_normal(len(cast.rays), np.float32),
             )
             yield SimulatedScan(
                 stamp=stamp,
@@ -135,8 +131,8 @@ class _Caster:
 
     def cast(
         self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Cast rays from each column's pose: the rays, and what `_Target.cast` gives for them."""
+    ) -> kernels.Cast:
+        """Cast rays from each column's pose."""
         station = float(self._road.station(T_world_sensor[0, 0, 3]))
         tile = int(station // TILE)
         if tile != self._here:
@@ -163,7 +159,7 @@ class _Caster:
             normals[picked, 0] = cos * turned[:, 0] - sin * turned[:, 1]
             normals[picked, 1] = sin * turned[:, 0] + cos * turned[:, 1]
             normals[picked, 2] = turned[:, 2]
-        return rays, hits, normals, reflectivity
+        return kernels.Cast(rays, hits, normals, reflectivity)
 
 
 class _Target:

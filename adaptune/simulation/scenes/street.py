@@ -65,12 +65,10 @@ def _build(tile: Tile) -> list[Mesh]:
                 house = _house(width, rng.uniform(8.0, 12.0), int(rng.integers(2, 6)), rng)
                 at = tile.at(middle, side * (_KERB + rng.uniform(4.0, 10.0)))
                 meshes.append(place(house, at, tile.heading(middle) + turn))
-            elif width >= 4.0 and rng.random() < 0.5:
+            elif width >= 4.0 and rng.random() < 0.5 and not crossing:
                 hedge = box((width, 0.8, 1.6), Material.LEAVES)
-                if not crossing:
-                    meshes.append(
-                        place(hedge, tile.at(middle, side * (_KERB + 4.0)), tile.heading(middle))
-                    )
+                at = tile.at(middle, side * (_KERB + 4.0))
+                meshes.append(place(hedge, at, tile.heading(middle)))
             s += width + gap
         if crossing:
             meshes.extend(_side_street(tile, side))
