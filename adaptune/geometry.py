@@ -31,9 +31,9 @@ def invert(T_target_source: Poses) -> Poses:
 
 
 def rectify(T_target_source: Poses) -> Poses:
-    """Take rounding errors out of rotations, by one Newton step of the polar decomposition.
+    """Remove rounding errors from rotations by one Newton step of the polar decomposition.
 
-    Chained motions amplify them: where each pose is predicted from the two before it, they more
+    Chained motions amplify them. Where each pose is predicted from the two before it, they more
     than double with every scan.
 
     Parameters
@@ -81,19 +81,19 @@ def steps(T_world_sensor: Poses) -> Poses:
 
 
 def scale(T_previous_current: Poses, share: float) -> Poses:
-    """A motion that goes on for another time, at the same velocities.
+    """Scale a motion in time, at the same velocities.
 
     Parameters
     ----------
     T_previous_current
         The motion, of shape (4, 4).
     share
-        Of its time.
+        Share of its time.
 
     Returns
     -------
     ndarray of shape (4, 4)
-        The screw motion through the same: `share` times its logarithm.
+        The exponential of `share` times its logarithm.
     """
     if share == 1.0:
         return T_previous_current
@@ -196,7 +196,7 @@ def interpolate(
     at
         Nanoseconds, of shape (m,).
     max_gap
-        Nanoseconds. Between two poses further apart than this nothing is interpolated.
+        Nanoseconds. Nothing is interpolated between poses further apart than this.
 
     Returns
     -------

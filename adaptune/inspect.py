@@ -78,7 +78,7 @@ class ScanSummary:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What is known of a recording.
+    """Content of a recording.
 
     Attributes
     ----------
@@ -90,9 +90,9 @@ class Inspection:
         None where no scan could be read.
     reference : Trajectory, optional
     problems : tuple of str
-        What is odd or cannot be read.
+        What is odd or unreadable.
     missing : dict
-        What each stage still needs, by stage; nothing where it can run.
+        What each stage still needs, by stage; empty if it can run.
     entry : str
         YAML for the `sequences:` of a study.
     """
@@ -108,7 +108,7 @@ class Inspection:
 
 
 def inspect(path: Path) -> Inspection:
-    """Read through a recording and tell what it holds.
+    """Read a whole recording and report what it holds.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def inspect(path: Path) -> Inspection:
     Raises
     ------
     SequenceError
-        If it cannot be opened at all. What cannot be read after that is among the problems.
+        If it cannot be opened at all. Later failures are among the problems.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
@@ -134,7 +134,7 @@ def inspect(path: Path) -> Inspection:
         problems += read
         clouds = [t for t in topics if t.type in POINTS_TYPES and t.count]
         if clouds:
-            # The densest of several: others are its own parts, or filtered.
+            # The densest of several: the others are parts of it, or filtered.
             given["points"] = max(clouds, key=lambda t: (t.count, t.name)).name
         poses = [t for t in topics if t.type in POSES and t.count and "tf" not in t.type.lower()]
         if poses:
@@ -164,7 +164,7 @@ def inspect(path: Path) -> Inspection:
 
 
 def _kind(path: Path) -> str:
-    """Key of a `sequences:` entry that opens it."""
+    """Key of the `sequences:` entry that opens it."""
     if not path.is_dir():
         return "bag"
     if any((path / name).is_dir() for name in _KITTI_FOLDERS):
@@ -174,13 +174,13 @@ def _kind(path: Path) -> str:
 
 
 def _any_bag(path: Path) -> BagSource:
-    """The bag, opened without asking for point clouds."""
+    """Open the bag without looking for point clouds."""
     about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
     return BagSource(bag_paths([str(path)]), about=about)
 
 
 def _topics(source: BagSource) -> tuple[tuple[Topic, ...], list[str]]:
-    """Every topic with its stamps, and what kept them from being read."""
+    """Every topic with its stamps, and the problems of reading them."""
     problems = []
     with source.open() as reader:
         kinds = {c.topic: c.msgtype for c in reader.connections}
@@ -229,7 +229,7 @@ def _topic(
 def _oddities(
     stamps: NDArray[np.int64], recorded: Items[int], gap: float | None, rate: float | None
 ) -> tuple[str, ...]:
-    told = []
+    found = []
     steps = np.diff(stamps)
     if len(stamps) > 1 and stamps.max() == 0:
         return ("all stamps are zero",)
@@ -240,18 +240,18 @@ def _oddities(
         ("stamps are zero", np.count_nonzero(stamps[1:] == 0)),
     ):
         if number:
-            told.append(f"{number} {what}")
+            found.append(f"{number} {what}")
     if gap is not None and rate is not None and gap * rate > 3.5 and gap > 0.2:
         lost = np.count_nonzero(steps * 1e-9 * rate > 3.5)
-        told.append(f"{lost} gaps, the longest of {gap:.2f} s")
+        found.append(f"{lost} gaps, the longest of {gap:.2f} s")
     if len(recorded) == len(stamps):
         late = (np.array(recorded, np.int64) - stamps) * 1e-9
         usual = float(np.median(late))
         if abs(usual) > 5.0:
-            told.append(f"its clock is {abs(usual):.3f} s {_side(usual)} the recorder's")
+            found.append(f"its clock is {abs(usual):.3f} s {_side(usual)} the recorder's")
         if leaps := np.count_nonzero(np.abs(late - usual) > 5.0):
-            told.append(f"{leaps} stamps leap by more than 5 s against the recorder's clock")
-    return tuple(told)
+            found.append(f"{leaps} stamps leap by more than 5 s against the recorder's clock")
+    return tuple(found)
 
 
 def _side(late: float) -> str:
@@ -267,7 +267,7 @@ def _first_scan(
     tuple[Topic, ...],
     list[str],
 ]:
-    """First scan and reference through the very reader that the stages use."""
+    """First scan and reference, read as the stages read them."""
     problems = []
     scan, reference = None, None
     layout: tuple[tuple[str, str, int], ...] = ()

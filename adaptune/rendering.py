@@ -135,8 +135,8 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
     above.plot(0, 0, "r+", markersize=10)
     figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6, extend="both")
     figure.suptitle(f"{inspection.path.name}: {_scan_text(inspection.scan)}", fontsize=9)
-    with replacing(path) as beside:
-        figure.savefig(beside, format="png", dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 def render_cache() -> RenderableType:

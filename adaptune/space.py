@@ -1,4 +1,4 @@
-"""The parameters of an odometry: their types, their ranges, and the unit cube they map to."""
+"""The parameters of an odometry: their types, their ranges, and their map to the unit cube."""
 
 import difflib
 import math
@@ -17,11 +17,11 @@ ParameterSet = dict[str, Value]
 
 
 class SpaceError(AdaptuneError):
-    """A parameter set that is not of its space."""
+    """A parameter set that does not fit its space."""
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Half a sentence that helps with a wrong name: the nearest valid one, else all."""
+    """The nearest valid name as half a sentence, or all valid names."""
     names = sorted(names)
     close = difflib.get_close_matches(name, names, n=1)
     if close:
@@ -34,7 +34,7 @@ class _Parameter(BaseModel):
 
 
 class _Range(_Parameter):
-    """What real and whole numbers share: bounds, and a scale between them."""
+    """Bounds and scale of a real or whole number."""
 
     low: float
     high: float
@@ -141,8 +141,8 @@ class Categorical(_Parameter):
         return any(type(value) is type(choice) and value == choice for choice in self.choices)
 
     def index(self, value: object) -> int:
-        """Which of the choices it is."""
-        # Not by the tuple's own: True is equal to 1.
+        """Index of a choice."""
+        # Not the index of the tuple: True is equal to 1.
         alike = [type(value) is type(choice) and value == choice for choice in self.choices]
         return alike.index(True)
 
@@ -161,7 +161,7 @@ _adapter: TypeAdapter[Float | Integer | Categorical] = TypeAdapter(Parameter)
 
 
 class ParameterSpace:
-    """The parameters that are tuned, in their order.
+    """The tuned parameters in their order.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class ParameterSpace:
 
     @property
     def baseline(self) -> ParameterSet:
-        """The odometry's own choice of every parameter."""
+        """The odometry's own value of every parameter."""
         return {name: parameter.baseline for name, parameter in self.parameters.items()}
 
     def check(self, parameters: Mapping[str, object]) -> None:
@@ -228,7 +228,7 @@ class ParameterSpace:
 
     @classmethod
     def load(cls, data: Mapping[str, Any]) -> Self:
-        """Make a space from what `dump` gave.
+        """Make a space from the result of `dump`.
 
         Raises
         ------

@@ -28,7 +28,7 @@ class Trajectory:
     T_world_sensor : ndarray of shape (n, 4, 4)
         The pose at each stamp, in metres.
     max_gap : float
-        Seconds; between poses further apart nothing is known.
+        Seconds. Between poses further apart the trajectory is unknown.
     """
 
     stamps: NDArray[np.int64]
@@ -60,7 +60,7 @@ class Trajectory:
         Returns
         -------
         ndarray of shape (m, 4, 4)
-            NaN where the trajectory says nothing.
+            NaN where the trajectory has no pose.
         """
         gap = self.max_gap if max_gap is None else max_gap
         return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
@@ -69,7 +69,7 @@ class Trajectory:
 def _rows(
     path: Path, columns: int, kind: str, or_more: bool = False
 ) -> list[tuple[int, list[str]]]:
-    """Split the lines that are neither empty nor a comment, with their numbers."""
+    """Fields of the lines that are neither empty nor a comment, with the numbers of the lines."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -180,7 +180,7 @@ def write_kitti(path: Path, T_world_sensor: Poses) -> None:
 
 
 def is_kitti(path: Path) -> bool:
-    """Whether a file's first pose is one of 12 numbers, without a stamp.
+    """Whether a file's first pose has 12 numbers, and no stamp.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def _columns(path: Path) -> int:
 def read_euroc(path: Path) -> Trajectory:
     """Read ``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...`` lines, nanoseconds and metres.
 
-    What follows the pose (velocities, biases) is left aside.
+    Numbers after the pose (velocities, biases) are ignored.
 
     Raises
     ------

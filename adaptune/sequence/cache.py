@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,6 +19,7 @@ from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 import numpy as np
+import platformdirs
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
@@ -47,13 +47,7 @@ def folder() -> Path:
     """Where decoded sequences are kept: ``$ADAPTUNE_CACHE``, or in the user's cache folder."""
     if given := os.environ.get("ADAPTUNE_CACHE"):
         return Path(given).expanduser()
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "adaptune"
+    return platformdirs.user_cache_path("adaptune", appauthor=False)
 
 
 def cap() -> int:
@@ -201,9 +195,9 @@ class Writer:
         root = folder()
         root.mkdir(parents=True, exist_ok=True)
         _sweep(root)
-        self._beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
+        self._temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
         self._arrays = {
-            name: _Growing(self._beside / f"{name}.npy", np.dtype(kind), shape)
+            name: _Growing(self._temporary / f"{name}.npy", np.dtype(kind), shape)
             for name, (kind, shape) in _ARRAYS.items()
         }
         self._index: list[tuple[int | bool, ...]] = []
@@ -240,17 +234,17 @@ class Writer:
             for array in self._arrays.values():
                 array.close()
             if self._done and error is None:
-                np.save(self._beside / "index.npy", np.array(self._index, _INDEX))
+                np.save(self._temporary / "index.npy", np.array(self._index, _INDEX))
                 about = json.dumps(self._about, indent=1)
-                (self._beside / "about.json").write_text(about, "utf-8")
-                _make_room(_size(self._beside))
+                (self._temporary / "about.json").write_text(about, "utf-8")
+                _make_room(_size(self._temporary))
                 # Another process may have been first; its arrays are the same.
                 if not (folder() / self._key).exists():
-                    self._beside.rename(folder() / self._key)
+                    self._temporary.rename(folder() / self._key)
         except OSError as problem:
             _log.warning("%s: not kept in the cache (%s)", self._about.get("name"), problem)
         finally:
-            shutil.rmtree(self._beside, ignore_errors=True)
+            shutil.rmtree(self._temporary, ignore_errors=True)
 
 
 def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan]:

@@ -53,7 +53,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("stamps", "poses", "told"),
+    ("stamps", "poses", "expected"),
     [
         ([0, 0.1, 0.1, 0.3], [], "/points: 1 stamps repeat the one before"),
         ([0, 0.2, 0.1, 0.3], [], "/points: 1 stamps go back in time"),
@@ -67,15 +67,15 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path: Path) ->
         ([0, 0.1], [(50, 0), (60, 0)], "set `clock_offset`"),
     ],
 )
-def test_oddities_are_told(
-    tmp_path: Path, stamps: list[float], poses: list[tuple[float, float]], told: str
+def test_oddities_are_reported(
+    tmp_path: Path, stamps: list[float], poses: list[tuple[float, float]], expected: str
 ) -> None:
     inspection = inspect(drive(tmp_path / "a.bag", stamps, poses))
-    assert any(told in problem for problem in inspection.problems), inspection.problems
-    assert told[:20] in inspection_text(inspection, width=1000)
+    assert any(expected in problem for problem in inspection.problems), inspection.problems
+    assert expected[:20] in inspection_text(inspection, width=1000)
 
 
-def test_what_is_missing_is_told(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     inspection = inspect(write(tmp_path / "a.bag", [("/poses", START, pose(START, 0))]))
     assert inspection.missing["online"] == ("point clouds that can be read",)
     assert inspection.scan is None
