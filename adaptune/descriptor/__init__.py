@@ -1,4 +1,4 @@
-"""What a scan's surroundings look like, in numbers."""
+"""Environment descriptors of scans."""
 
 from adaptune.descriptor.base import (
     DESCRIPTORS,

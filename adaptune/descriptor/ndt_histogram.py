@@ -25,7 +25,7 @@ N_FEATURES = N_DISTANCES * N_CLASSES
 SPAN = 128
 """Cells across, more than there can be within the last bin."""
 Z_LIMIT = 1_000_000
-"""Metres and cells; beyond, the number of a cell would lose its meaning."""
+"""Metres and cells; beyond it the number of a cell would overflow."""
 
 
 @numba.njit(cache=True)
@@ -174,14 +174,14 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """Count the NDT cells of a scan by distance and shape.
 
     Cells are linear (l2/l1 < 0.1), planar (l3/l2 < 0.1) or spherical, where l1 >= l2 >= l3 are the
-    eigenvalues of the points' covariance. Linear ones are told apart by thirds of abs(z) of their
-    direction, planar ones by thirds of abs(z) of their normal, spherical ones by l2/l1. Turning
-    the sensor about z does not change any of this.
+    eigenvalues of the points' covariance. Linear cells are classified by thirds of abs(z) of their
+    direction, planar cells by thirds of abs(z) of their normal, spherical cells by l2/l1. A turn
+    of the sensor about z changes nothing.
 
     Parameters
     ----------
     points
-        Metres in the sensor's frame, of shape (n, 3). Those that are not finite do not count.
+        Metres in the sensor's frame, of shape (n, 3). Points that are not finite do not count.
 
     Returns
     -------

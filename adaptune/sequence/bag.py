@@ -32,7 +32,7 @@ IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
 @cache
 def _typestore() -> Any:
-    """What messages of ROS 2 bags are when the bags themselves do not tell."""
+    """Message definitions for ROS 2 bags that contain none."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     types: Any = {}
     for name, text in livox.DEFINITIONS.items():
@@ -51,9 +51,9 @@ class BagSource:
     points
         Topic of the point clouds; may be left out where there is only one.
     timing
-        What the stamps mean.
+        Meaning of the stamps.
     about
-        What `about` told when they were opened before; the bags are then not opened now.
+        Result of `about` when they were opened before; the bags are then not opened now.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class BagSource:
         self._ready = reader
 
     def about(self) -> dict[str, Any]:
-        """What opening the bags has told, as plain data."""
+        """Everything that opening the bags has shown, as plain data."""
         return {
             "name": self.name,
             "topics": self.topics,
@@ -132,7 +132,7 @@ class BagSource:
                 yield Frame(stamp, recorded, partial(self._load, decode, data, number))
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
-        """Stamp of the first message, none where it tells none; reading it on tells why."""
+        """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
         try:
             connection, _, data = next(self.read(reader, topic))
             if topic == self.points:
@@ -214,12 +214,12 @@ class BagSource:
         Raises
         ------
         SequenceError
-            Naming what there is.
+            Naming the topics in the bags.
         """
         types = tuple(types)
         fitting = sorted(t for t, kind in self.topics.items() if kind in types)
         if name is None:
-            # Packets are often recorded beside the points that were made of them.
+            # Packets are often recorded together with the points that were made of them.
             fitting = [t for t in fitting if self.topics[t] not in velodyne.TYPES] or fitting
             if len(fitting) != 1:
                 raise SequenceError(
@@ -241,7 +241,7 @@ class BagSource:
         Raises
         ------
         SequenceError
-            Naming what there is, or what to install.
+            Naming the topics in the bags, or the package to install.
         """
         if self.topics[self.points] in velodyne.TYPES and find_spec("velodyne_decoder") is None:
             raise SequenceError(

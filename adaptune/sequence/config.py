@@ -1,4 +1,4 @@
-"""How a study describes a sequence."""
+"""Configuration of a sequence in a study."""
 
 import os
 import re
@@ -27,7 +27,7 @@ _SOURCES = ("bag", "kitti", "folder", "evalio")
 
 
 def expand(text: str) -> str:
-    """Replace ``${VARIABLE}`` by what the environment says.
+    """Replace ``${VARIABLE}`` by the value of the environment variable.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class _Part(_Section):
 
 
 class DropConfig(_Part):
-    """Which share of the scans from `start` to `stop` is lost."""
+    """The share of the scans from `start` to `stop` that is lost."""
 
     share: float = Field(gt=0, lt=1)
     seed: int = Field(0, ge=0)
@@ -153,7 +153,7 @@ class ViewConfig(_Section):
     speed : SpeedConfig
     reverse : true
     rings : int
-        Every how many rings one is kept.
+        Keep one ring in so many.
     noise : NoiseConfig
     transform : Transform
         Pose of the LiDAR in the frame from which to see it.
@@ -237,15 +237,15 @@ class SequenceConfig(_Part):
     points : str, optional
         Topic of the point clouds.
     stamp : {"auto", "start", "end"}
-        What of a scan its stamp marks.
+        Whether a stamp marks the start or the end of its scan.
     time_unit : {"s", "ms", "us", "ns"}, optional
         Unit of the points' times.
     period : float
-        Seconds a scan takes, where neither points nor files tell.
+        Seconds a scan takes; used if neither points nor files have times.
     start, stop : float
         Seconds since the first scan.
     stride : int
-        Every how many scans to use.
+        Use every stride-th scan.
     reference : str, optional
         Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
     child_frame : str, optional
@@ -255,17 +255,17 @@ class SequenceConfig(_Part):
     clock_offset : float
         Seconds to add to the reference's stamps.
     max_gap : float
-        Seconds; nothing is known between reference poses further apart.
+        Seconds. The reference is unknown between poses further apart.
     imu : ImuConfig, optional
     elevation : float, optional
         Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
         benchmark and the raw drives when left out.
     compensate : {"constant_velocity", "gyro"}, optional
-        Take out of every scan the motion since the scan before, or the rotation that the IMU
-        measured.
+        Compensate every scan for the motion since the scan before, or for the rotation that the
+        IMU measured.
     views : list of ViewConfig
     cache : bool
-        Whether to keep decoded bags on disk.
+        Whether to keep decoded bags in the cache.
     """
 
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None

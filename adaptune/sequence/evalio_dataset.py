@@ -23,8 +23,8 @@ from adaptune.trajectory import Trajectory
 def evalio_source(name: str) -> Source:
     """Scans, poses and IMU of a sequence such as ``newer_college_2020/short_experiment``.
 
-    evalio tells where the files are (in its data folder, ``$EVALIO_DATA``), what their stamps mean
-    and which frames the poses are of. Bags are read here; evalio converts all other files.
+    evalio knows where the files are (in its data folder, ``$EVALIO_DATA``), what their stamps mean
+    and the frames of the poses. adaptune reads bags itself; evalio converts all other files.
 
     Raises
     ------
@@ -70,12 +70,12 @@ def _poses(dataset: Any) -> Trajectory | None:
 
 
 def _place_of_imu(dataset: Any) -> Poses:
-    """Tell the IMU's pose in the LiDAR's frame."""
+    """The IMU's pose in the LiDAR's frame."""
     return geometry.invert(np.asarray(dataset.imu_T_lidar().to_mat(), np.float64))
 
 
 class EvalioBag(BagSource):
-    """A data set kept in bags: evalio tells the topics, the stamps and the poses."""
+    """A data set in bags. evalio knows the topics, the meaning of the stamps and the poses."""
 
     def __init__(self, dataset: Any, recording: Any):
         at_end = str(recording.lidar_format.stamp) == "end"
@@ -102,7 +102,7 @@ class EvalioBag(BagSource):
 
 
 class EvalioFiles:
-    """A data set kept in files of its own, which evalio converts point by point."""
+    """A data set in its own format, which evalio converts point by point."""
 
     random_access: ClassVar[bool] = False
 
@@ -116,7 +116,7 @@ class EvalioFiles:
         return str(self._dataset.full_name)
 
     def about(self) -> dict[str, Any]:
-        """Its name is all there is to note."""
+        """Its name."""
         return {"name": self.name}
 
     def frames(self) -> Iterator[Frame]:

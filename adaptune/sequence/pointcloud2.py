@@ -29,7 +29,7 @@ Field = tuple[str, int, int, int]
 
 
 class PointCloud2(NamedTuple):
-    """What a message tells of its points, and their bytes."""
+    """Layout of the points of a message, and their bytes."""
 
     stamp: int
     height: int
@@ -148,7 +148,7 @@ def decode(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
     cdr
         Whether it is serialised as in ROS 2.
     timing
-        What its stamps mean.
+        Meaning of its stamps.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     stamp
         The header's, in nanoseconds.
     timing
-        What the stamps mean.
+        Meaning of the stamps.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
     time = next((name for name in TIME_FIELDS if name in names), None)
     ring = next((name for name in RING_FIELDS if name in names), None)
-    # What nothing needs is no reason to refuse a cloud.
+    # An odd intensity field is ignored: nothing needs it.
     numbers = (n for n in INTENSITY_FIELDS if n in names and raw[n].ndim == 1)
     intensity = next((name for name in numbers if raw[name].dtype.kind in "iuf"), None)
     columns = {name: raw[name] for name in (*"xyz", time, ring, intensity) if name}
@@ -299,10 +299,10 @@ def _compact(
 @cache
 def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Gather and compact clouds whose times are of this type."""
-    # Importing numba takes a while, and a bag may never be read.
+    # Importing numba takes time, and a bag may never be read.
     import numba
 
-    # Fields lie at any offset; what is aligned may be taken for what is not.
+    # Fields lie at any offset. Unaligned types accept aligned arrays, too.
     def column(scalar: Any) -> Any:
         return types.Array(scalar, 1, "A", readonly=True, aligned=False)
 

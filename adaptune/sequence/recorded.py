@@ -36,7 +36,7 @@ class ReferenceSettings:
     Attributes
     ----------
     source : str or Path, optional
-        A topic or a file; what the recording brings along when left out.
+        A topic or a file; the recording's own poses if left out.
     child_frame : str, optional
         On a topic of transforms, the frame whose poses to take.
     T_reference_sensor : ndarray of shape (4, 4), optional
@@ -44,7 +44,7 @@ class ReferenceSettings:
     clock_offset : float
         Seconds to add to the poses' stamps.
     max_gap : float
-        Seconds; between poses further apart nothing is known.
+        Seconds. Between poses further apart the reference is unknown.
     """
 
     source: str | Path | None = None
@@ -87,11 +87,11 @@ class RecordedSequence:
     source
         The recording.
     section
-        Which part of it.
+        The part to read.
     reference, imu
-        Where its motion is told; no IMU when left out.
+        Where its motion comes from; no IMU if left out.
     key
-        Under which the decoded scans are kept on disk; not at all when left out.
+        Key of the decoded scans in the cache; not cached if left out.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class RecordedSequence:
             raise SequenceError(f"{self.name}: no scan {self.section}")
 
     def backward(self) -> Iterator[Scan]:
-        """Read the scans, the last one first; a bag is decoded to the cache before.
+        """Read the scans, the last one first. A bag is decoded to the cache before.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class RecordedSequence:
         Raises
         ------
         SequenceError
-            If they cannot be read, or say nothing about the time of the scans.
+            If they cannot be read, or do not cover the time of the scans.
         """
         settings = self._reference
         if isinstance(settings.source, Path):
@@ -221,13 +221,13 @@ class RecordedSequence:
         return trajectory
 
     def check(self) -> None:
-        """Find early what would fail while the scans are read, without reading them.
+        """Find early what would fail while reading the scans, without reading them.
 
         Raises
         ------
         SequenceError
             If the section begins after the end, or the reference cannot be read or is of another
-            time. Whether poses on a topic are of another time is told by the first of them.
+            time. For poses on a topic, only the first one is checked.
         """
         span = self.source.span()
         if span is None:
@@ -277,13 +277,13 @@ class RecordedSequence:
             _warn_of_jumps(self.name, trajectory)
             return
         raise SequenceError(
-            f"{self.name}: the reference tells of {_seconds(begin, end)}, the scans are of "
+            f"{self.name}: the reference covers {_seconds(begin, end)}, the scans cover "
             f"{_seconds(*span)}: set `clock_offset` to the seconds to add to the reference's "
             f"stamps{self._proposal(trajectory)}"
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:
-        """What the gyroscope says of the offset, or the scans themselves where there is none."""
+        """The offset found from the gyroscope, or from the scans if there is none."""
         try:
             imu = self.source.imu(None if self._imu is None else self._imu.topic)
         except AdaptuneError:
@@ -291,19 +291,19 @@ class RecordedSequence:
         if imu is not None:
             turning = np.linalg.norm(imu.angular_velocity, axis=1)
             found = clock_offset(trajectory, imu.stamps, turning)
-            return self._offset("gyroscope tells", found)
+            return self._offset("gyroscope measured", found)
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
             stamps, turning = turning_of(islice(self._decode(Repairs()), _MOST_SCANS))
         except AdaptuneError:
             return ""
         found = clock_offset(trajectory, stamps, turning)
-        return self._offset("scans tell", found)
+        return self._offset("scans show", found)
 
     def _offset(self, what: str, found: float | None) -> str:
         if found is None:
             return ""
-        # It was found for stamps to which the offset that is set was added before.
+        # The stamps already include the offset that is set.
         offset = self._reference.clock_offset + found
         return f" (the {what} the same motion with clock_offset: {offset:.3f})"
 

@@ -13,15 +13,15 @@ from adaptune.trajectory import Trajectory
 
 
 class SequenceError(AdaptuneError):
-    """A recording that cannot be read as asked."""
+    """A recording that cannot be read as described."""
 
 
 class Sequence(Protocol):
-    """Scans of a LiDAR in the order of their stamps, and what is known of its motion."""
+    """Scans of a LiDAR in the order of their stamps, with its reference and its IMU."""
 
     @property
     def name(self) -> str:
-        """What messages call it: its file."""
+        """Its file, for messages."""
         ...
 
     @property
@@ -42,5 +42,5 @@ class Sequence(Protocol):
         ...
 
     def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Nanoseconds at which what was measured at `stamps` arrives when played in real time."""
+        """Nanoseconds at which measurements of `stamps` arrive when played in real time."""
         ...

@@ -43,7 +43,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call it: its file."""
+        """Its file, for messages."""
         ...
 
     @property
@@ -56,7 +56,7 @@ class Source(Protocol):
         ...
 
     def about(self) -> dict[str, Any]:
-        """What to note of it beside its decoded scans, as plain data."""
+        """Plain data to store with its decoded scans."""
         ...
 
     def span(self) -> tuple[int, int] | None:
@@ -64,7 +64,7 @@ class Source(Protocol):
         ...
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Reference poses that the recording brings along, or those of one topic."""
+        """Reference poses of the recording itself, or those of one topic."""
         ...
 
     def first_pose(self, name: str) -> int | None:
@@ -78,7 +78,7 @@ class Source(Protocol):
 
 @dataclass
 class Repairs:
-    """What was left out of a recording, by reason."""
+    """Counts of what was left out of a recording, by reason."""
 
     counts: dict[str, int] = field(default_factory=dict)
 
@@ -88,7 +88,7 @@ class Repairs:
             self.counts[reason] = self.counts.get(reason, 0) + n
 
     def report(self, name: str) -> None:
-        """Log what was counted, if anything."""
+        """Log the counts, if there are any."""
         if self.counts:
             what = ", ".join(f"{n} {reason}" for reason, n in self.counts.items())
             _log.warning("%s: left out %s", name, what)
@@ -101,7 +101,7 @@ LEAP = "scans whose stamps leap ahead of the recording"
 def in_order(frames: Iterable[Frame], repairs: Repairs) -> Iterator[Frame]:
     """Leave out the fewest frames so that stamps strictly increase.
 
-    Where a stamp does not come after the one before it, one of the two is wrong: the one that
+    If a stamp does not come after the one before it, one of the two is wrong. The one that
     disagrees more with the recorder's clock is left out. A single stamp in the future thus costs
     one scan, not all that follow.
     """
@@ -121,8 +121,8 @@ def in_order(frames: Iterable[Frame], repairs: Repairs) -> Iterator[Frame]:
         if last is not None and frame.stamp <= last.stamp:
             repairs.add(BACKWARD)
         elif last is None or _leap(last, frame) > _DOUBT:
-            # The next one will tell. Others are not held back, so that they are decoded while
-            # their bytes are still in the processor's cache.
+            # The next frame decides. Other frames pass at once: they are decoded while their bytes
+            # are still in the processor's cache.
             doubtful = frame
         else:
             yield frame
@@ -150,7 +150,7 @@ class Section:
     start, stop : float
         Seconds since the first scan; those in [start, stop) belong to it.
     stride : int
-        Every how many of them.
+        Use every stride-th scan.
     """
 
     start: float = 0.0

@@ -21,22 +21,21 @@ _SAME_CLOCK = 10.0
 
 
 class TimingError(AdaptuneError):
-    """Times of points that cannot be what they are taken for."""
+    """Times of points that are not plausible."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What the time stamps of a recording mean.
+    """Meaning of the time stamps of a recording.
 
     Attributes
     ----------
     stamp : {"auto", "start", "end"}
-        What of a scan its header's stamp marks. `auto` believes the points: they come before the
-        stamp, or they come after it. Scans whose points have no time are taken as stamped at
-        their start.
+        Moment of the scan that the header's stamp marks. `auto` follows the points: they come
+        before the stamp or after it. Scans whose points have no time are stamped at their start.
     unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the points' times. Where it is left out, floating-point numbers are seconds and
-        whole ones nanoseconds; absolute times tell their unit by their size.
+        Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
+        nanoseconds; the size of absolute times reveals their unit.
     period : float
         Seconds a scan takes; only for scans stamped at their end whose points have no time.
     """
@@ -132,4 +131,4 @@ class Timing:
 
 
 AUTO = Timing()
-"""Believe the points."""
+"""Follow the points."""
