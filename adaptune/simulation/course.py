@@ -1,4 +1,4 @@
-"""What a simulated recording shall be."""
+"""Configuration of a simulated recording."""
 
 from typing import Annotated, Literal, Self
 
@@ -11,7 +11,7 @@ from adaptune.simulation.sensors import SENSORS
 from adaptune.simulation.weather import WEATHERS
 
 LONGEST = 20_000.0
-"""Metres; a longer course is a mistake more often than a wish."""
+"""Metres; a longer course is most likely a mistake."""
 
 
 class SimulationError(AdaptuneError):
@@ -33,7 +33,7 @@ class SceneLeg(BaseModel):
     scene
         A name from `SCENES`.
     length
-        Metres driven in it; the course's own `length` when not given.
+        Metres driven in it; the course's `length` if not given.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -48,7 +48,7 @@ class SceneLeg(BaseModel):
 
 
 class Course(BaseModel):
-    """A simulated recording: where it leads, what is carried and how.
+    """A simulated recording: its scenes, its sensor and its motion.
 
     Attributes
     ----------
@@ -63,11 +63,11 @@ class Course(BaseModel):
     seed
         Another seed is another world, another drive and other noise.
     rate
-        Turns of the sensor in a second; the sensor's own when not given.
+        Turns of the sensor in a second; the sensor's own if not given.
     columns
-        Firings in a turn; the sensor's own when not given.
+        Firings in a turn; the sensor's own if not given.
     imu
-        Hz of the inertial measurements; none are made when not given.
+        Hz of the inertial measurements; none are made if not given.
     moving_objects
         Whether cars and walkers move about.
     weather

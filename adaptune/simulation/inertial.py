@@ -1,4 +1,4 @@
-"""An inertial measurement unit beside the LiDAR."""
+"""Simulated measurements of an inertial measurement unit."""
 
 from dataclasses import dataclass
 
@@ -47,7 +47,7 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
     R_world_lidar = ride.poses(times)[:, :3, :3]
     _, turn = ride.velocities(times)
     acceleration, turn_rate = ride.accelerations(times)
-    # The IMU goes round the LiDAR as both turn.
+    # Rotation accelerates the IMU, which is not at the LiDAR's origin.
     round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
     force = acceleration + np.array([0.0, 0.0, GRAVITY])
     force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_

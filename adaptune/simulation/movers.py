@@ -26,7 +26,7 @@ def model(kind: str) -> Mesh:
 
 @dataclass(frozen=True)
 class Mover:
-    """Something that goes to and fro along the road, slowing down where it turns back.
+    """A car or walker that goes to and fro along the road and slows down to turn back.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Mover:
 
 
 def populate(road: Road) -> list[Mover]:
-    """Let movers loose on every leg that has some."""
+    """Place the movers of every leg."""
     rng = np.random.default_rng([road.seed, 4])
     movers = []
     for leg in road.legs:

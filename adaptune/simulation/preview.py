@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from adaptune.simulation.simulate import Drive, SimulatedScan
 
 _MAP_SCANS, _MAP_POINTS = 150, 4000
-"""Scans in the map and points of each, whatever the recording's length."""
+"""Number of scans in the map, and points of each."""
 
 
 class Preview:
-    """Gathers what a picture shows while the scans go by.
+    """Collects the content of the picture scan by scan.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Preview:
         self._scan: SimulatedScan | None = None
 
     def add(self, scan: SimulatedScan) -> None:
-        """Take note of the next scan."""
+        """Add the next scan."""
         if self._count % self._every == 0 and len(scan):
             T = scan.T_world_sensor
             points = scan.points[:: max(len(scan) // _MAP_POINTS, 1)]

@@ -49,8 +49,7 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
     T_world_sensor
         Pose at each column, of shape (n_columns, 4, 4).
     origin
-        What to take as the world's origin, of shape (3,): single precision is a tenth of a
-        millimetre a kilometre away.
+        Origin of the rays' coordinates, of shape (3,). Near it, single precision is exact enough.
 
     Returns
     -------
@@ -76,7 +75,7 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
 def towards(
     rays: F32, rings: int, centres: F64, yaw: F64, radius: float
 ) -> tuple[NDArray[np.int64], F32]:
-    """Pick the rays that pass a moving thing, seen from that thing.
+    """Pick the rays that pass a moving object, in the frame of the object.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ def towards(
     rings
         Rays in a column.
     centres
-        The thing's origin at each column, of shape (n_columns, 3).
+        The object's origin at each column, of shape (n_columns, 3).
     yaw
         Its heading at each column in radians, of shape (n_columns,).
     radius
@@ -96,7 +95,7 @@ def towards(
     picked : ndarray of shape (m,)
         Indices of the rays.
     local : ndarray of shape (m, 6)
-        The rays in the thing's frame.
+        The rays in the object's frame.
     """
     picked = np.empty(len(rays), np.int64)
     local = np.empty((len(rays), 6), np.float32)
@@ -133,7 +132,7 @@ def receive(
     directions
         Unit vectors in the sensor's frame, of shape (n, 3).
     cast, sensor
-        The rays with what they hit, and what the sensor makes of the echoes.
+        The rays with their hits, and the receiver.
     air
         Extinction, backscatter and its reach: see `adaptune.simulation.weather.Weather`.
     chance, normal

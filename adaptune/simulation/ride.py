@@ -20,9 +20,8 @@ _STEP = 0.25
 class Ride:
     """The sensor's trajectory in continuous time, with its derivatives.
 
-    One spline of fifth order through positions and roll, pitch and yaw: what the world's shape,
-    the vehicle and its shake contribute is all in it, so that poses, velocities and accelerations
-    belong together exactly.
+    One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
+    vehicle and its shake. Poses, velocities and accelerations thus match exactly.
 
     Parameters
     ----------

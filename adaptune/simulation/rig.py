@@ -1,4 +1,4 @@
-"""The sensors of a simulated recording: their topics, and how the IMU is mounted."""
+"""The sensors of a simulated recording: their topics, and the mounting of the IMU."""
 
 from pathlib import Path
 from typing import Any
@@ -25,16 +25,16 @@ T_IMU_LIDAR: Poses = np.array(
 """Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
 
 NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
-"""Of an Xsens MTi-680G."""
+"""Noise of an Xsens MTi-680G."""
 
 
 def as_sequence(course: Course, path: Path) -> SequenceConfig:
-    """How a study names what was recorded of a course.
+    """Configuration of the sequence that was recorded of a course.
 
     Parameters
     ----------
     course
-        What was simulated.
+        The simulated course.
     path
         The bag.
     """

@@ -27,12 +27,12 @@ EPOCH = 1_600_000_000_000_000_000
 """Nanoseconds at which every recording starts."""
 
 _DETOUR = 1.2
-"""Metres of road for a metre of sight, where it winds."""
+"""Metres of road in a metre of sight, where it winds."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedScan(Scan):
-    """A scan with what else the sensor and the truth say.
+    """A scan with intensities, rings and its true pose.
 
     Attributes
     ----------
@@ -50,12 +50,12 @@ class SimulatedScan(Scan):
 
 
 class Drive:
-    """A course made ready: its road and the sensor's ride along it.
+    """A course with its road and the sensor's ride along it.
 
     Parameters
     ----------
     course
-        What to simulate.
+        The course to simulate.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Drive:
 
 
 class _Caster:
-    """Casts rays into what is near, and builds it anew every tile."""
+    """Casts rays into the world nearby, which it builds again for every tile."""
 
     def __init__(self, drive: Drive, sight: float) -> None:
         self._road, self._sight = drive.road, sight
@@ -172,7 +172,7 @@ class _Target:
         vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)
         triangles = np.ascontiguousarray(mesh.triangles, np.uint32)
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
-        # One more for the rays that hit nothing.
+        # The last one is for rays that hit nothing.
         self._reflectivity = np.append(REFLECTIVITY[mesh.materials], np.float32(0.0))
 
     def cast(
@@ -194,11 +194,11 @@ def simulate(course: Course) -> Iterator[SimulatedScan]:
     Parameters
     ----------
     course
-        What to simulate.
+        The course to simulate.
 
     Yields
     ------
     SimulatedScan
-        In order; its stamp marks its start, whatever the course wants of recordings.
+        In order; the stamp always marks the scan's start.
     """
     return Drive(course).scans()

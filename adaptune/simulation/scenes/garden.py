@@ -17,7 +17,7 @@ def _kind(index: int, seed: int) -> str:
 
 
 def _channel(spots: Spots, seed: int) -> Floats:
-    """Give the depth of the brooks under bridges, as a share."""
+    """Depth of the brooks under bridges, as a share."""
     depth = np.zeros_like(spots.s)
     index = np.floor(spots.s / TILE)
     for i in np.unique(index).astype(int).tolist():

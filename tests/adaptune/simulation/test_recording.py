@@ -167,7 +167,7 @@ def test_a_folder_of_something_else_stays(tmp_path):
     folder = tmp_path / "thesis"
     folder.mkdir()
     (folder / "chapter.tex").write_text("mine")
-    with pytest.raises(SimulationError, match="no recording of this kind: it stays"):
+    with pytest.raises(SimulationError, match="no recording of this kind: not replaced"):
         record(COURSE, folder, overwrite=True)
     for _ in range(2):
         record(COURSE, tmp_path / "run", overwrite=True)
