@@ -264,7 +264,7 @@ class Archive:
                 stamps=frames.stamps,
                 T_ref_sensor=frames.T_ref_sensor,
                 descriptors=compact(frames.descriptors),
-                blocks=np.frombuffer(json.dumps(frames.blocks).encode(), np.uint8),
+                blocks=_packed(frames.blocks),
                 elevations=frames.elevations.astype(np.float32),
             )
 
@@ -296,17 +296,17 @@ class Archive:
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
-                parameters=np.frombuffer(json.dumps(trial.parameters).encode(), np.uint8),
+                parameters=_packed(trial.parameters),
                 T_odom_sensor=trial.T_odom_sensor,
                 errors=trial.errors.astype(np.float32),
                 restarted=trial.restarted,
                 registered=trial.registered,
                 seconds=trial.seconds.astype(np.float32),
-                faults=np.frombuffer(json.dumps(trial.faults).encode(), np.uint8),
-                metrics=np.frombuffer(json.dumps(trial.metrics).encode(), np.uint8),
-                usage=np.frombuffer(json.dumps(trial.usage).encode(), np.uint8),
-                repeats=np.frombuffer(json.dumps(trial.repeats).encode(), np.uint8),
-                unhealthy=np.frombuffer(json.dumps(trial.unhealthy).encode(), np.uint8),
+                faults=_packed(trial.faults),
+                metrics=_packed(trial.metrics),
+                usage=_packed(trial.usage),
+                repeats=_packed(trial.repeats),
+                unhealthy=_packed(trial.unhealthy),
             )
         if whole:
             return
@@ -376,6 +376,11 @@ def compact(descriptors: NDArray[np.float32]) -> NDArray[Any]:
     with np.errstate(invalid="ignore"):
         counts = descriptors.astype(np.uint16)
     return counts if (counts == descriptors).all() else descriptors
+
+
+def _packed(value: Any) -> NDArray[np.uint8]:
+    """Plain data for a file, as the bytes of its JSON."""
+    return np.frombuffer(json.dumps(value).encode(), np.uint8)
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:

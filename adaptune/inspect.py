@@ -20,6 +20,9 @@ from adaptune.sequence.recorded import RecordedSequence
 from adaptune.sequence.serialized import header_stamp
 from adaptune.trajectory import Trajectory
 
+Layout = tuple[tuple[str, str, int], ...]
+"""Name, type and offset of the fields of a point."""
+
 _KITTI_FOLDERS = ("velodyne", "velodyne_points")
 
 
@@ -84,8 +87,8 @@ class Inspection:
     ----------
     path : Path
     topics : tuple of Topic
-    layout : tuple of (name, type, offset)
-        Fields of a point, in the first cloud.
+    layout : Layout
+        Of the first cloud.
     scan : ScanSummary, optional
         None where no scan could be read.
     reference : Trajectory, optional
@@ -99,7 +102,7 @@ class Inspection:
 
     path: Path
     topics: tuple[Topic, ...]
-    layout: tuple[tuple[str, str, int], ...]
+    layout: Layout
     scan: ScanSummary | None
     reference: Trajectory | None
     problems: tuple[str, ...]
@@ -124,7 +127,7 @@ def inspect(path: Path) -> Inspection:
         raise SequenceError(f"{path}: there is no such file or folder")
     given: dict[str, Any] = {}
     topics: tuple[Topic, ...] = ()
-    layout: tuple[tuple[str, str, int], ...] = ()
+    layout: Layout = ()
     problems: list[str] = []
     kind = _kind(path)
     given[kind] = str(path)
@@ -248,29 +251,20 @@ def _oddities(
         late = (np.array(recorded, np.int64) - stamps) * 1e-9
         usual = float(np.median(late))
         if abs(usual) > 5.0:
-            found.append(f"its clock is {abs(usual):.3f} s {_side(usual)} the recorder's")
+            side = "behind" if usual > 0 else "ahead of"
+            found.append(f"its clock is {abs(usual):.3f} s {side} the recorder's")
         if leaps := np.count_nonzero(np.abs(late - usual) > 5.0):
             found.append(f"{leaps} stamps leap by more than 5 s against the recorder's clock")
     return tuple(found)
 
 
-def _side(late: float) -> str:
-    return "behind" if late > 0 else "ahead of"
-
-
 def _first_scan(
     given: dict[str, Any],
-) -> tuple[
-    ScanSummary | None,
-    Trajectory | None,
-    tuple[tuple[str, str, int], ...],
-    tuple[Topic, ...],
-    list[str],
-]:
+) -> tuple[ScanSummary | None, Trajectory | None, Layout, tuple[Topic, ...], list[str]]:
     """First scan and reference, read as the stages read them."""
     problems = []
     scan, reference = None, None
-    layout: tuple[tuple[str, str, int], ...] = ()
+    layout: Layout = ()
     topics: tuple[Topic, ...] = ()
     options = {key: value for key, value in given.items() if key != "imu"}
     try:
@@ -298,7 +292,7 @@ def _first_scan(
     return scan, reference, layout, topics, problems
 
 
-def _layout(source: BagSource) -> tuple[tuple[tuple[str, str, int], ...], int]:
+def _layout(source: BagSource) -> tuple[Layout, int]:
     """Fields of a point of the first cloud, and how many points it holds."""
     message = next(source.messages(source.points), None)
     if message is None or not hasattr(message, "fields"):

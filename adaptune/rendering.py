@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -35,14 +35,6 @@ def render_inspection(inspection: Inspection) -> RenderableType:
         parts.append(Text(f"{stage}: {state}", style="red" if lacking else "green"))
     parts.append(Text("\n" + inspection.entry))
     return Group(*parts)
-
-
-def inspection_text(inspection: Inspection, width: int = 100) -> str:
-    """The inspection as plain text."""
-    console = Console(width=width, color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(render_inspection(inspection))
-    return capture.get()
 
 
 def _topic_table(inspection: Inspection) -> Table:
@@ -118,15 +110,8 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
     above, side = figure.subplots(2, 1, height_ratios=(3, 1))
     for axes, (i, j), names in ((above, (0, 1), "xy"), (side, (0, 2), "xz")):
         order = np.argsort(points[:, 2])
-        dots = axes.scatter(
-            points[order, i],
-            points[order, j],
-            c=points[order, 2],
-            s=0.4,
-            cmap="viridis",
-            vmin=low,
-            vmax=high,
-        )
+        x, y, z = points[order, i], points[order, j], points[order, 2]
+        dots = axes.scatter(x, y, c=z, s=0.4, cmap="viridis", vmin=low, vmax=high)
         axes.set_xlim(-reach, reach)
         axes.set_aspect("equal")
         axes.set_xlabel(f"{names[0]} (m)")

@@ -69,15 +69,12 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
         made.add_column(
             key, justify="right" if numbers else "left", no_wrap=key == keys[0], overflow="fold"
         )
+    grouped = bool(rows) and len({row[keys[0]] for row in rows}) < len(rows)
     for i, row in enumerate(rows):
-        if i and len(rows) > 1 and rows[i - 1][keys[0]] != row[keys[0]] and _grouped(rows, keys[0]):
+        if i and grouped and rows[i - 1][keys[0]] != row[keys[0]]:
             made.add_row()
         made.add_row(*(_cell(row[key]) for key in keys))
     return made
-
-
-def _grouped(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    return len({row[key] for row in rows}) < len(rows)
 
 
 def _cell(value: Any) -> str:
@@ -258,14 +255,9 @@ def _draw_sequences(axes: Any, found: LeftOutResults) -> None:
     at = np.arange(len(found.sequences))
     for mode, of_mode in found.ratios.items():
         if mode != "fixed":
-            axes.plot(
-                at,
-                of_mode,
-                {"oracle, sequence": "_", "oracle, period": "x"}.get(mode, "o"),
-                color=COLOURS.get(mode, "#999999"),
-                label=mode,
-                alpha=0.6 if mode == "baseline" else 1.0,
-            )
+            marker = {"oracle, sequence": "_", "oracle, period": "x"}.get(mode, "o")
+            colour, alpha = COLOURS.get(mode, "#999999"), 0.6 if mode == "baseline" else 1.0
+            axes.plot(at, of_mode, marker, color=colour, label=mode, alpha=alpha)
     axes.set_xticks(at, found.sequences, rotation=60, ha="right")
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -3,7 +3,7 @@
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ class _Parameter(BaseModel):
 class _Range(_Parameter):
     """Bounds and scale of a real or whole number."""
 
+    _types: ClassVar[tuple[type, ...]] = (int,)
+
     low: float
     high: float
     baseline: float
@@ -54,6 +56,12 @@ class _Range(_Parameter):
             raise ValueError(f"a log scale needs low ({self.low:g}) above 0")
         return self
 
+    def contains(self, value: object) -> bool:
+        """Whether `value` is a number of the type and in the range."""
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            return False
+        return isinstance(value, self._types) and self.low <= value <= self.high
+
     def to_unit(self, value: Any) -> float:
         """Map a value to [0, 1], a whole number to the middle of its share."""
         low, high = self._bounds()
@@ -70,19 +78,13 @@ class _Range(_Parameter):
 class Float(_Range):
     """A real number from `low` to `high`, both included; `log` spaces it evenly in ratio."""
 
+    _types: ClassVar[tuple[type, ...]] = (int, float)
+
     type: Literal["float"] = "float"
     low: float = Field(allow_inf_nan=False)
     high: float = Field(allow_inf_nan=False)
     baseline: float
     log: bool = False
-
-    def contains(self, value: object) -> bool:
-        """Whether `value` is a number in the range."""
-        return (
-            isinstance(value, int | float)
-            and not isinstance(value, bool)
-            and self.low <= value <= self.high
-        )
 
     def from_unit(self, unit: float) -> float:
         """Map from [0, 1] to a value."""
@@ -100,14 +102,6 @@ class Integer(_Range):
     high: int
     baseline: int
     log: bool = False
-
-    def contains(self, value: object) -> bool:
-        """Whether `value` is a whole number in the range."""
-        return (
-            isinstance(value, int)
-            and not isinstance(value, bool)
-            and self.low <= value <= self.high
-        )
 
     def from_unit(self, unit: float) -> int:
         """Map from [0, 1] to the value whose share it falls in."""

@@ -22,25 +22,19 @@ class Sequence(Protocol):
     @property
     def name(self) -> str:
         """Its file, for messages."""
-        ...
 
     @property
     def n_messages(self) -> int:
         """At least as many as there are scans."""
-        ...
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans; their stamps strictly increase."""
-        ...
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR, if they are known."""
-        ...
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU, if there is one."""
-        ...
 
     def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
         """Nanoseconds at which measurements of `stamps` arrive when played in real time."""
-        ...

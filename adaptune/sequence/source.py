@@ -44,36 +44,28 @@ class Source(Protocol):
     @property
     def name(self) -> str:
         """Its file, for messages."""
-        ...
 
     @property
     def n_messages(self) -> int:
         """At least as many as there are scans."""
-        ...
 
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of their recording."""
-        ...
 
     def about(self) -> dict[str, Any]:
         """Plain data to store with its decoded scans."""
-        ...
 
     def span(self) -> tuple[int, int] | None:
         """First stamp, and about the last one; none where there is no scan."""
-        ...
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """Reference poses of the recording itself, or those of one topic."""
-        ...
 
     def first_pose(self, name: str) -> int | None:
         """Stamp of the first pose on a topic."""
-        ...
 
     def imu(self, name: str | None) -> Imu | None:
         """Measurements of its IMU, in the IMU's own units."""
-        ...
 
 
 @dataclass

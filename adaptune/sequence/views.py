@@ -34,7 +34,6 @@ class Reversible(Sequence, Protocol):
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,27 +240,9 @@ def transform(sequence: Reversible, T_seen_sensor: Poses) -> View:
     )
 
 
-class Reversed:
-    """A sequence played backwards: the last scan comes first, and time still goes forward.
-
-    Parameters
-    ----------
-    inner
-        What to reverse.
-    """
-
-    def __init__(self, inner: Reversible):
-        self.inner = inner
-
-    @property
-    def name(self) -> str:
-        """The recording's file."""
-        return self.inner.name
-
-    @property
-    def n_messages(self) -> int:
-        """At least as many as there are scans."""
-        return self.inner.n_messages
+@dataclass(frozen=True, eq=False)
+class Reversed(View):
+    """A sequence played backwards: the last scan comes first, and time still goes forward."""
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans."""

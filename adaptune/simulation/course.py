@@ -1,8 +1,9 @@
 """Configuration of a simulated recording."""
 
+from collections.abc import Collection
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from adaptune.errors import AdaptuneError
 from adaptune.simulation.motions import MOTIONS
@@ -18,10 +19,9 @@ class SimulationError(AdaptuneError):
     """A recording that cannot be made."""
 
 
-def _known(kind: str, name: str, names: object) -> str:
-    known = sorted(names)  # type: ignore[call-overload]
-    if name not in known:
-        raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(known)}")
+def _known(kind: str, name: str, names: Collection[str]) -> str:
+    if name not in names:
+        raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(sorted(names))}")
     return name
 
 
@@ -98,20 +98,11 @@ class Course(BaseModel):
                 _known("scene", scene, SCENES)
         return scenes
 
-    @field_validator("sensor")
+    @field_validator("sensor", "motion", "weather")
     @classmethod
-    def _sensor(cls, name: str) -> str:
-        return _known("sensor", name, SENSORS)
-
-    @field_validator("motion")
-    @classmethod
-    def _motion(cls, name: str) -> str:
-        return _known("motion", name, MOTIONS)
-
-    @field_validator("weather")
-    @classmethod
-    def _weather(cls, name: str) -> str:
-        return _known("weather", name, WEATHERS)
+    def _names(cls, name: str, info: ValidationInfo) -> str:
+        kind = str(info.field_name)
+        return _known(kind, name, {"sensor": SENSORS, "motion": MOTIONS, "weather": WEATHERS}[kind])
 
     @model_validator(mode="after")
     def _rate_follows_motion(self) -> Self:

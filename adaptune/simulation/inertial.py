@@ -1,6 +1,6 @@
 """Simulated measurements of an inertial measurement unit."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +13,12 @@ GRAVITY = 9.80665
 """m/s^2, downwards along the world's z axis."""
 
 
-@dataclass(frozen=True, eq=False)
-class Inertial:
-    """Inertial measurements in the IMU's frame.
+class Inertial(NamedTuple):
+    """Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
 
-    Attributes
-    ----------
-    times : ndarray of shape (n,)
-        Seconds since the recording's start.
-    gyro : ndarray of shape (n, 3)
-        Angular velocities in rad/s.
-    accel : ndarray of shape (n, 3)
-        Specific forces in m/s^2: at rest they point up.
+    The specific force points up at rest.
     """
 
-    times: NDArray[np.float64]
     gyro: NDArray[np.float64]
     accel: NDArray[np.float64]
 
@@ -51,7 +42,7 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
     round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
     force = acceleration + np.array([0.0, 0.0, GRAVITY])
     force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_
-    return Inertial(times, turn @ R_lidar_imu, force @ R_lidar_imu)
+    return Inertial(turn @ R_lidar_imu, force @ R_lidar_imu)
 
 
 def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
@@ -79,4 +70,4 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
             rng.normal(0.0, walk / np.sqrt(rate), (len(times), 3)), axis=0
         )
         errors.append(bias + rng.normal(0.0, noise * np.sqrt(rate), (len(times), 3)))
-    return Inertial(times, truth.gyro + errors[0], truth.accel + errors[1])
+    return Inertial(truth.gyro + errors[0], truth.accel + errors[1])

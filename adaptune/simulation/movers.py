@@ -68,14 +68,6 @@ def populate(road: Road) -> list[Mover]:
                 swing = min(rng.uniform(15.0, 40.0), (leg.stop - leg.start) / 3.0)
                 middle = rng.uniform(leg.start + swing + 3.0, leg.stop - swing - 3.0)
                 speed = _SPEED[kind] * rng.uniform(0.7, 1.3)
-                movers.append(
-                    Mover(
-                        kind,
-                        float(middle),
-                        swing,
-                        offset + rng.uniform(-0.3, 0.3),
-                        speed / swing,
-                        rng.uniform(0.0, 2.0 * np.pi),
-                    )
-                )
+                aside, phase = offset + rng.uniform(-0.3, 0.3), rng.uniform(0.0, 2.0 * np.pi)
+                movers.append(Mover(kind, float(middle), swing, aside, speed / swing, phase))
     return movers

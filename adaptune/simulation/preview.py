@@ -80,16 +80,8 @@ class Preview:
     def _draw_map(self, axes: Any) -> None:
         points = np.concatenate(self._map) if self._map else np.empty((0, 3))
         points = points[np.argsort(points[:, 2], kind="stable")]
-        axes.scatter(
-            points[:, 0],
-            points[:, 1],
-            c=points[:, 2],
-            s=0.5,
-            linewidths=0,
-            cmap="viridis",
-            vmin=-1.5,
-            vmax=4.0,
-        )
+        x, y, z = points.T
+        axes.scatter(x, y, c=z, s=0.5, linewidths=0, cmap="viridis", vmin=-1.5, vmax=4.0)
         T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
         axes.plot(T[:, 0, 3], T[:, 1, 3], color="red", linewidth=1.2)
         axes.set(aspect="equal", facecolor="black", xlabel="x (m)", ylabel="y (m)")

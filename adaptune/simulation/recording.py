@@ -113,9 +113,7 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
     if not overwrite:
         raise SimulationError(f"{path} exists already; give --overwrite to replace it")
     if path.is_dir() and (mark is None or not (path / mark).exists()):
-        raise SimulationError(
-            f"{path} is a folder, but no recording of this kind: it is not replaced"
-        )
+        raise SimulationError(f"{path} is a folder, but no recording of this kind: not replaced")
     if mark is not None and not path.is_dir():
         raise SimulationError(
             f"{path} is a file, the recording would be a folder: it is not replaced"
@@ -169,8 +167,7 @@ class _Composer(Messages):
     def _inertial(self, end: int) -> tuple[Inertial, NDArray[np.int64]]:
         drive, rate = self._drive, self._drive.course.imu
         if rate is None:
-            empty = np.empty((0, 3))
-            return Inertial(np.empty(0), empty, empty), np.empty(0, np.int64)
+            return Inertial(np.empty((0, 3)), np.empty((0, 3))), np.empty(0, np.int64)
         start = int(drive.stamps()[0])
         stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
         return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps

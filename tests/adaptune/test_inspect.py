@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
+from rich.console import Console
 from small_bag import START, cloud, drive, pose, write
 
 from adaptune import yaml
 from adaptune.inspect import inspect
-from adaptune.rendering import inspection_text, write_inspection_png
+from adaptune.rendering import render_inspection, write_inspection_png
 from adaptune.sequence import SequenceConfig, SequenceError
 from adaptune.sequence.opening import open_sequence
 
@@ -18,6 +19,13 @@ from adaptune.sequence.opening import open_sequence
 @pytest.fixture(autouse=True)
 def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ADAPTUNE_CACHE", str(tmp_path / "cache"))
+
+
+def inspection_text(inspection: Any, width: int = 100) -> str:
+    console = Console(width=width, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(render_inspection(inspection))
+    return capture.get()
 
 
 def entry(inspection: Any) -> dict[str, SequenceConfig]:

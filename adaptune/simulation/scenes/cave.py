@@ -122,14 +122,9 @@ def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
     s, d = tile.scatter(0.12, 1.6, 3.8, margin=2.0)
     at, n = tile.at(s, d), len(s)
     radius = tile.rng.uniform(0.25, 0.6, n)
-    lower = place(cone, at, 0.0, np.column_stack([radius, radius, np.full(n, 2.6)]))
-    upper = place(
-        cone,
-        at + np.array([0.0, 0.0, 3.6]),
-        1.0,
-        np.column_stack([radius, radius, np.full(n, -2.6)]),
-    )
-    return [lower, upper]
+    size = np.column_stack([radius, radius, np.full(n, 2.6)])
+    hanging = place(cone, at + np.array([0.0, 0.0, 3.6]), 1.0, size * np.array([1.0, 1.0, -1.0]))
+    return [place(cone, at, 0.0, size), hanging]
 
 
 CAVE = Scene(
