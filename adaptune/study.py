@@ -536,6 +536,11 @@ class Study:
             "warm_up": self.warm_up._asdict(),
         }
 
+    @property
+    def model_path(self) -> Path:
+        """Where the error model is kept."""
+        return self.folder / "model.safetensors"
+
     def recording(self, course: str) -> Path:
         """Where a simulated course's bag is kept."""
         return self.folder / "recordings" / f"{course}.bag"

@@ -18,7 +18,8 @@ from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.simulation import record
 from adaptune.study import Study, load_study
-from offline.campaign import run_batches, train
+from offline.campaign import run_batches
+from offline.train import train
 from offline.objective import choose_fixed
 from offline.workers import Outcome, Result, Task
 

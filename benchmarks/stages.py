@@ -26,7 +26,7 @@ from adaptune.odometry.gicp import crop
 from adaptune.sequence import Scan, SequenceConfig, open_sequence
 from adaptune.study import Study, load_study
 from adaptune.trajectory import read_kitti
-from offline.campaign import train
+from offline.train import train
 from offline.trial import PreparedSequence, run_trials
 from online.replay import adaptive, replay
 

@@ -43,14 +43,15 @@ def write_model_file(path: Path, header: Mapping[str, Any], arrays: Arrays) -> N
     long to load, and could demand a thousand times its size in memory. Their digest guards against
     damage.
     """
-    metadata = {
-        "format": str(FORMAT),
-        "adaptune": __version__,
-        "header": json.dumps(header),
+    text = {
+        "format": FORMAT,
+        "version": __version__,
         "digest": digest(header, arrays),
+        "header": header,
     }
+    # The format keeps no order of several entries, and the same model shall have the same bytes.
     with replacing(path) as temporary:
-        save_file(dict(arrays), temporary, metadata)
+        save_file(dict(arrays), temporary, {"adaptune": json.dumps(text)})
 
 
 def read_model_file(
@@ -75,11 +76,11 @@ def read_model_file(
         If there is no such file, or it is damaged.
     """
     with path.open("rb"), safe_open(path, "np") as file:
-        metadata = file.metadata() or {}
-        _check_format(path, int(metadata["format"]), metadata["adaptune"])
-        header = json.loads(metadata["header"])
+        text = json.loads((file.metadata() or {})["adaptune"])
+        _check_format(path, int(text["format"]), str(text["version"]))
+        header = dict(text["header"])
         arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
-    if digest(header, arrays) != metadata["digest"]:
+    if digest(header, arrays) != text["digest"]:
         raise ValueError("its content is not what was written")
     for name, known in types.items():
         if arrays[name].dtype.str not in known:

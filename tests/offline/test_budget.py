@@ -6,7 +6,7 @@ import pytest
 from adaptune.errors import AdaptuneError
 from adaptune.study import OfflineConfig, load_study
 from offline.budget import Clock, max_trials, spent
-from offline.campaign import train
+from offline.train import train
 from offline.objective import Verdict
 
 

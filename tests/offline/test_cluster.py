@@ -13,7 +13,7 @@ import pytest
 
 from adaptune.study import load_study
 from offline import cluster
-from offline.campaign import train
+from offline.train import train
 from offline.cluster import Cluster, ClusterError
 
 distributed = pytest.importorskip("distributed")

@@ -15,7 +15,7 @@ from adaptune.geometry import steps
 from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.study import ConfigurationError, OfflineConfig, Study, load_study
-from offline.campaign import train
+from offline.train import train
 from offline.objective import (
     SEVERITY,
     Result,

@@ -8,7 +8,7 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.study import ConfigurationError, load_study
-from offline.campaign import train
+from offline.train import train
 
 
 @pytest.fixture

@@ -118,16 +118,16 @@ def saved(folder, **changes):
     return path
 
 
-def rewrite(path, arrays=None, metadata=None, **header):
+def rewrite(path, arrays=None, text=None, **header):
     """Change parts of a file as somebody could who knows the format."""
     with safe_open(path, "np") as file:
-        said = file.metadata() | (metadata or {})
+        said = json.loads(file.metadata()["adaptune"]) | (text or {})
         parts = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    changed = json.loads(said["header"]) | header
-    said["header"] = json.dumps(changed)
     parts |= arrays or {}
-    said["digest"] = digest(changed, parts)
-    save_file({name: np.ascontiguousarray(part) for name, part in parts.items()}, path, said)
+    said["header"] |= header
+    said["digest"] = digest(said["header"], parts)
+    parts = {name: np.ascontiguousarray(part) for name, part in parts.items()}
+    save_file(parts, path, {"adaptune": json.dumps(said)})
 
 
 def refused(path):
@@ -269,13 +269,13 @@ def test_a_pickle_is_refused(tmp_path):
 
 def test_an_older_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
-    rewrite(path, metadata={"adaptune": "0.0.1", "format": str(FORMAT - 1)})
+    rewrite(path, text={"version": "0.0.1", "format": FORMAT - 1})
     assert "older adaptune (0.0.1)" in refused(path)
 
 
 def test_a_newer_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
-    rewrite(path, metadata={"adaptune": "7.8.9", "format": str(FORMAT + 1)})
+    rewrite(path, text={"version": "7.8.9", "format": FORMAT + 1})
     message = refused(path)
     assert "7.8.9" in message
     assert "newer" in message

@@ -14,7 +14,7 @@ from needs import lacking
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study import ConfigurationError, load_study
-from offline.campaign import train
+from offline.train import train
 from offline.trial import PreparedSequence, run_trials
 from online.comparison import compare, run_replays
 
@@ -273,7 +273,7 @@ def test_the_whole_way(make):
     study = make("pretend", "offline.trials=2")
     training = train(study)
     assert training.model.space.names == ("registration.voxel", "distance")
-    assert run_replays(study, study.folder / "model.npz") == 2
+    assert run_replays(study, study.folder / "model.safetensors") == 2
     assert {row["mode"] for row in compare(study)} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")
