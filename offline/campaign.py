@@ -16,13 +16,15 @@ from adaptune.files import write_text
 from adaptune.model import ErrorModel
 from adaptune.odometry import versions
 from adaptune.space import ParameterSet
-from adaptune.study import TIMED, OfflineConfig, Study
 from offline.budget import BUDGETS, Clock
 from offline.cluster import Cluster
+from offline.config import TIMED, OfflineConfig
 from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
+from offline.offline_study import OfflineStudy
 from offline.pruning import rungs
 from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
-from offline.storage import Told, open_mirror
+from offline.storage import MirrorRow, open_mirror
+from offline.trial import TrialSettings, TrialSetup
 from offline.validation import choose_bank, labelled_sequences, tune, tune_bank
 from offline.workers import Pool, Task, Workers, run
 
@@ -54,7 +56,7 @@ class Training(NamedTuple):
 
 
 def train(
-    study: Study, progress: Progress = lambda *_: None, cluster: str | None = None
+    study: OfflineStudy, progress: Progress = lambda *_: None, cluster: str | None = None
 ) -> Training:
     """Run all trials that are not in the archive yet, and fit the model.
 
@@ -88,7 +90,13 @@ def train(
     n_workers = config.workers or available()
     where = cluster or f"{n_workers} worker{'s' if n_workers > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    with Cluster(study, cluster) if cluster else Workers(study, n_workers) as workers:
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    memory = config.memory * 1e9
+    with (
+        Cluster(setup, study.training, memory, cluster)
+        if cluster
+        else Workers(setup, n_workers, memory)
+    ) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
         whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
@@ -167,7 +175,7 @@ def _training_rows(
 
 
 def _write_pareto(
-    study: Study, verdicts: Mapping[int, Verdict], trials: Mapping[int, Mapping[str, Any]]
+    study: OfflineStudy, verdicts: Mapping[int, Verdict], trials: Mapping[int, Mapping[str, Any]]
 ) -> None:
     """The sets that none that keeps the limits is better than in every objective."""
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
@@ -181,7 +189,7 @@ def _write_pareto(
 
 
 def run_batches(
-    study: Study, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
 ) -> dict[int, Verdict]:
     """Run all trials that are not in the archive yet, and tell how each did.
 
@@ -207,17 +215,19 @@ def run_batches(
 class _Campaign:
     """Searches on their way."""
 
-    def __init__(self, study: Study, archive: Archive, workers: Pool[Any], progress: Progress):
+    def __init__(
+        self, study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
+    ):
         self._study, self._archive, self._workers = study, archive, workers
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
         of_sequences = self._finished.values()
         known = {n: trial.parameters for trials in of_sequences for n, trial in trials.items()}
-        self._mirror = open_mirror(study, known)
+        self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names
         self._unframed = [name for name in self._names if not archive.has_frames(name, described)]
-        self._stages = make_stages(study, self._finished)
+        self._stages = make_stages(self._config, study.odometry.space, self._names, self._finished)
         self._tally = _Tally(progress, self._finished, self._stages)
         # By the trials' numbers, the sequences that they are of.
         self._counted: dict[int, Sequence[str]] = {}
@@ -279,8 +289,8 @@ class _Campaign:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
 
     def _tell(self) -> None:
-        self._mirror.tell(
-            self._counted, lambda n: _told(self._config, self._verdict(n), self._finished, n)
+        self._mirror.report(
+            self._counted, lambda n: _mirrored(self._config, self._verdict(n), self._finished, n)
         )
 
 
@@ -327,8 +337,8 @@ def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) 
     return tasks
 
 
-def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> Told:
-    """What the mirror is told of a trial."""
+def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> MirrorRow:
+    """A trial as the mirror receives it."""
     trials = {name: finished[name][n] for name in verdict.sequences}
     attributes = {name: trial.mean_error for name, trial in trials.items()}
     attributes["lost"] = sum(trial.lost for trial in trials.values())
@@ -337,7 +347,7 @@ def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -
         f"{name} <= {limit.max:g}": by
         for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
     }
-    return Told(verdict.parameters, verdict.values, attributes, constraints)
+    return MirrorRow(verdict.parameters, verdict.values, attributes, constraints)
 
 
 class _Tally:
@@ -403,7 +413,7 @@ def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[tu
 
 
 def _run_whole(
-    study: Study,
+    study: OfflineStudy,
     archive: Archive,
     workers: Pool[Any],
     verdicts: Mapping[int, Verdict],
@@ -428,7 +438,7 @@ def _run_whole(
     return {name: (means[name, 0], means[name, fixed]) for name in names}
 
 
-def _tuned(study: Study, model: ErrorModel) -> ErrorModel:
+def _tuned(study: OfflineStudy, model: ErrorModel) -> ErrorModel:
     """Choose the bank, and the settings of the rule and of the bank's weights."""
     sequences, sets, everywhere = labelled_sequences(study, model)
     fixed = everywhere.index(model.fixed)
@@ -452,7 +462,9 @@ def _tuned(study: Study, model: ErrorModel) -> ErrorModel:
     )
 
 
-def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int) -> ErrorModel:
+def fit(
+    study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int
+) -> ErrorModel:
     """Make the error model of all trials that keep the limits.
 
     Sets have no errors (NaN) on the sequences that they were not run on.
@@ -485,8 +497,8 @@ def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: 
         sequence.append(np.full(labelled.sum(), s))
         errors.append(of_sequence[labelled])
     return ErrorModel(
-        odometry=study.identity,
-        space=study.space,
+        odometry=study.odometry.identity,
+        space=study.odometry.space,
         sets=[verdicts[n].parameters for n in numbers],
         fixed=numbers.index(fixed),
         length=study.config.sub_trajectory,
@@ -497,7 +509,7 @@ def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: 
         sequence=np.concatenate(sequence),
         errors=np.concatenate(errors),
         elevations=elevations,
-        provenance={"versions": versions(study.box), "trials": numbers}
+        provenance={"versions": versions(study.odometry.odometry_class), "trials": numbers}
         | study.config.offline.model_dump(
             mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
         ),

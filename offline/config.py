@@ -1,16 +1,14 @@
 """The configuration of a study with the settings of the offline stage."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_serializer, model_validator
 
 from adaptune.sequence.config import ViewConfig, expand
 from adaptune.space import ParameterSpace, nearest
-from adaptune.study import Study, StudyConfig, read_study
-from adaptune.study.config import StudySection
+from adaptune.study.config import StudyConfig, StudySection
 from adaptune.study.mistakes import Mistake, validated
 from offline.samplers.check import check_sampler
 from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError, optuna_class
@@ -101,7 +99,7 @@ class OfflineConfig(StudySection):
     """
 
     sampler: str = "tpe"
-    sampler_settings: dict[str, Any] = {}
+    sampler_settings: dict[str, Any] = Field(default_factory=dict)
     sets: Literal["shared", "own", "both"] = "shared"
     trials: int | None = Field(None, ge=1)
     hours: float | None = Field(None, gt=0, allow_inf_nan=False)
@@ -117,7 +115,7 @@ class OfflineConfig(StudySection):
     objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
         {"rte": 1.0},
     )
-    limits: dict[Metric, Limit] = {}
+    limits: dict[Metric, Limit] = Field(default_factory=dict)
     runs: Literal["restart", "whole", "episodes"] = "restart"
     repeats: int = Field(1, ge=1)
     augment: tuple[ViewConfig, ...] = ()
@@ -225,14 +223,3 @@ class OfflineStudyConfig(StudyConfig):
         offline = resolved.get("offline", {})
         kept = {key: value for key in _LASTING if (value := offline.get(key))}
         return super().lasting(resolved) | {"offline": kept}
-
-
-OfflineStudy = Study[OfflineStudyConfig]
-"""A study with the settings of the offline stage."""
-
-
-def load_study(
-    path: Path, overrides: Sequence[str] = (), folder: Path | None = None, runs: Path = Path("runs")
-) -> OfflineStudy:
-    """Read and check the whole YAML of a study, see `adaptune.study.read_study`."""
-    return read_study(path, OfflineStudyConfig, overrides, folder, runs)

@@ -9,11 +9,11 @@ the batch so far, and on nothing else.
   Jamieson and Talwalkar, AISTATS 2016): the best third of all trials that came so far.
 - ``hyperband``: the same, but batches begin with three, nine... sequences in turn (Li et al., JMLR
   2018), for studies in which a few sequences say little about the others.
-- ``wilcoxon``: one sequence after the other. A trial stops if a signed-rank test finds it worse than
-  the best trial on the same sequences (Optuna's pruner).
+- ``wilcoxon``: one sequence after the other. A trial stops if a signed-rank test finds it worse
+  than the best trial on the same sequences (Optuna's pruner).
 
-All rules stop a trial that cannot win any more. Values are never negative, so a trial whose sum over
-some sequences exceeds the best trial's sum over all sequences is worse.
+All rules stop a trial that cannot win any more. Values are never negative, so a trial whose sum
+over some sequences exceeds the best trial's sum over all sequences is worse.
 """
 
 import warnings

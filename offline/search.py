@@ -22,8 +22,8 @@ class Search:
     """One search, batch by batch.
 
     Several searches of a study number their trials in turn: all of them share trial 0, the
-    baseline, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers do
-    not depend on a budget.
+    baseline, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers
+    do not depend on a budget.
 
     Parameters
     ----------

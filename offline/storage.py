@@ -1,7 +1,7 @@
 """A study's trials in an Optuna storage, for Optuna's own tools.
 
-The storage is a mirror: the archive is the truth. Only the numbers and parameters of mirrored trials
-are ever read back.
+The storage is a mirror: the archive is the truth. Only the numbers and parameters of mirrored
+trials are ever read back.
 """
 
 import logging

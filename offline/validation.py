@@ -34,9 +34,9 @@ from adaptune.model.base import complementary, mean_errors
 from adaptune.model.fusion import PairedFusion
 from adaptune.model.paired import ERROR_FLOOR, Near
 from adaptune.sequence.views import origin, places
-from adaptune.study import Study
 from offline.fusion import Drive, drive, error_vectors, periods
 from offline.objective import weighted
+from offline.offline_study import OfflineStudy
 from offline.search import owner
 
 MIN_SEQUENCES = 6
@@ -260,7 +260,7 @@ class Validated(NamedTuple):
 
 
 def validate(
-    study: Study,
+    study: OfflineStudy,
     curve: bool = False,
     sizes: bool = False,
     progress: Callable[[str, int, int], None] = lambda *_: None,
@@ -288,7 +288,7 @@ def validate(
     """
     path = study.folder / "model.npz"
     model = ErrorModel.load(path)
-    model.check_study(study.identity, study.space, path)
+    model.check_study(study.odometry.identity, study.odometry.space, path)
     if (study.training, study.window) != (model.sequences, model.window):
         raise ModelError(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "
@@ -439,7 +439,7 @@ def bank_curve(
 
 
 def labelled_sequences(
-    study: Study, model: ErrorModel
+    study: OfflineStudy, model: ErrorModel
 ) -> tuple[list[LabelledSequence], NDArray[np.float64], list[int]]:
     """The training sequences of a model from the archive, and of which sets they tell.
 
@@ -506,7 +506,7 @@ def labelled_sequences(
     return sequences, model.space.to_unit([model.sets[i] for i in everywhere]), everywhere
 
 
-def _eligible(study: Study, model: ErrorModel, everywhere: list[int]) -> list[int]:
+def _eligible(study: OfflineStudy, model: ErrorModel, everywhere: list[int]) -> list[int]:
     """Which of the sets may be in a bank; to read the poses of thousands would take long."""
     means = mean_errors(model.errors[:, everywhere], model.sequence)
     # With a sequence left out, others than now may be among the best.

@@ -65,8 +65,9 @@ class OdometryFactory:
         given = self.space.baseline | (parameters or {})
         if issubclass(self.odometry_class, Command):
             strict = sequence in self.strict_sequences and given == self.space.baseline
-            known = self.material is not None and sequence is not None
-            material: Any = partial(self.material, sequence) if known else None  # type: ignore[arg-type]
+            material = None
+            if self.material is not None and sequence is not None:
+                material = partial(self.material, sequence)
             return Command(given, self.settings, self.limits, material, strict)
         if issubclass(self.odometry_class, Process):
             return Process(given, self.settings, self.limits)

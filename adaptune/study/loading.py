@@ -41,8 +41,9 @@ def read_study(
         It lists all mistakes, each with its line, its key and what to do.
     """
     document = _read(path)
-    overridden = [_override(document.data, text) for text in overrides]
-    config, mistakes = check(config_type, document.data, path.parent.resolve())
+    data: Any = document.data
+    overridden = [_override(data, text) for text in overrides]
+    config, mistakes = check(config_type, data, path.parent.resolve())
     if mistakes or config is None:
         mistakes.sort(key=lambda mistake: document.line(mistake.key) or 0)
         lines = [_say(mistake, path, document, overridden) for mistake in mistakes]

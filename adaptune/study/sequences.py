@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.command import Material, material
-from adaptune.sequence import Sequence, SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
-from adaptune.sequence.config import ViewConfig
+from adaptune.sequence.config import SequenceConfig, ViewConfig, open_sequence
 from adaptune.sequence.export import Layout
+from adaptune.sequence.sequence import Sequence
 from adaptune.sequence.views import OF_VIEW, WithImu, origin
-from adaptune.simulation import Course, as_sequence
+from adaptune.simulation.course import Course
 from adaptune.study.mistakes import ConfigurationError
 
 _materials: dict[tuple[str, str], Material] = {}
@@ -56,6 +56,8 @@ class StudySequences:
             return config.model_copy(update={"views": (*config.views, self.views[view])})
         if name in self.recordings:
             return self.recordings[name]
+        from adaptune.simulation import as_sequence
+
         return as_sequence(self.courses[name], self.recording(name))
 
     def open(self, name: str) -> Sequence:

@@ -48,7 +48,7 @@ class Study(Generic[C_co]):
     def sequences(self) -> StudySequences:
         """The sequences by name."""
         config, described = self.config, describe_odometry(self.config.odometry)
-        layout = odometry_settings(config.odometry).input if described.whole else "bag"
+        layout: Any = odometry_settings(config.odometry).input if described.whole else "bag"
         of_study = (config.sequences, config.courses, config.views, self.folder)
         return StudySequences(*of_study, described.needs_imu, layout)
 

@@ -22,5 +22,9 @@ def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
     from offline.samplers.asked import AskedSampler
     from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
 
-    own = {"grid": GridSampler, "random": RandomSampler, "sobol": SobolSampler}
+    own: dict[str, type[Sampler]] = {
+        "grid": GridSampler,
+        "random": RandomSampler,
+        "sobol": SobolSampler,
+    }
     return own.get(config.sampler, AskedSampler)(space, config)

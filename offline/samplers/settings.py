@@ -26,6 +26,7 @@ SINGLE = ("annealing", "cmaes")
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
 
+
 class SamplerError(AdaptuneError):
     """A sampler that cannot be used."""
 

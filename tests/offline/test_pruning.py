@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import train
+from offline.offline_study import load_study
 from offline.pruning import estimate, rungs, survivors
 from offline.validation import validate
 

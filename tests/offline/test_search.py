@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches, train
 from offline.objective import choose_fixed
+from offline.offline_study import load_study
 from offline.search import make_stages, owner
 from offline.validation import labelled_sequences, leave_one_out
 

@@ -7,9 +7,9 @@ import pytest
 from adaptune.metrics import sub_trajectory_vectors
 from adaptune.model import ErrorModel, ModelError, PairedFusion, Selection, Settings
 from adaptune.model.base import Rule
-from adaptune.study import load_study
 from offline.campaign import train
 from offline.fusion import Drive
+from offline.offline_study import load_study
 from offline.validation import (
     BANK,
     LabelledSequence,
