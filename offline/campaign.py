@@ -9,12 +9,13 @@ import numpy as np
 
 from adaptune.archive import Archive
 from adaptune.space import ParameterSet
-from adaptune.study import OfflineConfig, Study
 from offline.budget import Clock
+from offline.config import OfflineConfig
 from offline.objective import Verdict, label
+from offline.offline_study import OfflineStudy
 from offline.pruning import rungs
 from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
-from offline.storage import Told, open_mirror
+from offline.storage import MirrorRow, open_mirror
 from offline.workers import Pool, Task, run
 
 Progress = Callable[[str, int, int, str], None]
@@ -24,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 def run_batches(
-    study: Study, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
 ) -> dict[int, Verdict]:
     """Run all trials that are not in the archive yet, and judge all of them.
 
@@ -50,17 +51,19 @@ def run_batches(
 class _Campaign:
     """Searches on their way."""
 
-    def __init__(self, study: Study, archive: Archive, workers: Pool[Any], progress: Progress):
+    def __init__(
+        self, study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
+    ):
         self._study, self._archive, self._workers = study, archive, workers
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
         of_sequences = self._finished.values()
         known = {n: trial.parameters for trials in of_sequences for n, trial in trials.items()}
-        self._mirror = open_mirror(study, known)
+        self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names
         self._unframed = [name for name in self._names if not archive.has_frames(name, described)]
-        self._stages = make_stages(study, self._finished)
+        self._stages = make_stages(self._config, study.odometry.space, self._names, self._finished)
         self._tally = _Tally(progress, self._finished, self._stages)
         # By the trials' numbers, the sequences that they are of.
         self._counted: dict[int, Sequence[str]] = {}
@@ -122,8 +125,8 @@ class _Campaign:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
 
     def _tell(self) -> None:
-        self._mirror.tell(
-            self._counted, lambda n: _told(self._config, self._verdict(n), self._finished, n)
+        self._mirror.report(
+            self._counted, lambda n: _mirrored(self._config, self._verdict(n), self._finished, n)
         )
 
 
@@ -170,8 +173,8 @@ def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) 
     return tasks
 
 
-def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> Told:
-    """What the mirror is told of a trial."""
+def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> MirrorRow:
+    """A trial as the mirror receives it."""
     trials = {name: finished[name][n] for name in verdict.sequences}
     attributes = {name: trial.mean_error for name, trial in trials.items()}
     attributes["lost"] = sum(trial.lost for trial in trials.values())
@@ -180,7 +183,7 @@ def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -
         f"{name} <= {limit.max:g}": by
         for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
     }
-    return Told(verdict.parameters, verdict.values, attributes, constraints)
+    return MirrorRow(verdict.parameters, verdict.values, attributes, constraints)
 
 
 class _Tally:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adaptune.model import ErrorModel
-from adaptune.study import SwitchingConfig
+from adaptune.study.config import SwitchingConfig
 from offline.labelled import LabelledData
 from offline.tuning import choose_bank, tune, tune_bank
 

@@ -16,9 +16,10 @@ from adaptune.model.bank_weights import POOL
 from adaptune.model.base import mean_errors
 from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.views import origin, places
-from adaptune.study import Metric
 from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
+from offline.config import Metric, OfflineStudyConfig
 from offline.objective import margin, repeated, weighted
+from offline.search import owner
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,39 +188,14 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
     return first, number
 
 
-class Labelling(NamedTuple):
-    """How frames are labelled.
-
-    Attributes
-    ----------
-    length : float
-        Metres of a sub-trajectory.
-    lost_track : float
-        Metres a second.
-    period : float
-        Seconds between selections.
-    window : int
-        Number of descriptors that are averaged.
-    objective : dict
-        Weighted metrics that choose the fixed set.
-    """
-
-    length: float
-    lost_track: float
-    period: float
-    window: int
-    objective: Mapping[Metric, float]
-
-
-def read_labelled(
+def labelled_data(
     archive: Archive,
     run: Mapping[str, Sequence[int]],
     sets: ParameterSets,
-    how: Labelling,
-    owners: Mapping[int, str | None],
-    named: Collection[int] = (),
+    config: OfflineStudyConfig,
+    window: int,
 ) -> LabelledData:
-    """Read the labelled data set from an archive.
+    """Read the labelled data set of a study.
 
     Parameters
     ----------
@@ -229,13 +205,10 @@ def read_labelled(
         For each training sequence, the trials that count there.
     sets
         The sets to read about.
-    how
-        How frames are labelled.
-    owners
-        For each trial the sequence that its set was searched for on, if on one alone.
-    named
-        Sets whose error vectors are needed, besides the best ones: to read the poses of thousands
-        would take long.
+    config
+        Of the study.
+    window
+        Number of descriptors that are averaged.
 
     Raises
     ------
@@ -248,26 +221,35 @@ def read_labelled(
                 f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
                 f"fitted to; run `adaptune offline` again"
             )
-    sequences = [_labelled(archive, name, set(run[name]), sets, how) for name in run]
-    number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s, _, _ in sequences])
-    means = mean_errors(np.concatenate([s.errors for s, _, _ in sequences]), number)
-    # With a sequence left out, others than now may be among the best.
+    read = [_labelled(archive, name, set(run[name]), sets, config, window) for name in run]
+    number = np.repeat(np.arange(len(read)), [len(s.errors) for s, _, _ in read])
+    means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
+    # With a sequence left out, others than now may be among the best. To read the poses of
+    # thousands of trials would take long.
     order = np.argsort(means, kind="stable")[: 2 * POOL]
-    eligible = {*named, *(sets.trials[c] for c in order if np.isfinite(means[c]))}
+    eligible = {sets.trials[c] for c in order if np.isfinite(means[c])}
+    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
+    eligible |= {trial for trial in named if trial is not None}
+    owners = [owner(config.offline, list(run), trial) for trial in sets]
     labelled = []
-    for sequence, frames, known in sequences:
-        name, searched = sequence.name, [owners[trial] for trial in sets]
+    for sequence, frames, known in read:
         vectors = np.full((*sequence.errors.shape, 3), np.nan, np.float32)
-        for trial in eligible.intersection(run[name]):
-            of_trial = error_vectors(frames, archive.read(name, trial), how.length)
-            vectors[:, sets.column(trial)] = of_trial[known]
-        own = [one is not None and origin(one) == origin(name) for one in searched]
+        for trial in eligible.intersection(sets).intersection(run[sequence.name]):
+            of_trial = archive.read(sequence.name, trial)
+            of_frames = error_vectors(frames, of_trial, config.sub_trajectory)
+            vectors[:, sets.column(trial)] = of_frames[known]
+        own = [one is not None and origin(one) == origin(sequence.name) for one in owners]
         labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
     return LabelledData(labelled, sets)
 
 
 def _labelled(
-    archive: Archive, name: str, run: Collection[int], sets: ParameterSets, how: Labelling
+    archive: Archive,
+    name: str,
+    run: Collection[int],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+    window: int,
 ) -> tuple[LabelledSequence, Frames, NDArray[np.bool_]]:
     """A labelled sequence without error vectors, its frames, and which of them are labelled."""
     frames = archive.read_frames(name)
@@ -276,29 +258,30 @@ def _labelled(
     errors[:, [trial not in run for trial in sets]] = np.nan
     # Whether there is a sub-trajectory depends on the reference alone.
     known = np.asarray(~np.isnan(errors).all(axis=1))
-    described = averaged(frames.descriptors, frames.stamps, how.window, how.period)
-    period = ((frames.stamps - frames.stamps[0]) * 1e-9 // how.period).astype(np.int64)
+    period, objective = config.online.period, config.offline.objective[0]
+    described = averaged(frames.descriptors, frames.stamps, window, period)
+    periods_since = ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64)
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
-    values = [np.inf if s is None else weighted(how.objective, s.metrics) for s in summaries]
+    values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
     simulation = BankSimulation(
         frames.stamps,
         frames.T_ref_sensor,
         described,
-        period,
-        how.length,
-        how.lost_track,
-        motions_from_archive(archive, name, frames, how.lost_track),
+        periods_since,
+        config.sub_trajectory,
+        config.lost_track,
+        motions_from_archive(archive, name, frames, config.lost_track),
     )
     labelled = LabelledSequence(
         name,
-        period[known],
+        periods_since[known],
         described[known],
         errors[known],
         blocks=frames.blocks,
         baseline=archive.read(name, 0).errors[known],
         values=np.array(values),
-        repeats=_repeats(summaries, how.objective),
-        block=span(frames.T_ref_sensor, how.length),
+        repeats=_repeats(summaries, objective),
+        block=span(frames.T_ref_sensor, config.sub_trajectory),
         elevation=float(np.nanmedian(frames.elevations)),
         simulation=simulation,
     )

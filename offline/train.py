@@ -15,14 +15,16 @@ from adaptune.model import ErrorModel
 from adaptune.odometry import versions
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import ParameterSet
-from adaptune.study import TIMED, Metric, OfflineConfig, Study
 from offline.budget import BUDGETS
 from offline.campaign import Progress, run_batches, run_tasks
 from offline.cluster import Cluster
+from offline.config import TIMED, Metric, OfflineConfig
 from offline.fit import fit, tuned
-from offline.labelled import LabelledData, Labelling, read_labelled
+from offline.labelled import labelled_data
 from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
-from offline.search import Finished, owner
+from offline.offline_study import OfflineStudy
+from offline.search import Finished
+from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Pool, Task, Workers
 
 _log = logging.getLogger(__name__)
@@ -50,7 +52,7 @@ class Training(NamedTuple):
 
 
 def train(
-    study: Study, progress: Progress = lambda *_: None, cluster: str | None = None
+    study: OfflineStudy, progress: Progress = lambda *_: None, cluster: str | None = None
 ) -> Training:
     """Run all trials that are not in the archive yet, and fit the model.
 
@@ -84,7 +86,13 @@ def train(
     n_workers = config.workers or available()
     where = cluster or f"{n_workers} worker{'s' if n_workers > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    with Cluster(study, cluster) if cluster else Workers(study, n_workers) as workers:
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    memory = config.memory * 1e9
+    with (
+        Cluster(setup, study.training, memory, cluster)
+        if cluster
+        else Workers(setup, n_workers, memory)
+    ) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
         sets = {n: verdicts[n].parameters for n in sorted({0, fixed})}
@@ -109,39 +117,23 @@ def train(
     return Training(model, means, fixed, rows)
 
 
-def _fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int) -> ErrorModel:
+def _fit(
+    study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int
+) -> ErrorModel:
+    """Fit the error model to the trials of all sets that keep the limits."""
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
-    sets = ParameterSets(
-        study.space, tuple(feasible), tuple(v.parameters for v in feasible.values())
-    )
+    parameters = tuple(verdict.parameters for verdict in feasible.values())
+    sets = ParameterSets(study.odometry.space, tuple(feasible), parameters)
     run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
-    data = labelled_data(study, archive, run, sets)
+    data = labelled_data(archive, run, sets, study.config, study.window)
     settings = study.config.offline.model_dump(
         mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
     )
-    provenance = {"versions": versions(study.box)} | settings
+    provenance = {"versions": versions(study.odometry.odometry_class)} | settings
     length = study.config.sub_trajectory
-    model = fit(data, fixed, study.identity, length, study.window, provenance)
+    model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
     model = tuned(model, data, study.config.online.switching)
     return model.thinned(study.config.offline.max_frames)
-
-
-def labelled_data(
-    study: Study, archive: Archive, run: Mapping[str, list[int]], sets: ParameterSets
-) -> LabelledData:
-    """Read the labelled data set of a study, see `read_labelled`."""
-    config = study.config
-    how = Labelling(
-        config.sub_trajectory,
-        config.lost_track,
-        config.online.period,
-        study.window,
-        config.offline.objective[0],
-    )
-    owners = {n: owner(config.offline, study.training, n) for n in sets}
-    named = [n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ()]
-    known = {n for n in named if n is not None and n in sets}
-    return read_labelled(archive, run, sets, how, owners, known)
 
 
 def _trial_rows(

@@ -11,10 +11,10 @@ from adaptune import report
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.paired import ERROR_FLOOR
-from adaptune.study import Study
 from offline.curves import bank_curve, learning_curve
+from offline.labelled import labelled_data
 from offline.leave_one_out import Interval, Validation, leave_one_out
-from offline.train import labelled_data
+from offline.offline_study import OfflineStudy
 
 
 class Validated(NamedTuple):
@@ -36,7 +36,7 @@ class Validated(NamedTuple):
 
 
 def validate(
-    study: Study,
+    study: OfflineStudy,
     curve: bool = False,
     sizes: bool = False,
     progress: Callable[[str, int, int], None] = lambda *_: None,
@@ -66,7 +66,8 @@ def validate(
     complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
     sets = model.sets.subset([model.sets.trials[column] for column in complete])
     run = {name: list(sets) for name in model.sequences}
-    data = labelled_data(study, Archive(study.folder / "trials"), run, sets)
+    archive = Archive(study.folder / "trials")
+    data = labelled_data(archive, run, sets, study.config, study.window)
     switching = study.config.online.switching
     named = switching.sets is not None and set(model.bank) <= set(sets)
     bank = model.bank if named else switching.size
@@ -99,10 +100,10 @@ def validate(
     return Validated(validation, rows, learning, banks)
 
 
-def _checked_model(study: Study) -> ErrorModel:
+def _checked_model(study: OfflineStudy) -> ErrorModel:
     path = study.model_path
     model = ErrorModel.load(path)
-    model.check_study(study.identity, study.space, path)
+    model.check_study(study.odometry.identity, study.odometry.space, path)
     if (study.training, study.window) != (model.sequences, model.window):
         raise ModelError(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "

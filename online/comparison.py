@@ -19,7 +19,7 @@ from adaptune.model import ErrorModel, Selection
 from adaptune.odometry import Bank, Box, HandOver
 from adaptune.report import Track
 from adaptune.space import ParameterSet
-from adaptune.study import Study
+from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from online.replay import Policy, adaptive, replay, write_replay
 
@@ -68,7 +68,7 @@ def run_replays(
         If there is no test sequence, or the model is of another odometry or other parameters.
     """
     model = ErrorModel.load(model_path)
-    model.check_study(study.identity, study.space, model_path)
+    model.check_study(study.odometry.identity, study.odometry.space, model_path)
     # The set that adaptive modes begin with.
     fixed = bank_sets(study, model)[0][0] if study.mechanism == "bank" else model.fixed
     if not study.config.test:
@@ -84,7 +84,7 @@ def run_replays(
             if not again and _about_before(folder / mode) == about:
                 continue
             if sequence is None:
-                sequence = study.sequence(name)
+                sequence = study.sequences.open(name)
             what, n = f"{name}, {mode}", sequence.n_messages
             done = 0
 
@@ -151,12 +151,12 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
     mechanism = study.mechanism
     if mechanism == "bank" and mode == "paired" and model.fusion.hedge == 1.0:
         # It was not shown to pay: others than the fixed set would only cost.
-        mechanism = "live" if study.described.live else "hand_over"
+        mechanism = "live" if study.odometry.description.live else "hand_over"
     if mechanism == "live":
-        return study.odometry(fixed), adaptive(model, mode, study.price())
+        return study.odometry(fixed), adaptive(model, mode, study.switch_cost())
     if mechanism == "hand_over":
-        box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
-        return box, adaptive(model, mode, study.price())
+        box = HandOver(study.odometry, fixed, study.warm_up, switching.catch_up_scans)
+        return box, adaptive(model, mode, study.switch_cost())
     members, sets = bank_sets(study, model)
     bank = Bank(study.odometry, sets, study.warm_up, study.config.lost_track)
     return bank, adaptive(model, mode, members=members)
@@ -213,7 +213,7 @@ def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -
     """All that a replay depends on."""
     parameters: ParameterSet | None = None
     if mode == "baseline":
-        parameters = study.space.baseline
+        parameters = study.odometry.space.baseline
     elif mode == "fixed":
         parameters = model.sets[model.fixed]
     about: dict[str, Any] = {
@@ -227,27 +227,23 @@ def _about(study: Study, name: str, mode: str, model: ErrorModel, digest: str) -
 
 def _setting(study: Study, name: str) -> dict[str, Any]:
     """What every mode's replay of a sequence depends on."""
-    course = study.config.courses.get(name)
     return {
         "period": study.config.online.period,
         "odometry": study.config.odometry.model_dump(mode="json"),
         "health": study.config.health.model_dump(mode="json"),
-        "sequence": study.sequence_config(name).model_dump(mode="json"),
-        "course": None if course is None else course.model_dump(mode="json"),
-        "recording": study.recording_size(name),
-    }
+    } | study.sequences.identity(name)
 
 
 def _switching(study: Study) -> dict[str, Any]:
-    """The mechanism, those of its settings that it heeds, and its price."""
-    heeded = {"live": set[str](), "hand_over": {"beside"}, "bank": {"size", "sets"}}
+    """The mechanism, the settings that it uses, and the switch cost."""
+    heeded = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
     settings = study.config.online.switching.model_dump(
         mode="json", include=heeded[study.mechanism]
     )
     if study.mechanism != "live":
         settings["warm_up"] = study.warm_up._asdict()
     if study.mechanism != "bank":
-        settings["price"] = study.price()
+        settings["switch_cost"] = study.switch_cost()
     return {"mechanism": study.mechanism} | settings
 
 
@@ -315,7 +311,7 @@ def compare(study: Study) -> list[dict[str, Any]]:
             f"{study.name}: {name}",
             study.config.sub_trajectory,
             tracks,
-            [n for n, p in study.space.parameters.items() if getattr(p, "log", False)],
+            [n for n, p in study.odometry.space.parameters.items() if getattr(p, "log", False)],
         )
     if len(ratios["fixed"]) > 1:
         rows += _pooled(rows, ratios)
@@ -385,14 +381,16 @@ def _track(folder: Path, mode: str, study: Study) -> Track:
     if len(frames.get("restarted", [])) != len(stamps):
         raise _damaged(folder / mode / "frames.csv", ValueError("not a row for every scan"))
     choices = _columns(folder / mode / "selections.csv")
-    chosen: dict[str, Sequence[Any]] = {name: choices.get(name, []) for name in study.space.names}
+    chosen: dict[str, Sequence[Any]] = {
+        name: choices.get(name, []) for name in study.odometry.space.names
+    }
     try:
         at = np.array([int(s) for s in choices.get("stamp_ns", [])], np.int64)
     except (TypeError, ValueError) as error:
         raise _damaged(folder / mode / "selections.csv", error) from error
     if not len(at):
         about = _summary(folder / mode)["about"]
-        chosen = {name: [about["parameters"][name]] for name in study.space.names}
+        chosen = {name: [about["parameters"][name]] for name in study.odometry.space.names}
         at = stamps[:1]
     else:
         chosen = {name: _numbers(values) for name, values in chosen.items()}

@@ -15,7 +15,7 @@ from adaptune.model import Selection
 from adaptune.odometry import Bank, Box, HandOver, WarmUp
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
-from adaptune.study import Study
+from adaptune.study.study import Study
 from online.replay import replay
 
 Progress = Callable[[str, int, int], None]
@@ -72,8 +72,8 @@ def measure_switching(
         for what, mean in means.items()
     ]
     found = {
-        "of": study.switching_about(),
-        "price": means[_own(study)] - 1.0,
+        "of": study.switching_identity(),
+        "switch_cost": means[_own(study)] - 1.0,
         "seconds": seconds,
         "rows": rows,
     }
@@ -82,7 +82,7 @@ def measure_switching(
 
 
 def _read(study: Study, name: str, seconds: float) -> tuple[list[Scan], Poses]:
-    sequence = study.sequence(name)
+    sequence = study.sequences.open(name)
     scans: list[Scan] = []
     for scan in sequence:
         if scans and (scan.stamp - scans[0].stamp) * 1e-9 > seconds:
@@ -108,13 +108,13 @@ def _mechanisms(study: Study) -> dict[str, Callable[[], Driven]]:
     names: list[ParameterSet] = [{"number": 0}, {"number": 1}]
 
     def hand_over(warm_up: WarmUp) -> Callable[[], Driven]:
-        return lambda: (HandOver(same, names[0], warm_up, beside), names)
+        return lambda: (HandOver(same, names[0], warm_up, catch_up_scans), names)
 
-    beside = study.config.online.switching.beside
+    catch_up_scans = study.config.online.switching.catch_up_scans
     warm_ups = dict.fromkeys([*(WarmUp(s, s, 1) for s in WARM_UPS), study.warm_up])
     made: dict[str, Callable[[], Driven]] = {"none": lambda: (study.odometry(), None)}
-    if study.described.live:
-        made["live"] = lambda: (study.odometry(), _alike(study.space.baseline))
+    if study.odometry.description.live:
+        made["live"] = lambda: (study.odometry(), _alike(study.odometry.space.baseline))
     made |= {_say(warm_up): hand_over(warm_up) for warm_up in warm_ups}
     made["bank"] = lambda: (Bank(same, names, study.warm_up), names)
     return made

@@ -14,8 +14,9 @@ from adaptune.archive import Archive
 from adaptune.descriptor import averaged
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from offline.train import train
+from offline.offline_study import load_study
 from offline.workers import WorkerError, Workers
 
 
@@ -44,7 +45,7 @@ def test_every_trial_is_in_the_archive(trained):
         trial = archive.read(name, number)
         assert trial.parameters == training.model.sets[number]
         assert training.means[name][number] == pytest.approx(trial.mean_error, rel=1e-6)
-    assert training.model.sets[0] == study.space.baseline
+    assert training.model.sets[0] == study.odometry.space.baseline
 
 
 def test_the_table_of_trials(trained):

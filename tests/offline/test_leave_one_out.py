@@ -9,12 +9,12 @@ from adaptune.metrics import sub_trajectory_vectors
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.base import Rule
 from adaptune.selection import Selection
-from adaptune.study import load_study
 from offline import tuning
 from offline.bank_simulation import BankSimulation
 from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, LabelledSequence
 from offline.leave_one_out import BANK, LeftOut, Validation, ValidationError, leave_one_out
+from offline.offline_study import load_study
 from offline.train import train
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings, tune, tune_bank
 from offline.validate import validate

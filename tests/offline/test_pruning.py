@@ -13,8 +13,9 @@ from offline.validate import validate
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from offline.train import train
+from offline.offline_study import load_study
 from offline.pruning import estimate, rungs, survivors
 
 

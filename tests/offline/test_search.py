@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
 from offline.train import train
 from offline.objective import choose_fixed
+from offline.offline_study import load_study
 from offline.search import make_stages, owner
 
 NAMES = ["one", "two", "three"]

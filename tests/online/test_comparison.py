@@ -8,9 +8,10 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, Selection, Settings
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.train import train
+from offline.offline_study import load_study
 from online.comparison import (
     ComparisonError,
     _warn_of_scant_evidence,
@@ -243,7 +244,7 @@ def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
 
 
 def read_tum_of(study, study_file):
-    return load_study(study_file, [], study.folder).sequence("three").reference()
+    return load_study(study_file, [], study.folder).sequences.open("three").reference()
 
 
 @pytest.mark.parametrize(

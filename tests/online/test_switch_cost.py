@@ -3,7 +3,7 @@ import json
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.study import load_study
+from offline.offline_study import load_study
 from online import switching
 
 
@@ -32,8 +32,8 @@ def test_every_mechanism_is_priced(study_file, tmp_path, monkeypatch):
     assert seen[-1][0] == "two, bank"
     assert seen[-1][1:] == (40, 40)
     kept = json.loads((tmp_path / "switching.json").read_text())
-    assert kept["price"] == pytest.approx(ratios["hand_over, 0.3 s"] - 1.0)
-    assert study.price() == max(0.0, kept["price"])
+    assert kept["switch_cost"] == pytest.approx(ratios["hand_over, 0.3 s"] - 1.0)
+    assert study.switch_cost() == max(0.0, kept["switch_cost"])
 
 
 def test_too_short_to_tell(study_file, tmp_path):

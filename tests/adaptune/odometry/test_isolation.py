@@ -17,7 +17,7 @@ from adaptune.odometry.gicp import KeyframeGicp, Settings
 from adaptune.odometry.isolation import _server
 from adaptune.sequence import Imu, Scan
 from adaptune.sequence.imu import ImuNoise
-from adaptune.study import load_study
+from offline.offline_study import load_study
 from offline.trial import PreparedSequence, run_trials
 from offline.workers import Task, Workers, run
 from online.replay import replay

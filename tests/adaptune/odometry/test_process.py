@@ -13,7 +13,8 @@ from adaptune.odometry import Limits, OdometryError, Process
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.process import Settings, listen
 from adaptune.sequence import Scan
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
 
 LIMITS = Limits(seconds=20.0)
 
@@ -176,8 +177,8 @@ def test_a_study_takes_its_space(study_file, tmp_path):
         "odometry.parameters={speed: {high: 2.0}}",
     ]
     study = load_study(study_file, overrides, tmp_path / "study")
-    assert study.space.parameters["speed"].high == 2.0
-    assert study.described.live
+    assert study.odometry.space.parameters["speed"].high == 2.0
+    assert study.odometry.description.live
     box = study.odometry({"speed": 1.5})
     box.start(scan(0), np.eye(4))
     assert box.register(scan(1)).T_odom_sensor[0, 3] == 1.5
