@@ -182,17 +182,17 @@ def serve(
     What the odometry itself writes goes to standard error, or is told with its fault where it has
     a process of its own. `docs/odometry.md` describes the messages.
     """
-    from adaptune.odometry import process, wire
+    from adaptune.odometry import serving
 
     if listen is not None:
         if odometry is None:
             raise AdaptuneError("--listen serves one odometry: name it")
-        process.listen(
+        serving.listen(
             listen, odometry, lambda at: console.print(f"{odometry} at {at}", highlight=False)
         )
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        wire.serve(sys.stdin.buffer, writer, odometry, process.anywhere)
+        serving.serve(sys.stdin.buffer, writer, odometry)
 
 
 @app.command()

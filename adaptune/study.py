@@ -9,7 +9,7 @@ import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal, Self, TypeVar, get_args
 
@@ -30,20 +30,19 @@ from adaptune.cores import available
 from adaptune.descriptor import DescriptorError, descriptor
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.odometry import (
-    Box,
-    Command,
+from adaptune.odometry.base import (
     Description,
-    HealthCheck,
-    Isolated,
-    Limits,
     Odometry,
     OdometryError,
-    Process,
+    OdometryInstance,
     WarmUp,
-    box_class,
 )
-from adaptune.odometry.command import Material, material
+from adaptune.odometry.command import Command
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.program_input import ProgramInput, program_input
+from adaptune.odometry.registry import odometry_class
 from adaptune.sampling import NAMES, SETTINGS, SINGLE, SamplerError, check_sampler, optuna_class
 from adaptune.sequence import SequenceConfig, open_sequence
 from adaptune.sequence.bag import bag_paths
@@ -266,10 +265,10 @@ class DescriptorConfig(_Section):
         return {"names": data} if isinstance(data, list) else data
 
 
-def _catches_up(beside: int) -> int:
-    if beside == 1:
+def _catches_up(scans: int) -> int:
+    if scans == 1:
         raise ValueError("with 1 a new instance would never catch up; give 0, or 2 or more")
-    return beside
+    return scans
 
 
 class SwitchingConfig(_Section):
@@ -288,8 +287,8 @@ class SwitchingConfig(_Section):
         Seconds of the most recent ones, of which it sees all.
     stride : int, optional
         Every how many of those before it sees.
-    beside : int
-        How many of them it sees with every new scan while the old instance still gives the poses;
+    catch_up_scans : int
+        How many of them it sees with every new scan, while the old instance still gives the poses;
         with 0, all at once.
     size : int
         Instances in the bank.
@@ -305,7 +304,7 @@ class SwitchingConfig(_Section):
     warm_up: float | None = Field(None, gt=0, allow_inf_nan=False)
     full_rate: float | None = Field(None, ge=0, allow_inf_nan=False)
     stride: int | None = Field(None, ge=1)
-    beside: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
+    catch_up_scans: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
     size: int = Field(4, ge=2, le=6)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0)] | dict[str, Value], ...] | None,
@@ -313,6 +312,13 @@ class SwitchingConfig(_Section):
     ] = None
     cores: int | None = Field(None, ge=1)
     memory: float = Field(16.0, gt=0, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "beside" in given:
+            raise ValueError("the key `beside` is now called `catch_up_scans`")
+        return given
 
 
 class OnlineConfig(_Section):
@@ -389,25 +395,29 @@ class Study:
         return self.folder.name
 
     @cached_property
-    def box(self) -> type[Odometry] | type[Command] | type[Process]:
-        """Class of the odometry."""
-        return _box(self.config.odometry.name)
+    def factory(self) -> OdometryFactory:
+        """Makes the study's odometry."""
+        name, training = self.config.odometry.name, self.config.training
+        limits = self.config.isolation
+        return OdometryFactory(
+            name, self.settings, self.space, limits, self._program_input, training
+        )
 
     @cached_property
     def settings(self) -> Any:
         """Settings of the odometry."""
-        return self.box.settings_type.model_validate(self.config.odometry.settings)
+        odometry = self.config.odometry
+        return odometry_class(odometry.name).settings_type.model_validate(odometry.settings)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Name and settings of the odometry, as a model tells what it was made for."""
-        settings = self.settings.model_dump(mode="json")
-        return {"name": self.config.odometry.name, "settings": settings}
+        """See `OdometryFactory.identity`."""
+        return self.factory.identity
 
     @cached_property
     def described(self) -> Description:
-        """What the odometry says of itself."""
-        return self.box.describe(self.settings)
+        """Description of the odometry."""
+        return odometry_class(self.config.odometry.name).describe(self.settings)
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -424,35 +434,11 @@ class Study:
         parameters: ParameterSet | None = None,
         sequence: str | None = None,
         isolated: bool = False,
-    ) -> Box:
-        """A new instance.
+    ) -> OdometryInstance:
+        """Make a new instance, see `OdometryFactory`."""
+        return self.factory(parameters, sequence, isolated)
 
-        It runs in a process of its own if it is not known to be clean, or if `isolated` asks.
-
-        Parameters
-        ----------
-        parameters
-            Those not given keep their baseline.
-        sequence
-            The sequence that it will be driven along; a program that reads whole recordings only
-            wants to know.
-        isolated
-            Whether its memory is to be told.
-        """
-        given = self.space.baseline | (parameters or {})
-        limits = self.config.isolation
-        if issubclass(self.box, Command):
-            # What fails in training with the baseline's parameters fails for want of something.
-            strict = sequence in self.config.training and given == self.space.baseline
-            material = None if sequence is None else partial(self._material, sequence)
-            return Command(given, self.settings, limits, material, strict)
-        if issubclass(self.box, Process):
-            return Process(given, self.settings, limits)
-        if self.box.clean and not isolated:
-            return self.box(given, self.settings)
-        return Isolated(self.config.odometry.name, given, self.settings, limits)
-
-    def _material(self, name: str) -> Material:
+    def _program_input(self, name: str) -> ProgramInput:
         """A sequence as a program reads it."""
         folder = self.folder / "inputs" / name
         course = self.config.courses.get(name)
@@ -466,10 +452,10 @@ class Study:
             "recording": self.recording_size(name),
         }
         key = str(folder), json.dumps(about)
-        if key not in _materials:
+        if key not in _inputs:
             sequence = self.sequence(name)
-            _materials[key] = material(sequence, config, about, folder, self.settings.input)
-        return _materials[key]
+            _inputs[key] = program_input(sequence, config, about, folder, self.settings.input)
+        return _inputs[key]
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -677,8 +663,8 @@ class Study:
         return resolved
 
 
-_materials: dict[tuple[str, str], Material] = {}
-"""What programs are given of sequences, by folder and all that it depends on."""
+_inputs: dict[tuple[str, str], ProgramInput] = {}
+"""Recordings for programs, by folder and all that they depend on."""
 
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
@@ -824,19 +810,13 @@ def _check_roles(data: dict[str, Any], known: set[Any], problems: list[_Problem]
                 problems.append(((role, i), f"{name!r} is trained on, and proves nothing here"))
 
 
-def _box(name: str) -> type[Odometry] | type[Command] | type[Process]:
-    if name == "command":
-        return Command
-    return Process if name == "process" else box_class(name)
-
-
 def _check_odometry(data: dict[str, Any], problems: list[_Problem], folder: Path) -> None:
     """Check all that depends on the odometry; paths in its settings are made absolute."""
     name = data.get("name")
     if not isinstance(name, str):
         return
     try:
-        box = _box(name)
+        box = odometry_class(name)
     except OdometryError as error:
         problems.append((("odometry", "name"), str(error)))
         return
@@ -883,7 +863,7 @@ def _check_parameters(
 def _check_box(config: StudyConfig, problems: list[_Problem]) -> None:
     """Find what is asked of the odometry that it cannot do, and what it lacks."""
     try:
-        box: Any = _box(config.odometry.name)
+        box: Any = odometry_class(config.odometry.name)
         found = box.describe(box.settings_type.model_validate(config.odometry.settings))
     except (OdometryError, ValidationError):
         return

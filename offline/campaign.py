@@ -14,7 +14,6 @@ from adaptune.cores import available
 from adaptune.descriptor import averaged
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
-from adaptune.odometry import versions
 from adaptune.space import ParameterSet
 from adaptune.study import TIMED, OfflineConfig, Study
 from offline.budget import BUDGETS, Clock
@@ -497,7 +496,7 @@ def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: 
         sequence=np.concatenate(sequence),
         errors=np.concatenate(errors),
         elevations=elevations,
-        provenance={"versions": versions(study.box), "trials": numbers}
+        provenance={"versions": study.factory.versions, "trials": numbers}
         | study.config.offline.model_dump(
             mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
         ),

@@ -13,8 +13,7 @@ from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
-from adaptune.odometry import Box, Isolated
-from adaptune.odometry.base import prepared_bytes
+from adaptune.odometry.base import OdometryInstance, prepared_bytes
 from adaptune.odometry.health import unhealthy
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
@@ -151,7 +150,7 @@ def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
 
 def _odometry(
     study: Study, parameters: ParameterSet | None = None, sequence: str | None = None
-) -> Box:
+) -> OdometryInstance:
     """An odometry, in a process of its own where its memory is to be told apart."""
     if "memory" in study.config.offline.metrics:
         return study.odometry(parameters, sequence, isolated=True)
@@ -162,7 +161,12 @@ class _Run:
     """An odometry on its way along a piece of a sequence, from frame `begin` to before `end`."""
 
     def __init__(
-        self, odometry: Box, frames: Frames, lost_track: float | None, begin: int, end: int
+        self,
+        odometry: OdometryInstance,
+        frames: Frames,
+        lost_track: float | None,
+        begin: int,
+        end: int,
     ):
         n = len(frames.stamps)
         self.odometry = odometry
@@ -172,15 +176,9 @@ class _Run:
         self.registered = np.ones(n, bool)
         self.seconds = np.zeros(n)
         self.lost_steps: dict[int, Poses] = {}
-        self._cpu = 0.0
         self._T_ref_sensor = frames.T_ref_sensor
         self._T_ref_steps = steps(frames.T_ref_sensor)
         self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
-
-    @property
-    def cpu(self) -> float:
-        """Seconds that the odometry has computed."""
-        return self.odometry.cpu if isinstance(self.odometry, Isolated) else self._cpu
 
     def step(self, i: int, prepared: Any) -> None:
         if i == self.begin:
@@ -189,10 +187,9 @@ class _Run:
             self.odometry.start(prepared, T)
             self.T_odom_sensor[i] = T
             return
-        begin, begin_cpu = time.perf_counter(), time.process_time()
+        begin = time.perf_counter()
         T, self.registered[i] = self.odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
-        self._cpu += time.process_time() - begin_cpu
         finite = np.isfinite(T).all()
         # An odometry without a pose has, as far as one can tell, not moved.
         T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
@@ -312,7 +309,7 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         restarted[own], registered[own] = run.restarted[own], run.registered[own]
         seconds[own] = run.seconds[own]
         lost_steps |= run.lost_steps
-        cpu += run.cpu * (own.stop - own.start) / (run.end - run.begin)
+        cpu += run.odometry.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
         if after is not None:
             T = run.T_odom_sensor
             lost_steps[after.begin] = invert(T[after.begin - 1]) @ T[after.begin]
@@ -320,10 +317,10 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
     for i, T_step in lost_steps.items():
         T_steps[i - 1] = T_step
     duration = (frames.stamps[-1] - frames.stamps[0]) * 1e-9
-    isolated = [r.odometry for r in pieces if isinstance(r.odometry, Isolated)]
     usage = {"cpu": 100.0 * cpu / duration}
-    if isolated:
-        usage["memory"] = max(box.memory for box in isolated)
+    memory = [run.odometry.usage.memory for run in pieces]
+    if known := [megabytes for megabytes in memory if megabytes is not None]:
+        usage["memory"] = max(known)
     return Trial(
         parameters,
         T_odom_sensor,
@@ -331,7 +328,7 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         restarted,
         registered,
         seconds,
-        tuple(fault for run in pieces for fault in getattr(run.odometry, "faults", ())),
+        tuple(fault for run in pieces for fault in run.odometry.faults),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
         usage,
         unhealthy=unhealthy(study.config.health, T_steps, frames.stamps, registered),

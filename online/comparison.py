@@ -16,7 +16,9 @@ from adaptune.descriptor import DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import KittiError, bootstrap, kitti_error, span, sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
-from adaptune.odometry import Bank, Box, HandOver
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import OdometryInstance
+from adaptune.odometry.hand_over import HandOver
 from adaptune.report import Track
 from adaptune.space import ParameterSet
 from adaptune.study import Study
@@ -70,7 +72,8 @@ def run_replays(
     model = ErrorModel.load(model_path)
     model.check_study(study.identity, study.space, model_path)
     # The set that adaptive modes begin with.
-    fixed = bank_sets(study, model)[0][0] if study.mechanism == "bank" else model.fixed
+    members = bank_sets(study, model)[0] if study.mechanism == "bank" else None
+    fixed = model.fixed if members is None else members[0]
     if not study.config.test:
         raise ComparisonError("test: name at least one sequence to replay")
     study.open()
@@ -103,6 +106,7 @@ def run_replays(
                     model.sets,
                     study.config.online.period,
                     step,
+                    members,
                 )
             except DescriptorError as error:
                 raise ComparisonError(f"sequences.{name}: {error}") from error
@@ -130,7 +134,9 @@ def _warn_of_scant_evidence(what: str, selections: Sequence[Selection], fixed: i
         )
 
 
-def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, Policy | None]:
+def driven(
+    study: Study, model: ErrorModel, mode: str, name: str
+) -> tuple[OdometryInstance, Policy | None]:
     """What a mode drives through a recording, and what chooses its parameters.
 
     Parameters
@@ -155,10 +161,11 @@ def driven(study: Study, model: ErrorModel, mode: str, name: str) -> tuple[Box, 
     if mechanism == "live":
         return study.odometry(fixed), adaptive(model, mode, study.price())
     if mechanism == "hand_over":
-        box = HandOver(study.odometry, fixed, study.warm_up, switching.beside)
+        box = HandOver(study.odometry, fixed, study.warm_up, switching.catch_up_scans)
         return box, adaptive(model, mode, study.price())
     members, sets = bank_sets(study, model)
-    bank = Bank(study.odometry, sets, study.warm_up, study.config.lost_track)
+    by_number = dict(zip(members, sets, strict=True))
+    bank = Bank(study.odometry, by_number, study.warm_up, study.config.lost_track)
     return bank, adaptive(model, mode, members=members)
 
 
@@ -240,7 +247,7 @@ def _setting(study: Study, name: str) -> dict[str, Any]:
 
 def _switching(study: Study) -> dict[str, Any]:
     """The mechanism, those of its settings that it heeds, and its price."""
-    heeded = {"live": set[str](), "hand_over": {"beside"}, "bank": {"size", "sets"}}
+    heeded = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
     settings = study.config.online.switching.model_dump(
         mode="json", include=heeded[study.mechanism]
     )

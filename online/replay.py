@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune import selection as applied
 from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.descriptor.motion import MOTION, SECOND, fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
@@ -21,8 +22,8 @@ from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
 from adaptune.model import RULES, ErrorModel, PairedFusion, Selection
 from adaptune.model.fusion import Steady
-from adaptune.odometry import Bank, Box, HealthCheck
-from adaptune.odometry.health import Guard
+from adaptune.odometry.base import OdometryInstance
+from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory, write_tum
@@ -187,12 +188,13 @@ def _foreign(model: ErrorModel) -> Callable[[Scan], bool]:
 
 def replay(
     scans: Iterable[Scan],
-    odometry: Box,
+    odometry: OdometryInstance,
     health: HealthCheck,
     policy: Policy | None = None,
     sets: list[ParameterSet] | None = None,
     period: float = 1.0,
     progress: Callable[[], None] = lambda: None,
+    members: list[int] | None = None,
 ) -> Replay:
     """Drive an odometry through a recording, as fast as it goes and always the same way.
 
@@ -205,7 +207,7 @@ def replay(
         In order of time.
     odometry
         A new instance; if there is a policy, one that can change its parameters between scans, by
-        itself or by `adaptune.odometry.switching`.
+        itself, by a hand-over or in a bank.
     health
         The odometry is started anew where its motion is not healthy.
     policy
@@ -216,6 +218,8 @@ def replay(
         Seconds between selections.
     progress
         Called after every scan.
+    members
+        Of a bank, the sets that the weights of a selection belong to.
 
     Raises
     ------
@@ -244,10 +248,10 @@ def replay(
             selection = policy(scan, _motion(stamps, poses))
             parameters = sets[selection.set_index]
             seconds = time.perf_counter() - t
-            if isinstance(odometry, Bank) and selection.weights is not None:
-                odometry.weigh(selection.weights)
-            else:
-                odometry.configure(parameters)
+            weights = None
+            if selection.weights is not None:
+                weights = dict(zip(members or (), selection.weights, strict=True))
+            odometry.apply(applied.Selection(selection.set_index, parameters, weights))
             choices.append(Choice(scan.stamp, selection, parameters, seconds))
             n_periods = int((scan.stamp - first) // (period * 1e9)) + 1
         t_prepare = time.perf_counter()

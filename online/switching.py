@@ -12,7 +12,9 @@ from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import Selection
-from adaptune.odometry import Bank, Box, HandOver, WarmUp
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import OdometryInstance, WarmUp
+from adaptune.odometry.hand_over import HandOver
 from adaptune.sequence import Scan
 from adaptune.space import ParameterSet
 from adaptune.study import Study
@@ -94,29 +96,29 @@ def _read(study: Study, name: str, seconds: float) -> tuple[list[Scan], Poses]:
     return scans, reference.at(np.array([scan.stamp for scan in scans], np.int64))
 
 
-Driven = tuple[Box, list[ParameterSet] | None]
+Driven = tuple[OdometryInstance, list[ParameterSet] | None]
 """What is driven, and the sets that it changes between."""
 
 
 def _mechanisms(study: Study) -> dict[str, Callable[[], Driven]]:
     """By name, what makes each mechanism that the odometry can have; the first never switches."""
 
-    def same(_: ParameterSet) -> Box:
+    def same(_: ParameterSet) -> OdometryInstance:
         return study.odometry()
 
     # Sets that differ in name only.
     names: list[ParameterSet] = [{"number": 0}, {"number": 1}]
 
     def hand_over(warm_up: WarmUp) -> Callable[[], Driven]:
-        return lambda: (HandOver(same, names[0], warm_up, beside), names)
+        return lambda: (HandOver(same, names[0], warm_up, catch_up), names)
 
-    beside = study.config.online.switching.beside
+    catch_up = study.config.online.switching.catch_up_scans
     warm_ups = dict.fromkeys([*(WarmUp(s, s, 1) for s in WARM_UPS), study.warm_up])
     made: dict[str, Callable[[], Driven]] = {"none": lambda: (study.odometry(), None)}
     if study.described.live:
         made["live"] = lambda: (study.odometry(), _alike(study.space.baseline))
     made |= {_say(warm_up): hand_over(warm_up) for warm_up in warm_ups}
-    made["bank"] = lambda: (Bank(same, names, study.warm_up), names)
+    made["bank"] = lambda: (Bank(same, dict(enumerate(names)), study.warm_up), names)
     return made
 
 
@@ -142,7 +144,7 @@ def _drive(
     what: str,
     scans: Sequence[Scan],
     T_ref_sensor: Poses,
-    box: Box,
+    box: OdometryInstance,
     sets: list[ParameterSet] | None,
     progress: Progress,
 ) -> tuple[float, float]:
