@@ -128,7 +128,10 @@ def test_reads_a_study(study_file, tmp_path):
         ("online.switching.warm_up=0", ["online.switching.warm_up", "not 0"]),
         ("online.switching.size=7", ["online.switching.size", "not 7"]),
         ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
-        ("online.switching.beside=1", ["online.switching.beside", "never catch up"]),
+        (
+            "online.switching.catch_up_scans=1",
+            ["online.switching.catch_up_scans", "never catch up"],
+        ),
         ("online.switching.sets=[0]", ["online.switching.sets"]),
         (
             "online.switching.sets=[0, {keyframe_intervall: 1.0}]",
