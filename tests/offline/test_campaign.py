@@ -15,8 +15,8 @@ from adaptune.descriptor import averaged
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.study.mistakes import ConfigurationError
-from offline.train import train
 from offline.offline_study import load_study
+from offline.train import train
 from offline.workers import WorkerError, Workers
 
 

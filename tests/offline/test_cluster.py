@@ -12,9 +12,9 @@ import postgres
 import pytest
 
 from offline import cluster
-from offline.train import train
 from offline.cluster import Cluster, ClusterError
 from offline.offline_study import load_study
+from offline.train import train
 
 distributed = pytest.importorskip("distributed")
 

@@ -14,10 +14,10 @@ from adaptune.cli import app
 from adaptune.model import ErrorModel
 from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
-from offline.train import train
 from offline.objective import choose_fixed
 from offline.offline_study import load_study
 from offline.search import make_stages, owner
+from offline.train import train
 
 NAMES = ["one", "two", "three"]
 
