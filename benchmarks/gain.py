@@ -23,6 +23,20 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
+from offline.fusion import Drive, error_vectors, periods, recorded_motions
+from offline.validation import (
+    BANK_SIZE,
+    NO_WORSE,
+    LabelledSequence,
+    Maker,
+    Validation,
+    choose_bank,
+    learning_curve,
+    leave_one_out,
+    training_data,
+    tune,
+    tune_bank,
+)
 
 from adaptune.archive import Frames
 from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
@@ -43,23 +57,10 @@ from adaptune.model import (
 from adaptune.model.base import complementary
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import simulate
-from adaptune.study import Study, StudyConfig
-from offline.fusion import Drive, error_vectors, periods, recorded_motions
+from adaptune.study.config import StudyConfig
+from adaptune.study.study import Study
 from offline.samplers import make_sampler
 from offline.trial import run_trials
-from offline.validation import (
-    BANK_SIZE,
-    NO_WORSE,
-    LabelledSequence,
-    Maker,
-    Validation,
-    choose_bank,
-    learning_curve,
-    leave_one_out,
-    training_data,
-    tune,
-    tune_bank,
-)
 
 ODOMETRIES = ("gicp", "ndt")
 N_SETS = 16
@@ -122,7 +123,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     offline = study.config.offline.model_copy(
         update={"sampler": "sobol", "batch": N_SETS, "seed": seed}
     )
-    sets = make_sampler(study.space, offline).propose([])
+    sets = make_sampler(study.odometry.space, offline).propose([])
     box = study.odometry()
     sequence: Any = Prepared(path.stem, [box.prepare(scan) for scan in scans], frames)
     trials = run_trials(study, sequence, sets)
@@ -135,7 +136,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
             stamps=frames.stamps,
             T_world_sensor=frames.T_ref_sensor,
             histograms=frames.descriptors.astype(np.uint16),
-            sets=study.space.to_unit(sets),
+            sets=study.odometry.space.to_unit(sets),
             errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
             vectors=np.stack(vectors, axis=1),
             motions=motions.astype(np.float32),

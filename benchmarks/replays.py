@@ -18,21 +18,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from adaptune.model.fusion import Steady
 from gain import ODOMETRIES, WINDOW, labelled, study_of, training_courses, trials
 from numpy.typing import NDArray
+from offline.validation import choose_bank, training_data, tune, tune_bank
 
 from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
-from adaptune.model.fusion import Steady
 from adaptune.model.paired import ERROR_FLOOR
-from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
+from adaptune.odometry import OdometryInstance, WarmUp
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.health import HealthCheck
 from adaptune.sequence import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import simulate
 from adaptune.space import ParameterSet
-from offline.validation import choose_bank, training_data, tune, tune_bank
 from online.replay import Policy, replay
 
 ORDERS = (
@@ -72,7 +74,7 @@ def geometric(data: TrainingData) -> int:
     return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
 
 
-Way = tuple[Callable[[], Box], Policy | None]
+Way = tuple[Callable[[], OdometryInstance], Policy | None]
 """What is driven, and what chooses its parameters."""
 
 
@@ -83,7 +85,7 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
     settings = tune(sequences, units)
     print(f"settings of the paired rule: {settings}")
     study = study_of(odometry)
-    sets = study.space.from_unit(units)
+    sets = study.odometry.space.from_unit(units)
 
     def alone(number: int | None) -> Way:
         return lambda: study.odometry(None if number is None else sets[number]), None

@@ -21,13 +21,14 @@ from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
-from adaptune.odometry import HealthCheck
-from adaptune.odometry.gicp import crop
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.keyframe import crop
 from adaptune.sequence import Scan, SequenceConfig
 from adaptune.sequence.opening import open_sequence
-from adaptune.study import Study, load_study
+from adaptune.study.study import Study
 from adaptune.trajectory import read_kitti
-from offline.campaign import train
+from offline.offline_study import load_study
+from offline.train import train
 from offline.trial import PreparedSequence, run_trials
 from online.replay import adaptive, replay
 
@@ -84,7 +85,7 @@ def trial(study: Study) -> None:
     sequence = PreparedSequence(study, "hall_begin", 8e9)
     prepared = [(scan.cloud, scan.tree) for scan in sequence]
     parameters = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
-    iterations = study.settings.iterations  # type: ignore[attr-defined]
+    iterations = study.odometry.settings.iterations  # type: ignore[attr-defined]
     compare(
         f"trial, {len(prepared)} scans",
         lambda: run_trials(study, sequence, [parameters], whole=True),
@@ -95,9 +96,9 @@ def trial(study: Study) -> None:
 def adaptive_replay(study: Study, model: ErrorModel) -> None:
     """Replay from the bag, selecting once a second, against read, prepare and align."""
     fixed = model.sets[model.fixed]
-    street = study.sequence("street")
+    street = study.sequences.open("street")
     box = study.odometry()
-    settings = study.settings
+    settings = study.odometry.settings
 
     select = adaptive(model, "paired")
 

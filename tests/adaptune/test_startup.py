@@ -16,6 +16,7 @@ HEAVY = ("matplotlib", "numba", "open3d", "rosbags", "scipy", "sklearn")
         "from adaptune.sequence.config import SequenceConfig, ViewConfig\n"
         "SequenceConfig(bag='a.bag', views=[ViewConfig(reverse=True)]).model_dump()",
         "from adaptune.sequence.names import origin",
+        "from adaptune.study.config import StudyConfig",
         "from adaptune.descriptor import check_descriptor\ncheck_descriptor('ndt')",
     ],
 )

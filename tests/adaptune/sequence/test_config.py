@@ -10,8 +10,9 @@ from adaptune import yaml
 from adaptune.sequence import SequenceConfig, SequenceError
 from adaptune.sequence.config import to_pose
 from adaptune.sequence.opening import check_sequence, open_sequence
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
+from offline.offline_study import load_study
 
 
 def test_paths_are_of_the_studys_folder_and_know_variables(
