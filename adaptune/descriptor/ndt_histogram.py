@@ -116,8 +116,7 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
                 if keys[cell] == key:
                     break
                 slot = (slot + 1) & mask
-        x -= (kx + 0.5) * CELL_SIZE
-        y -= (ky + 0.5) * CELL_SIZE
+        x, y = x - (kx + 0.5) * CELL_SIZE, y - (ky + 0.5) * CELL_SIZE
         z -= (kz + 0.5) * CELL_SIZE
         s = sums[cell]
         s[0] += 1.0
