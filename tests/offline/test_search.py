@@ -6,14 +6,17 @@ import itertools
 import drawn
 import numpy as np
 import pytest
-from offline.validation import labelled_sequences, leave_one_out
+from offline.validation import leave_one_out
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.model import ErrorModel
+from adaptune.parameter_sets import ParameterSets
 from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
+from offline.labelled import labelled_data
+from offline.leave_one_out import leave_one_out
 from offline.objective import choose_fixed
 from offline.offline_study import load_study
 from offline.search import make_stages, owner
@@ -175,23 +178,24 @@ def test_views_search_for_themselves(study_of):
 def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     study = study_of(sets="own")
     verdicts, _, archive = run(study)
-    fixed = choose_fixed(study.config.offline, verdicts)
-    from offline.campaign import fit
-
-    model = fit(study, archive, verdicts, fixed)
-    assert np.isnan(model.errors).any()
-    sequences, unit, _ = labelled_sequences(study, model)
-    complete = [n for n, v in verdicts.items() if v.complete]
-    assert len(unit) == len(complete)
-    for sequence in sequences:
-        assert [n for n, own in zip(complete, sequence.own, strict=True) if own] == [
-            n for n in complete if owner(study.config.offline, NAMES, n) == sequence.name
+    sets = ParameterSets(
+        study.odometry.space, tuple(verdicts), tuple(v.parameters for v in verdicts.values())
+    )
+    seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
+    data = labelled_data(archive, seen, sets, study.config, study.window)
+    assert np.isnan(data.sequences[0].errors).any()
+    complete = data.complete()
+    assert list(complete.sets) == [n for n, v in verdicts.items() if v.complete]
+    assert complete.fixed() == choose_fixed(study.config.offline, verdicts)
+    for sequence in complete.sequences:
+        assert sequence.own.tolist() == [
+            owner(study.config.offline, NAMES, n) == sequence.name for n in complete.sets
         ]
-    validation = leave_one_out(sequences, unit)
+    validation = leave_one_out(complete)
     for left_out in validation.left_out:
         known = [
             archive.finished(left_out.name)[n].mean_error
-            for n in complete
+            for n in complete.sets
             if owner(study.config.offline, NAMES, n) != left_out.name
         ]
         assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
@@ -210,7 +214,9 @@ def test_from_end_to_end(study_file, tmp_path):
     assert len(rows) == len(model.sets) == 1 + 2 * 4
     run_everywhere = [row for row in rows if row["mean"]]
     assert 1 <= len(run_everywhere) <= 3
-    assert float(rows[model.fixed]["mean"]) == min(float(row["mean"]) for row in run_everywhere)
+    assert float(rows[model.sets.column(model.fixed)]["mean"]) == min(
+        float(row["mean"]) for row in run_everywhere
+    )
     for s, name in enumerate(("one", "two")):
         missing = np.isnan(model.errors[model.sequence == s])
         assert (missing.all(axis=0) == missing.any(axis=0)).all()
