@@ -150,7 +150,7 @@ def offline(
     and the best set of each sequence. Stop it with Ctrl-C, and run it again to resume.
     """
     from adaptune import report
-    from offline.campaign import train
+    from offline.train import train
 
     loaded = _load(study, override, folder)
     say(f"Seed {loaded.config.offline.seed}.")
@@ -171,14 +171,14 @@ def offline(
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
-    if loaded.mechanism == "bank" and model.fusion.hedge < 1.0:
-        say(f"Bank: trials {', '.join(map(str, model.bank_trials))}")
-    elif model.paired.n_sets == 1:
+    if loaded.mechanism == "bank" and model.bank_adapts:
+        say(f"Bank: trials {', '.join(map(str, model.bank))}")
+    elif not model.paired.adapt:
         say(
             "Leaving out one training sequence after the other did not show that adapting pays "
             "(this needs six sequences or more): `paired` will always take the fixed set."
         )
-    say(f"Error model: {loaded.folder / 'model.npz'}")
+    say(f"Error model: {loaded.model_path}")
 
 
 @app.command()
@@ -248,7 +248,7 @@ def validate(
     without the left-out sequence, too.
     """
     from adaptune import report
-    from offline.validation import validate as validate_study
+    from offline.validate import validate as validate_study
 
     loaded = _load(study, override, folder)
     with progress() as show:
@@ -294,7 +294,7 @@ def online(
     and the time of each scan (CSV).
     """
     from adaptune.cores import pin
-    from online.comparison import run_replays
+    from online.run_replays import run_replays
 
     loaded = _load(study, override, folder)
     # Ask for the number of cores before the replays are bound to one.
@@ -302,7 +302,7 @@ def online(
     unpin = pin(os.getpid())
     try:
         with progress() as show:
-            made = run_replays(loaded, model or loaded.folder / "model.npz", again, show)
+            made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
     say(f"{made} replays made; all replays are in {loaded.folder / 'replays'}/")
@@ -324,7 +324,7 @@ def switching(
     study keeps the switch cost of its own mechanism, which selections take into account.
     """
     from adaptune import report
-    from online.switching import measure_switching
+    from online.switch_cost import measure_switching
 
     loaded = _load(study, override, folder)
     with progress() as show:
@@ -360,7 +360,7 @@ def compare(
     console.print(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m on test sequences",
-            rows,
+            [row.columns() for row in rows],
             "Intervals of 95 %: block bootstrap over time, if the sequence is long enough; seed 0. "
             "`all`: mean RTE, and geometric mean of the ratios.",
         )

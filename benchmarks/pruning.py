@@ -18,9 +18,10 @@ from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.simulation import record
 from adaptune.study.study import Study
-from offline.campaign import run_batches, train
+from offline.campaign import run_batches
 from offline.objective import choose_fixed
 from offline.offline_study import load_study
+from offline.train import train
 from offline.workers import Outcome, Result, Task
 
 RULES = ("halving", "hyperband", "wilcoxon")

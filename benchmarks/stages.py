@@ -26,8 +26,8 @@ from adaptune.odometry.gicp import crop
 from adaptune.sequence import Scan, SequenceConfig, open_sequence
 from adaptune.study.study import Study
 from adaptune.trajectory import read_kitti
-from offline.campaign import train
 from offline.offline_study import load_study
+from offline.train import train
 from offline.trial import PreparedSequence, run_trials
 from online.replay import adaptive, replay
 

@@ -164,7 +164,10 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
         max(of_run[name] for of_run in metrics) / limit.max - 1.0
         for name, limit in config.limits.items()
     )
-    return Verdict(runs[0].parameters, values, constraints, _margin(config.objective[0], runs))
+    above = 0.0
+    if all(run.repeats for run in runs):
+        above = float(margin(np.array([repeated(config.objective[0], r.repeats) for r in runs])))
+    return Verdict(runs[0].parameters, values, constraints, above)
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -172,15 +175,26 @@ def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> f
     return sum(weight * metrics[name] for name, weight in weights.items())
 
 
-def _margin(weights: Mapping[Metric, float], runs: Sequence[Summary]) -> float:
-    """Student's margin of the mean over sequences: runs of a set vary, sequences do not."""
-    if not all(run.repeats for run in runs):
-        return 0.0
+def repeated(weights: Mapping[Metric, float], runs: Sequence[Mapping[str, float]]) -> list[float]:
+    """The weighted sum of the metrics that can repeat, in every run of a trial."""
     repeatable = {name: w for name, w in weights.items() if name not in TIMED}
-    values = np.array([[weighted(repeatable, r) for r in run.repeats] for run in runs])
-    n_runs, n_repeats = values.shape
-    error = np.sqrt(values.var(axis=1, ddof=1).sum() / n_repeats) / n_runs
-    return float(stats.t.ppf(0.95, n_runs * (n_repeats - 1)) * error)
+    return [weighted(repeatable, run) for run in runs]
+
+
+def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From a mean over sequences to the upper end of its one-sided 95 % confidence interval.
+
+    The interval is Student's. Runs of a set vary, the sequences do not.
+
+    Parameters
+    ----------
+    repeats
+        Values of every run, of shape (n_sequences, ..., n_repeats).
+    """
+    n_sequences, n_repeats = len(repeats), repeats.shape[-1]
+    variance = repeats.var(axis=-1, ddof=1).sum(axis=0)
+    error = np.sqrt(variance / n_repeats) / n_sequences
+    return np.asarray(stats.t.ppf(0.95, n_sequences * (n_repeats - 1)) * error)
 
 
 def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:

@@ -44,6 +44,11 @@ class Study(Generic[C_co]):
         """Name of the study: its folder's."""
         return self.folder.name
 
+    @property
+    def model_path(self) -> Path:
+        """File of the error model."""
+        return self.folder / "model.safetensors"
+
     @cached_property
     def sequences(self) -> StudySequences:
         """The sequences by name."""

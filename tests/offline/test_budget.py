@@ -5,10 +5,10 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from offline.budget import Clock, max_trials, spent
-from offline.campaign import train
 from offline.config import OfflineConfig
 from offline.objective import Verdict
 from offline.offline_study import load_study
+from offline.train import train
 
 
 def verdicts(*values):

@@ -13,9 +13,9 @@ import pytest
 from setups import setup_of
 
 from offline import cluster
-from offline.campaign import train
 from offline.cluster import Cluster, ClusterError
 from offline.offline_study import load_study
+from offline.train import train
 
 distributed = pytest.importorskip("distributed")
 

@@ -16,7 +16,6 @@ from adaptune.geometry import steps
 from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.study.mistakes import ConfigurationError
-from offline.campaign import train
 from offline.config import OfflineConfig
 from offline.objective import (
     SEVERITY,
@@ -32,6 +31,7 @@ from offline.objective import (
     trajectory_metrics,
 )
 from offline.offline_study import load_study
+from offline.train import train
 
 
 def config(**given):

@@ -15,8 +15,8 @@ from setups import setup_of
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
-from offline.campaign import train
 from offline.offline_study import load_study
+from offline.train import train
 from online.comparison import compare, run_replays
 
 STUDY = """\
@@ -275,7 +275,7 @@ def test_the_whole_way(make):
     study = make("pretend", "offline.trials=2")
     training = train(study)
     assert training.model.space.names == ("registration.voxel", "distance")
-    assert run_replays(study, study.folder / "model.npz") == 2
+    assert run_replays(study, study.folder / "model.safetensors") == 2
     assert {row["mode"] for row in compare(study)} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")

@@ -3,29 +3,28 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tables import table
 
 from adaptune.metrics import sub_trajectory_vectors
-from adaptune.model import ErrorModel, ModelError, PairedFusion, Selection, Settings
+from adaptune.model import ErrorModel, ModelError
 from adaptune.model.base import Rule
-from offline.campaign import train
-from offline.fusion import Drive
+from adaptune.selection import Selection
+from offline import tuning
+from offline.bank_simulation import BankSimulation
+from offline.curves import bank_curve, learning_curve
+from offline.labelled import LabelledData, LabelledSequence
+from offline.leave_one_out import BANK, LeftOut, Validation, ValidationError, leave_one_out
 from offline.offline_study import load_study
-from offline.validation import (
-    BANK,
-    LabelledSequence,
-    LeftOut,
-    Validation,
-    ValidationError,
-    bank_curve,
-    learning_curve,
-    leave_one_out,
-    training_data,
-    tune,
-    tune_bank,
-    validate,
-)
+from offline.train import train
+from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings, tune, tune_bank
+from offline.validate import validate
 
-SETS = np.linspace(0.0, 1.0, 5)[:, None]
+TRIALS = (0, 3, 4, 7, 8)
+SETS = table(np.linspace(0.0, 1.0, 5)[:, None], TRIALS)
+
+
+def labelled(sequences):
+    return LabelledData(sequences, SETS)
 
 
 def sequence(name, means, kind, rng, n=80):
@@ -43,7 +42,7 @@ def two_kinds(rng):
 
 
 def test_rules_gain_where_places_tell_the_sets_apart():
-    validation = leave_one_out(two_kinds(np.random.default_rng(0)), SETS)
+    validation = leave_one_out(labelled(two_kinds(np.random.default_rng(0))))
     for rule in ("paired", "paper"):
         np.testing.assert_allclose(validation.ratios[rule], [0.5] * 4 + [0.4] * 4, rtol=0.05)
         assert validation.verdict(rule).startswith(f"Adapt by `{rule}`")
@@ -67,7 +66,7 @@ class Cheat(Rule):
         raise NotImplementedError
 
     def select(self, _feature, _current=None):
-        return Selection(0, 0.0, 0.0)
+        return Selection(0, {})
 
 
 def test_the_sequence_left_out_is_never_seen():
@@ -77,7 +76,7 @@ def test_the_sequence_left_out_is_never_seen():
         for i, s in enumerate(sequences)
     ]
     Cheat.fitted = ()
-    leave_one_out(marked, SETS, {"cheat": lambda *_: Cheat()})
+    leave_one_out(labelled(marked), {"cheat": lambda *_: Cheat()})
     for i, data in enumerate(Cheat.fitted):
         seen = {e.tobytes() for e in data.errors}
         assert not seen & {e.tobytes() for e in marked[i].errors}
@@ -90,10 +89,10 @@ def test_a_selection_holds_for_its_second():
     class Remember(Cheat):
         def select(self, feature, _current=None):
             asked.append(feature)
-            return Selection(len(asked) % 2, 0.0, 0.0)
+            return Selection(TRIALS[len(asked) % 2], {})
 
     sequences = two_kinds(np.random.default_rng(2))[:2]
-    validation = leave_one_out(sequences, SETS, {"r": lambda *_: Remember()})
+    validation = leave_one_out(labelled(sequences), {"r": lambda *_: Remember()})
     assert len(asked) == 2 * 8
     expected = np.where(np.arange(80) // 10 % 2 == 0, 1, 0)
     np.testing.assert_allclose(
@@ -104,7 +103,7 @@ def test_a_selection_holds_for_its_second():
 def test_the_oracle_is_never_worse_than_anything():
     rng = np.random.default_rng(3)
     sequences = [sequence(str(i), rng.lognormal(size=5), i % 3, rng) for i in range(6)]
-    ratios = leave_one_out(sequences, SETS).ratios
+    ratios = leave_one_out(labelled(sequences)).ratios
     for mode in ratios:
         assert (ratios["oracle, period"] <= ratios[mode] + 1e-12).all()
 
@@ -142,17 +141,17 @@ def test_intervals_over_time():
 def test_settings_are_chosen_on_the_sequences_at_hand():
     sequences = two_kinds(np.random.default_rng(0))
     # Set 2 everywhere, 0 in one kind of place and 4 in the other.
-    assert tune(sequences, SETS) == Settings(sharpness=6.0)
+    assert tune(labelled(sequences)) == PairedSettings(sharpness=6.0)
     # Where nothing is to be gained anywhere, nothing is tried.
     same = [replace(s, errors=np.ones_like(s.errors)) for s in sequences]
-    assert tune(same, SETS) == Settings(n_sets=1)
+    assert tune(labelled(same)) == DO_NOT_ADAPT
     # The last set is good in half of the sequences, and nothing tells which.
     rng = np.random.default_rng(5)
     random = [
         sequence(str(i), [9.0, 9.0, 1.0, 9.0, 0.5 if i % 2 else 2.5], 0, rng) for i in range(8)
     ]
-    assert tune(random, SETS) == Settings(n_sets=1)
-    assert tune(sequences[:5], SETS) == Settings(n_sets=1)
+    assert tune(labelled(random)) == DO_NOT_ADAPT
+    assert tune(labelled(sequences[:5])) == DO_NOT_ADAPT
 
 
 @pytest.mark.parametrize(("odd", "pays"), [(1.04, True), (1.5, False)])
@@ -163,7 +162,7 @@ def test_no_gain_makes_up_for_harm(odd, pays):
     sequences += [sequence(f"other{i}", other, 1, rng) for i in range(8)]
     # It looks like those where the last set does well.
     sequences.append(sequence("odd", [2.0, 2.0, 1.0, 2.0, odd], 1, rng))
-    assert (tune(sequences, SETS) != Settings(n_sets=1)) is pays
+    assert (tune(labelled(sequences)) != DO_NOT_ADAPT) is pays
 
 
 def test_a_gain_that_may_be_chance_is_none():
@@ -175,22 +174,22 @@ def test_a_gain_that_may_be_chance_is_none():
         ]
 
     # Where two of eight gain, the interval of the mean holds 1; not so with six of twelve.
-    assert tune(places(2), SETS) == Settings(n_sets=1)
-    assert tune(places(6), SETS) == Settings(sharpness=6.0)
+    assert tune(labelled(places(2))) == DO_NOT_ADAPT
+    assert tune(labelled(places(6))) == PairedSettings(sharpness=6.0)
 
 
 def test_a_sequence_left_out_is_judged_on_the_sets_it_has_seen():
     sequences = two_kinds(np.random.default_rng(0))
     for i, s in enumerate(sequences):
         s.errors[:, 1 + i % 2 * 2] = np.nan
-    validation = leave_one_out(sequences, SETS)
+    validation = leave_one_out(labelled(sequences))
     for mode, ratios in validation.ratios.items():
         assert np.isfinite(ratios).all(), mode
     np.testing.assert_allclose(validation.ratios["paired"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
 
 
 def test_what_several_sets_would_be_worth():
-    validation = leave_one_out(two_kinds(np.random.default_rng(0)), SETS)
+    validation = leave_one_out(labelled(two_kinds(np.random.default_rng(0))))
     # With two sets the second is for the other kind of place, of which one more was trained on.
     np.testing.assert_allclose(
         validation.portfolio(), [1.0, 1.0, *[np.sqrt(0.5 * 0.4)] * 4], rtol=0.05
@@ -199,16 +198,16 @@ def test_what_several_sets_would_be_worth():
 
 def test_more_sequences_teach_more():
     sequences = two_kinds(np.random.default_rng(0))
-    rows = learning_curve(sequences, SETS)
+    rows = learning_curve(labelled(sequences))
     assert [row["sequences"] for row in rows] == [3, 5, 7]
     assert rows[-1]["geometric"] == pytest.approx(np.sqrt(0.5 * 0.4), rel=0.05)
     assert rows[-1]["geometric"] <= rows[0]["geometric"] + 1e-9
-    assert learning_curve(sequences, SETS) == rows
+    assert learning_curve(labelled(sequences)) == rows
 
 
 def test_one_sequence_cannot_be_validated():
     with pytest.raises(ValidationError, match="one sequence"):
-        leave_one_out(two_kinds(np.random.default_rng(0))[:1], SETS)
+        leave_one_out(labelled(two_kinds(np.random.default_rng(0))[:1]))
 
 
 def test_a_sequence_is_left_out_with_its_views():
@@ -218,22 +217,22 @@ def test_a_sequence_is_left_out_with_its_views():
         for i, s in enumerate(sequences)
     ]
     Cheat.fitted = ()
-    validation = leave_one_out([*sequences, *seen], SETS, {"cheat": lambda *_: Cheat()})
+    validation = leave_one_out(labelled([*sequences, *seen]), {"cheat": lambda *_: Cheat()})
     assert [s.name for s in validation.left_out] == [s.name for s in sequences]
     for i, data in enumerate(Cheat.fitted):
         fitted = {e.tobytes() for e in data.errors}
         assert not fitted & {e.tobytes() for e in (*sequences[i].errors, *seen[i].errors)}
         assert len(fitted) == 4 * 80
     with pytest.raises(ValidationError, match="one sequence"):
-        leave_one_out([sequences[0], seen[0]], SETS)
+        leave_one_out(labelled([sequences[0], seen[0]]))
 
 
 def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
     sequences = two_kinds(np.random.default_rng(5))
     for value, expected in (([5, 4, 3, 2, 1], 4), ([np.inf, 1, 2, 3, 4], 1)):
         judged = [replace(s, values=np.array(value, float)) for s in sequences]
-        data, _ = training_data(judged, SETS)
-        assert data.fixed == expected
+        data, _ = labelled(judged).training_data()
+        assert data.fixed == labelled(judged).fixed() == TRIALS[expected]
 
 
 def test_validates_a_study(study_file, tmp_path):
@@ -248,7 +247,7 @@ def test_validates_a_study(study_file, tmp_path):
     assert rows[2]["bank, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert [row["sequences"] for row in learning] == [1]
-    n_sets = len(ErrorModel.load(study.folder / "model.npz").sets)
+    n_sets = len(ErrorModel.load(study.model_path).sets)
     # Two sequences show nothing: no bank is driven, of whatever size.
     assert [(row["instances"], row["geometric"]) for row in banks] == [
         (size, 1.0) for size in range(2, 1 + min(6, n_sets))
@@ -268,7 +267,7 @@ def test_validates_a_study(study_file, tmp_path):
         validate(study)
 
 
-def with_drive(of, rng, n_steps=300):
+def with_motions(of, rng, n_steps=300):
     """A sequence along x on which sets 0 and 4 err in opposite directions, and set 2 in both."""
     T_ref_sensor = np.tile(np.eye(4), (n_steps, 1, 1))
     T_ref_sensor[1:, 0, 3] = 0.3 * np.arange(1, n_steps)
@@ -287,55 +286,57 @@ def with_drive(of, rng, n_steps=300):
     known = ~np.isnan(errors[0])
     described = rng.poisson(3.0, (n_steps, 90)).astype(np.float32)
     period = np.arange(n_steps) // 10
-    drive = Drive(stamps, T_ref_sensor, described, period, 10.0, 3.0, lambda m: motions[:, list(m)])
+    simulation = BankSimulation(
+        stamps, T_ref_sensor, described, period, 10.0, 3.0, lambda m: motions[:, SETS.columns(m)]
+    )
     return LabelledSequence(
         of,
         period[known],
         described[known],
         np.array(errors, np.float32).T[known],
         vectors=np.array(vectors, np.float32).transpose(1, 0, 2)[known],
-        drive=drive,
+        simulation=simulation,
     )
 
 
 def test_a_bank_gains_where_no_set_is_better_than_another():
     rng = np.random.default_rng(6)
-    sequences = [with_drive(f"s{i}", rng) for i in range(8)]
-    validation = leave_one_out(sequences, SETS, {}, bank=3)
+    sequences = [with_motions(f"s{i}", rng) for i in range(8)]
+    validation = leave_one_out(labelled(sequences), {}, bank=3)
     assert validation.modes == ["bank"]
     assert validation.summary("bank")["geometric"] < 0.5
     assert validation.verdict("bank").startswith("Adapt by `bank`")
     assert all(0.2 < left_out.adapted["bank"] < 1.0 for left_out in validation.left_out)
     # Members that are named: what cancels is not among them.
-    named = leave_one_out(sequences, SETS, {}, bank=[0, 1])
+    named = leave_one_out(labelled(sequences), {}, bank=[0, 3])
     assert 0.5 < named.summary("bank")["geometric"] < 0.9
-    banks = bank_curve(sequences, SETS)
+    banks = bank_curve(labelled(sequences))
     assert [row["instances"] for row in banks] == [2, 3, 4, 5]
     assert banks[1] == {"instances": 3} | validation.summary("bank")
-    assert BANK not in leave_one_out(sequences, SETS, bank=0).ratios
-    rows = learning_curve(sequences[:6], SETS, bank=2)
+    assert BANK not in leave_one_out(labelled(sequences), bank=0).ratios
+    rows = learning_curve(labelled(sequences[:6]), bank=2)
     assert [row["sequences"] for row in rows] == [3, 5]
     assert all(row["geometric"] == 1.0 for row in rows)  # too few to show anything
 
 
-def test_a_bank_is_driven_with_steady_weights(monkeypatch):
+def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
     rng = np.random.default_rng(8)
-    sequences = [with_drive(f"s{i}", rng) for i in range(7)]
+    sequences = [with_motions(f"s{i}", rng) for i in range(7)]
     seen = []
 
     def errors(self, _, weights):
         seen.append(weights)
         return np.full(len(self.stamps), 0.1)
 
-    def weigh(self, near):
-        weights = np.zeros((len(near.squared), len(self.candidates_)))
+    def bank_weights(near, _):
+        weights = np.zeros((len(near.fixed), near.products.shape[-1]))
         weights[::2, 0] = weights[1::2, 1] = 1.0
+        near.evidence.familiarity[:] = 1.0
         return weights, np.ones(len(weights))
 
-    monkeypatch.setattr(Drive, "errors", errors)
-    monkeypatch.setattr(PairedFusion, "weigh", weigh)
-    monkeypatch.setattr(PairedFusion, "_familiarity", lambda _, squared: np.ones(len(squared)))
-    leave_one_out(sequences, SETS, {}, bank=2)
+    monkeypatch.setattr(BankSimulation, "errors", errors)
+    monkeypatch.setattr(tuning, "bank_weights", bank_weights)
+    leave_one_out(labelled(sequences), {}, bank=2)
     # With each setting on each of the others, and then on the one left out.
     assert len(seen) == 7 * (6 * 12 + 1)
     for weights in seen:
@@ -345,20 +346,23 @@ def test_a_bank_is_driven_with_steady_weights(monkeypatch):
 
 def test_a_bank_that_does_not_pay_keeps_the_fixed_set():
     rng = np.random.default_rng(7)
-    sequences = [with_drive(f"s{i}", rng) for i in range(7)]
+    sequences = [with_motions(f"s{i}", rng) for i in range(7)]
     # All members err alike: nothing cancels.
     alike = [
         replace(
             s,
             errors=np.repeat(s.errors[:, :1], 5, axis=1),
             vectors=np.repeat(s.vectors[:, :1], 5, axis=1),
-            drive=s.drive.of(np.zeros(5, int)),
+            simulation=replace(
+                s.simulation,
+                motions=lambda m, of=s.simulation.motions: of([0] * len(m)),
+            ),
         )
         for s in sequences
     ]
-    assert tune_bank(alike, SETS, [0, 1, 2], 0) == Settings(hedge=1.0)
-    validation = leave_one_out(alike, SETS, {})
+    assert tune_bank(labelled(alike), [0, 3, 4], 0) == NO_BANK
+    validation = leave_one_out(labelled(alike), {})
     np.testing.assert_array_equal(validation.ratios["bank"], 1.0)
     assert "kept the fixed set" in validation.verdict("bank")
-    assert tune_bank(sequences[:5], SETS, [0, 4], 0).hedge == 1.0
-    assert tune_bank(sequences, SETS, [0, 4], 0).hedge < 1.0
+    assert tune_bank(labelled(sequences[:5]), [0, 8], 0).adapt is False
+    assert tune_bank(labelled(sequences), [0, 8], 0).adapt

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from adaptune.odometry import Bank, Odometry, WarmUp
 from adaptune.odometry.base import Registration
 from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
-from offline.fusion import Drive, error_vectors, recorded_motions
+from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 
 N = 60
 LENGTH = 5.0
@@ -46,10 +48,10 @@ def lost_at(i, scale=0.3):
     return trial(T, restarted)
 
 
-def driven(trials, weights, lost_track=3.0):
+def simulated(trials, weights, lost_track=3.0):
     f = frames()
     motions = recorded_motions(f, trials, lost_track)
-    drive = Drive(
+    simulation = BankSimulation(
         f.stamps,
         f.T_ref_sensor,
         f.descriptors,
@@ -58,7 +60,7 @@ def driven(trials, weights, lost_track=3.0):
         lost_track,
         lambda members: motions[:, list(members)],
     )
-    return drive, drive.errors(range(len(trials)), np.tile(weights, (6, 1)))
+    return simulation, simulation.errors(range(len(trials)), np.tile(weights, (6, 1)))
 
 
 def test_errors_are_vectors_as_long_as_they_say():
@@ -80,22 +82,22 @@ def test_errors_are_vectors_as_long_as_they_say():
 def test_members_that_err_in_opposite_directions_make_up_for_it():
     trials = [trial(straight(0.33)), trial(straight(0.27))]
     for weights, expected in (([1.0, 0.0], 10.2), ([0.5, 0.5], 0.0), ([0.0, 1.0], 10.2)):
-        _, errors = driven(trials, weights)
+        _, errors = simulated(trials, weights)
         known = errors[~np.isnan(errors)]
         assert len(known) == (~np.isnan(trials[0].errors)).sum()
         np.testing.assert_allclose(known, expected, atol=1e-6)
 
 
-def test_one_that_lost_track_is_left_out():
+def test_a_member_that_lost_track_is_left_out():
     sound, lost = trial(straight(0.33)), lost_at(20, 0.27)
-    _, errors = driven([sound, lost], [0.6, 0.4])
+    _, errors = simulated([sound, lost], [0.6, 0.4])
     np.testing.assert_allclose(errors[5:20].max(), 100 * 0.012 * 16 / LENGTH, atol=1.5)
     # If it is heard more, its failure is the bank's.
-    _, errors = driven([sound, lost], [0.1, 0.9])
+    _, errors = simulated([sound, lost], [0.1, 0.9])
     assert (errors[10:20] == 30.0).all()
     assert (errors[20:30] < 30.0).all()
     # Where all are lost, so is the bank, and agreement in that is none.
-    _, errors = driven([lost, lost_at(20)], [0.5, 0.5])
+    _, errors = simulated([lost, lost_at(20)], [0.5, 0.5])
     assert (errors[10:20] == 30.0).all()
 
 
@@ -111,11 +113,9 @@ def test_where_a_piece_of_a_trial_began_nothing_is_known():
     whole = error_vectors(frames(), trial(straight(0.33)), LENGTH)
     known = np.isfinite(whole[:, 0])
     assert (vectors[known, 0] > 0.0).all()
-    drive, errors = driven([pieces], [1.0])
+    _, errors = simulated([pieces], [1.0])
     # There the reference's motion stands in.
     assert errors[25] == pytest.approx(pieces.errors[5] * 16 / 17, rel=0.01)
-    one = drive.of(np.array([0]))
-    np.testing.assert_array_equal(one.errors([0], np.ones((6, 1))), errors)
 
 
 class Recorded(Odometry):
@@ -143,7 +143,7 @@ def test_it_is_what_a_bank_does():
     rng = np.random.default_rng(0)
     trials = [trial(straight(0.3 + rng.normal(0.0, 0.1, N - 1))) for _ in range(3)]
     weights = rng.dirichlet(np.ones(3), 6)
-    drive, _ = driven(trials, weights[0])
+    simulation, _ = simulated(trials, weights[0])
     sets = [{"number": float(i)} for i in range(3)]
     box = Bank(lambda p: Recorded(p, trials), sets, WarmUp(), 1e9)
     f = frames()
@@ -156,7 +156,6 @@ def test_it_is_what_a_bank_does():
         else:
             poses.append(box.register(prepared).T_odom_sensor)
     expected = sub_trajectory_rte(f.T_ref_sensor, np.array(poses), LENGTH)
-    alone = Drive(*vars(drive).values())
-    object.__setattr__(alone, "lost_track", 1e9)
+    alone = replace(simulation, lost_track=1e9)
     np.testing.assert_allclose(alone.errors(range(3), weights), np.minimum(expected, 30.0))
     np.testing.assert_allclose(invert(poses[0]), np.eye(4))
