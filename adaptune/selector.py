@@ -73,9 +73,7 @@ class Selector:
         self._pca = model.pca()
         weighs = bool(self.members) and rule == "paired"
         fitted = (
-            BankRule(model.bank_settings)
-            if weighs
-            else make_rule(rule, model.paired, switch_cost)
+            BankRule(model.bank_settings) if weighs else make_rule(rule, model.paired, switch_cost)
         )
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
         self._describe = Describer(model.blocks)

@@ -70,15 +70,15 @@ def serve(
     The odometry's own output goes to standard error; an odometry in a process of its own reports it
     with its faults. `docs/odometry.md` describes the messages.
     """
-    from adaptune.odometry import process, wire
+    from adaptune.odometry import serving
 
     if listen is not None:
         if odometry is None:
             raise AdaptuneError("--listen serves one odometry: give its name")
-        process.listen(listen, odometry, lambda at: say(f"{odometry} at {at}"))
+        serving.listen(listen, odometry, lambda at: say(f"{odometry} at {at}"))
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        wire.serve(sys.stdin.buffer, writer, odometry, process.anywhere)
+        serving.serve(sys.stdin.buffer, writer, odometry)
 
 
 def show(

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 import drives
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.odometry.gicp import crop
+from adaptune.odometry.keyframe import crop
 from adaptune.simulation import record
 from offline import train as training
 from offline.offline_study import OfflineStudy, load_study

@@ -25,7 +25,10 @@ import small_gicp
 from adaptune import cores, open3d
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import BOXES, Box, HandOver, Isolated, Limits, WarmUp, box_class
+from adaptune.odometry import OdometryInstance, WarmUp
+from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.sequence import Scan, SequenceError, open_sequence
 from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course, as_sequence
@@ -89,7 +92,7 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
 
 
 def drive(
-    box: Box, scans: list[Scan], before: Callable[[int], None] = lambda _: None
+    box: OdometryInstance, scans: list[Scan], before: Callable[[int], None] = lambda _: None
 ) -> tuple[Poses, float]:
     """Poses, and what a scan took in milliseconds of processors' time, the median."""
     box.start(box.prepare(scans[0]), np.eye(4))
@@ -102,7 +105,7 @@ def drive(
     return np.array(poses), 1e3 * float(np.median(np.diff(at)))
 
 
-def computed(box: Box) -> float:
+def computed(box: OdometryInstance) -> float:
     """Seconds of processors' time, here and in the other process if there is one."""
     return time.process_time() + (box.cpu if isinstance(box, Isolated) else 0.0)
 
@@ -110,7 +113,7 @@ def computed(box: Box) -> float:
 def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     """Poses, milliseconds a scan, and those of them not in the odometry's own code; medians."""
     clock = Clock()
-    box: Any = box_class(name)()
+    box: Any = odometry_class(name)()
     box.start(box.prepare(scans[0]), np.eye(4))
     originals = small_gicp.align, small_gicp.preprocess_points
     registration = open3d.load().pipelines.registration
@@ -140,8 +143,8 @@ def adapters(path: Path, length: float) -> None:
     """Print a row for every odometry."""
     scans, T_ref = read(path)
     print("odometry          RTE %   ms   adapter ms    +process ms   changes by")
-    for name in BOXES:
-        cls = box_class(name)
+    for name in ODOMETRIES:
+        cls = odometry_class(name)
         try:
             poses, whole, added = own_time(name, scans)
         except Exception as error:
@@ -162,7 +165,10 @@ def adapters(path: Path, length: float) -> None:
 
 
 def rte_of(
-    box: Box, scans: list[Scan], T_ref: Poses, switch: Callable[[int], None] | None = None
+    box: OdometryInstance,
+    scans: list[Scan],
+    T_ref: Poses,
+    switch: Callable[[int], None] | None = None,
 ) -> float:
     """RTE in percent of a box that is made to switch every so often."""
     first = scans[0].stamp
@@ -189,9 +195,9 @@ def switching(path: Path, names: list[str]) -> None:
     heads = [f"{w.seconds:.0f} s" for w in WARM_UPS[:-1]] + ["sparse"]
     print("odometry           alone " + "".join(f"{head:>10}" for head in heads) + "   itself")
     for name in names:
-        cls = box_class(name)
+        cls = odometry_class(name)
 
-        def make(_: Any, name: str = name, cls: Any = cls) -> Box:
+        def make(_: Any, name: str = name, cls: Any = cls) -> OdometryInstance:
             return cls() if cls.clean else Isolated(name, {}, cls.settings_type(), Limits())
 
         row = [rte_of(make({}), scans, T_ref)]

@@ -28,7 +28,9 @@ from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
 from adaptune.model.paired import ERROR_FLOOR
-from adaptune.odometry import Bank, Box, HealthCheck, WarmUp
+from adaptune.odometry import OdometryInstance, WarmUp
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.health import HealthCheck
 from adaptune.sequence import Scan
 from adaptune.simulation import Course, simulate
 from adaptune.space import ParameterSet
@@ -71,7 +73,7 @@ def geometric(data: TrainingData) -> int:
     return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
 
 
-Way = tuple[Callable[[], Box], Policy | None]
+Way = tuple[Callable[[], OdometryInstance], Policy | None]
 """What is driven, and what chooses its parameters."""
 
 

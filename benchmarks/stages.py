@@ -21,8 +21,8 @@ from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
-from adaptune.odometry import HealthCheck
-from adaptune.odometry.gicp import crop
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.keyframe import crop
 from adaptune.sequence import Scan, SequenceConfig, open_sequence
 from adaptune.trajectory import read_kitti
 from offline.offline_study import OfflineStudy, load_study

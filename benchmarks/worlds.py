@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import Odometry, box_class
+from adaptune.odometry import Odometry
+from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, Course, simulate
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
@@ -64,7 +65,7 @@ def measure(
     T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
     costs = {}
     for name in odometries:
-        cls = box_class(name)
+        cls = odometry_class(name)
         prepared = [cls().prepare(scan) for scan in scans]
         costs[name] = []
         for parameters in parameter_sets(name):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.geometry import Poses, invert, mean_motion, steps
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
-from adaptune.odometry.switching import agreement, share
+from adaptune.odometry.bank import agreement, share
 
 
 def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ always return to the driver.
 
 import base64
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import io
@@ -249,8 +250,9 @@ def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
     given = {f.name: getattr(setup.sequences, f.name) for f in dataclasses.fields(StudySequences)}
     given["folder"] = setup.sequences.folder.absolute()
     sequences, odometry = AwaySequences(**given, digests=digests), setup.odometry
-    if odometry.material is not None:
-        odometry = dataclasses.replace(odometry, material=sequences.material)
+    if odometry.program_input is not None:
+        odometry = copy.copy(odometry)
+        odometry.program_input = sequences.program_input
     return TrialSetup(setup.settings, odometry, sequences)
 
 

@@ -12,7 +12,6 @@ from adaptune.archive import Archive
 from adaptune.cores import available
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
-from adaptune.odometry import versions
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import ParameterSet
 from offline.budget import BUDGETS
@@ -129,7 +128,7 @@ def _fit(
     settings = study.config.offline.model_dump(
         mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
     )
-    provenance = {"versions": versions(study.odometry.odometry_class)} | settings
+    provenance = {"versions": study.odometry.versions} | settings
     length = study.config.sub_trajectory
     model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
     model = tuned(model, data, study.config.online.switching)

@@ -1,7 +1,7 @@
 """One parameter set on one sequence, or several at once on one pass over it."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, Self
 
@@ -15,10 +15,9 @@ from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
-from adaptune.odometry import Box, HealthCheck, Isolated
-from adaptune.odometry.base import prepared_bytes
+from adaptune.odometry.base import OdometryInstance, prepared_bytes
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.health import unhealthy
+from adaptune.odometry.health import HealthCheck, unhealthy
 from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
@@ -108,7 +107,7 @@ class PreparedSequence:
         self,
         name: str,
         scans: sequence.Sequence,
-        odometry: Callable[..., Box],
+        odometry: OdometryFactory,
         settings: TrialSettings,
         memory: float,
     ):
@@ -214,7 +213,12 @@ class _Run:
     """A run of an odometry on a piece of a sequence, from frame `begin` to before `end`."""
 
     def __init__(
-        self, odometry: Box, frames: Frames, lost_track: float | None, begin: int, end: int
+        self,
+        odometry: OdometryInstance,
+        frames: Frames,
+        lost_track: float | None,
+        begin: int,
+        end: int,
     ):
         n = len(frames.stamps)
         self.odometry = odometry
@@ -224,15 +228,9 @@ class _Run:
         self.registered = np.ones(n, bool)
         self.seconds = np.zeros(n)
         self.lost_steps: dict[int, Poses] = {}
-        self._cpu = 0.0
         self._T_ref_sensor = frames.T_ref_sensor
         self._T_ref_steps = steps(frames.T_ref_sensor)
         self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
-
-    @property
-    def cpu(self) -> float:
-        """Seconds that the odometry has computed."""
-        return self.odometry.cpu if isinstance(self.odometry, Isolated) else self._cpu
 
     def step(self, i: int, prepared: Any) -> None:
         if i == self.begin:
@@ -241,10 +239,9 @@ class _Run:
             self.odometry.start(prepared, T)
             self.T_odom_sensor[i] = T
             return
-        begin, begin_cpu = time.perf_counter(), time.process_time()
+        begin = time.perf_counter()
         T, self.registered[i] = self.odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
-        self._cpu += time.process_time() - begin_cpu
         finite = np.isfinite(T).all()
         # An odometry without a pose counts as not moved.
         T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
@@ -308,7 +305,7 @@ class Scans(Protocol):
 
 def run_trials(
     settings: TrialSettings,
-    odometry: Callable[..., Box],
+    odometry: OdometryFactory,
     scans: Scans,
     sets: Sequence[ParameterSet],
     whole: bool = False,
@@ -339,7 +336,7 @@ def run_trials(
         pieces = episodes(frames.T_ref_sensor, settings.sub_trajectory)
     lost_track = settings.lost_track if kind == "restart" else None
 
-    def make(parameters: ParameterSet) -> Box:
+    def make(parameters: ParameterSet) -> OdometryInstance:
         return odometry(parameters, scans.name, isolated=settings.isolated)
 
     # For every set every repeat, and for every repeat every piece.
@@ -381,7 +378,7 @@ def _trial(
         restarted[own], registered[own] = run.restarted[own], run.registered[own]
         seconds[own] = run.seconds[own]
         lost_steps |= run.lost_steps
-        cpu += run.cpu * (own.stop - own.start) / (run.end - run.begin)
+        cpu += run.odometry.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
         if after is not None:
             T = run.T_odom_sensor
             lost_steps[after.begin] = invert(T[after.begin - 1]) @ T[after.begin]
@@ -395,7 +392,7 @@ def _trial(
         restarted,
         registered,
         seconds,
-        tuple(fault for run in pieces for fault in getattr(run.odometry, "faults", ())),
+        tuple(fault for run in pieces for fault in run.odometry.faults),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
         _usage(cpu, (frames.stamps[-1] - frames.stamps[0]) * 1e-9, pieces),
         unhealthy=unhealthy(settings.health, T_steps, frames.stamps, registered),
@@ -405,9 +402,9 @@ def _trial(
 def _usage(cpu: float, duration: float, pieces: Sequence[_Run]) -> dict[str, float]:
     """Percent of a core, and megabytes where the odometry has a process of its own."""
     usage = {"cpu": 100.0 * cpu / duration}
-    isolated = [run.odometry for run in pieces if isinstance(run.odometry, Isolated)]
-    if isolated:
-        usage["memory"] = max(odometry.memory for odometry in isolated)
+    memory = [run.odometry.usage.memory for run in pieces]
+    if known := [megabytes for megabytes in memory if megabytes is not None]:
+        usage["memory"] = max(known)
     return usage
 
 

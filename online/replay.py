@@ -4,19 +4,28 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
-from adaptune.odometry.base import OdometryInstance
+from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.selection import Selection
-from adaptune.selector import Selector
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
+
+
+class Selects(Protocol):
+    """What `adaptune.selector.Selector` offers to a replay; see there."""
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan."""
+
+    def select(self) -> Selection:
+        """Choose what to apply."""
 
 
 class Choice(NamedTuple):
@@ -156,7 +165,7 @@ def replay(
     scans: Iterable[Scan],
     odometry: OdometryInstance,
     health: HealthCheck,
-    selector: Selector | None = None,
+    selector: Selects | None = None,
     period: float = 1.0,
     progress: Callable[[], None] = lambda: None,
 ) -> Replay:
@@ -179,6 +188,8 @@ def replay(
         Seconds between selections.
     progress
         Called after every scan.
+    members
+        Of a bank, the sets that the weights of a selection belong to.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""What it costs to change parameters on the way, measured for a study's odometry."""
+"""What it costs to change parameters between scans, measured for a study's odometry."""
 
 import itertools
 import json
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,9 +11,13 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.model import Selection
-from adaptune.odometry import Bank, Box, HandOver, WarmUp
-from adaptune.sequence import Scan
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.health import HealthCheck
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 from adaptune.study.study import Study
 from online.replay import replay
@@ -28,6 +32,44 @@ PERIOD = 5.0
 """Seconds between switches."""
 
 
+class Mechanism(NamedTuple):
+    """A way to change parameters.
+
+    Attributes
+    ----------
+    make : callable
+        Makes a new odometry.
+    sets : tuple of dict
+        The sets to switch between; empty for no switches.
+    """
+
+    make: Callable[[], OdometryInstance]
+    sets: tuple[ParameterSet, ...]
+
+
+class Recording(NamedTuple):
+    """The beginning of a sequence, and what its errors are measured by."""
+
+    name: str
+    scans: Sequence[Scan]
+    T_ref_sensor: Poses
+    length: float
+
+
+class Alternating:
+    """Selects each set in turn."""
+
+    def __init__(self, sets: Sequence[ParameterSet]):
+        self._turns = itertools.cycle(enumerate(sets))
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """Ignore the scan."""
+
+    def select(self) -> Selection:
+        """Take the next set."""
+        return Selection(*next(self._turns))
+
+
 def measure_switching(
     study: Study, seconds: float = 60.0, progress: Progress = lambda *_: None
 ) -> list[dict[str, Any]]:
@@ -40,7 +82,7 @@ def measure_switching(
     seconds
         How much of every training sequence is used.
     progress
-        Told about every scan.
+        Called about every scan.
 
     Returns
     -------
@@ -54,26 +96,28 @@ def measure_switching(
         If a sequence is too short, or its reference unknown.
     """
     study.open()
-    ratios: dict[str, list[float]] = {}
-    times: dict[str, list[float]] = {}
+    warm_up, catch_up_scans = study.warm_up, study.config.online.switching.catch_up_scans
+    mechanisms = _mechanisms(study.odometry, warm_up, catch_up_scans)
+    ratios: dict[str, list[float]] = {what: [] for what in mechanisms}
+    times: dict[str, list[float]] = {what: [] for what in mechanisms}
     for name in study.config.training:
-        scans, T_ref_sensor = _read(study, name, seconds)
-        alone = 0.0
-        for what, make in _mechanisms(study).items():
-            box, sets = make()
-            error, ms = _drive(study, f"{name}, {what}", scans, T_ref_sensor, box, sets, progress)
-            alone = alone or error
-            ratios.setdefault(what, []).append(error / max(alone, 1e-12))
-            times.setdefault(what, []).append(ms)
+        recording = _read(study, name, seconds)
+        without = 0.0
+        for what, mechanism in mechanisms.items():
+            error, ms = _measure(recording, what, mechanism, study.config.health, progress)
+            without = without or error
+            ratios[what].append(error / max(without, 1e-12))
+            times[what].append(ms)
     means = {what: float(np.exp(np.mean(np.log(r)))) for what, r in ratios.items()}
     rows: list[dict[str, Any]] = [
         {"mechanism": what, "RTE ratio": mean, "ms a scan": float(np.mean(times[what]))}
         | dict(zip(study.config.training, ratios[what], strict=True))
         for what, mean in means.items()
     ]
+    own = _name(warm_up) if study.mechanism == "hand_over" else study.mechanism
     found = {
         "of": study.switching_identity(),
-        "switch_cost": means[_own(study)] - 1.0,
+        "switch_cost": means[own] - 1.0,
         "seconds": seconds,
         "rows": rows,
     }
@@ -81,7 +125,7 @@ def measure_switching(
     return rows
 
 
-def _read(study: Study, name: str, seconds: float) -> tuple[list[Scan], Poses]:
+def _read(study: Study, name: str, seconds: float) -> Recording:
     sequence = study.sequences.open(name)
     scans: list[Scan] = []
     for scan in sequence:
@@ -91,82 +135,61 @@ def _read(study: Study, name: str, seconds: float) -> tuple[list[Scan], Poses]:
     reference = sequence.reference()
     if reference is None:
         raise AdaptuneError(f"sequences.{name}: has no reference to measure errors against")
-    return scans, reference.at(np.array([scan.stamp for scan in scans], np.int64))
+    T_ref_sensor = reference.at(np.array([scan.stamp for scan in scans], np.int64))
+    return Recording(name, scans, T_ref_sensor, study.config.sub_trajectory)
 
 
-Driven = tuple[Box, list[ParameterSet] | None]
-"""What is driven, and the sets that it changes between."""
+def _mechanisms(
+    odometry: OdometryFactory, warm_up: WarmUp, catch_up_scans: int
+) -> dict[str, Mechanism]:
+    """Each mechanism that the odometry can have, by name; the first never switches."""
 
+    def same(_: ParameterSet) -> OdometryInstance:
+        return odometry()
 
-def _mechanisms(study: Study) -> dict[str, Callable[[], Driven]]:
-    """By name, what makes each mechanism that the odometry can have; the first never switches."""
-
-    def same(_: ParameterSet) -> Box:
-        return study.odometry()
+    def hand_over(warm_up: WarmUp) -> Mechanism:
+        return Mechanism(lambda: HandOver(same, names[0], warm_up, catch_up_scans), names)
 
     # Sets that differ in name only.
-    names: list[ParameterSet] = [{"number": 0}, {"number": 1}]
-
-    def hand_over(warm_up: WarmUp) -> Callable[[], Driven]:
-        return lambda: (HandOver(same, names[0], warm_up, catch_up_scans), names)
-
-    catch_up_scans = study.config.online.switching.catch_up_scans
-    warm_ups = dict.fromkeys([*(WarmUp(s, s, 1) for s in WARM_UPS), study.warm_up])
-    made: dict[str, Callable[[], Driven]] = {"none": lambda: (study.odometry(), None)}
-    if study.odometry.description.live:
-        made["live"] = lambda: (study.odometry(), _alike(study.odometry.space.baseline))
-    made |= {_say(warm_up): hand_over(warm_up) for warm_up in warm_ups}
-    made["bank"] = lambda: (Bank(same, names, study.warm_up), names)
+    names: tuple[ParameterSet, ...] = ({"number": 0}, {"number": 1})
+    made = {"none": Mechanism(odometry, ())}
+    if odometry.description.live:
+        made["live"] = Mechanism(odometry, _alike(odometry.space.baseline))
+    warm_ups = dict.fromkeys([*(WarmUp(s, s, 1) for s in WARM_UPS), warm_up])
+    made |= {_name(one): hand_over(one) for one in warm_ups}
+    bank = dict(enumerate(names))
+    made["bank"] = Mechanism(lambda: Bank(same, bank, warm_up), names)
     return made
 
 
-def _alike(parameters: ParameterSet) -> list[ParameterSet]:
-    """Two sets that differ so little that only the change itself tells."""
+def _alike(parameters: ParameterSet) -> tuple[ParameterSet, ...]:
+    """Two sets that differ so little that only the change itself has an effect."""
     nearly = {n: v * (1 + 1e-9) if isinstance(v, float) else v for n, v in parameters.items()}
-    return [parameters, nearly]
+    return parameters, nearly
 
 
-def _say(warm_up: WarmUp) -> str:
+def _name(warm_up: WarmUp) -> str:
     seconds, full_rate, stride = warm_up
     sparse = "" if stride == 1 or full_rate >= seconds else f", {full_rate:g} s in full"
     return f"hand_over, {seconds:g} s{sparse}"
 
 
-def _own(study: Study) -> str:
-    """Name of the mechanism that the study uses."""
-    return _say(study.warm_up) if study.mechanism == "hand_over" else study.mechanism
-
-
-def _drive(
-    study: Study,
-    what: str,
-    scans: Sequence[Scan],
-    T_ref_sensor: Poses,
-    box: Box,
-    sets: list[ParameterSet] | None,
-    progress: Progress,
+def _measure(
+    recording: Recording, what: str, mechanism: Mechanism, health: HealthCheck, progress: Progress
 ) -> tuple[float, float]:
     """Mean RTE in percent, and mean milliseconds a scan."""
-    turns, done = itertools.count(), itertools.count(1)
-
-    def policy(*_: object) -> Selection:
-        return Selection(next(turns) % 2, 0.0, 0.0)
-
+    done, n, what = itertools.count(1), len(recording.scans), f"{recording.name}, {what}"
+    selector = Alternating(mechanism.sets) if mechanism.sets else None
+    odometry = mechanism.make()
     result = replay(
-        scans,
-        box,
-        study.config.health,
-        None if sets is None else policy,
-        sets,
-        PERIOD,
-        lambda: progress(what, next(done), len(scans)),
+        recording.scans, odometry, health, selector, PERIOD, lambda: progress(what, next(done), n)
     )
-    errors = sub_trajectory_rte(
-        T_ref_sensor, result.trajectory.T_world_sensor, study.config.sub_trajectory
-    )
+    odometry.close()
+    T_odom_sensor = result.trajectory.T_world_sensor
+    errors = sub_trajectory_rte(recording.T_ref_sensor, T_odom_sensor, recording.length)
     if np.isnan(errors).all():
         raise AdaptuneError(
-            f"{what}: holds no sub-trajectory of {study.config.sub_trajectory:g} m; make "
-            f"sub_trajectory shorter, or give --seconds more"
+            f"{what}: holds no sub-trajectory of {recording.length:g} m; make sub_trajectory "
+            f"shorter, or give --seconds more"
         )
-    return float(np.nanmean(errors)), 1e3 * result.seconds / len(scans)
+    return float(np.nanmean(errors)), 1e3 * result.seconds / n

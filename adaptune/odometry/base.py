@@ -1,14 +1,18 @@
-"""What every odometry must do to be tuned."""
+"""What every odometry offers, and the base class of adapters."""
 
+import functools
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses, invert, rectify
-from adaptune.sequence import Scan
+from adaptune.geometry import Poses, invert
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
 
@@ -17,7 +21,7 @@ class OdometryError(AdaptuneError):
 
 
 class BaseSettings(BaseModel):
-    """What is set once for a study and not tuned."""
+    """What a study sets once and does not tune."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,9 +34,9 @@ class WarmUp(NamedTuple):
     seconds : float
         How far back they go.
     full_rate : float
-        Seconds of the most recent ones, of which it sees all.
+        Of the most recent scans, those of so many seconds are all seen.
     stride : int
-        Every how many of those before it sees.
+        Of the scans before, every so many is seen.
     """
 
     seconds: float = 12.0
@@ -48,11 +52,42 @@ class Registration(NamedTuple):
     T_odom_sensor : ndarray of shape (4, 4)
         Pose at the scan's stamp.
     registered : bool
-        False if the scan was too poor to register: the pose then goes on with the last motion.
+        False if the scan was too poor to register: the last motion then goes on.
     """
 
     T_odom_sensor: Poses
     registered: bool = True
+
+
+class Usage(NamedTuple):
+    """What an odometry has used so far.
+
+    Attributes
+    ----------
+    cpu : float
+        Seconds of CPU time.
+    memory : float or None
+        Peak megabytes of the odometry's own processes; None if it shares this process.
+    """
+
+    cpu: float
+    memory: float | None
+
+
+class Motions(NamedTuple):
+    """How the sensor moved over the last scan, before any health check.
+
+    Attributes
+    ----------
+    T_previous_current : ndarray of shape (4, 4)
+        Motion of the odometry or of the whole bank. NaN if there was no pose. After a start it is
+        the motion that `start` received, or the identity.
+    members : dict of ndarray
+        The same for each member of a bank, by trial number; empty for single odometries.
+    """
+
+    T_previous_current: Poses
+    members: Mapping[int, Poses]
 
 
 class Description(NamedTuple):
@@ -61,7 +96,7 @@ class Description(NamedTuple):
     Attributes
     ----------
     space : ParameterSpace or None
-        What can be tuned; None where that is the study's to define.
+        The parameters that can be tuned; None if the study defines them.
     live : bool
         See `Odometry`.
     needs_imu : bool
@@ -69,7 +104,7 @@ class Description(NamedTuple):
     warm_up : WarmUp
         See `Odometry`.
     whole : bool
-        Whether it runs whole recordings only, and so with one parameter set from end to end.
+        Whether it runs whole recordings only, with one parameter set from end to end.
     """
 
     space: ParameterSpace | None
@@ -79,8 +114,24 @@ class Description(NamedTuple):
     whole: bool = False
 
 
-class Box(Protocol):
-    """What can be driven through a recording, see `Odometry` for what each method does."""
+class OdometryInstance(Protocol):
+    """An odometry that runs along a sequence: in this process, in another one, or a bank of them.
+
+    `submit` and `collect` let several instances in other processes work at the same time. After
+    `close`, `prepare` still works and `start` begins again.
+    """
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """What went wrong so far. The poses of scans with a fault are NaN."""
+
+    @property
+    def usage(self) -> Usage:
+        """CPU time and memory so far."""
+
+    @property
+    def motions(self) -> Motions:
+        """Motions over the last scan."""
 
     def prepare(self, scan: Scan) -> Any:
         """See `Odometry.prepare`."""
@@ -90,43 +141,169 @@ class Box(Protocol):
     ) -> None:
         """See `Odometry.start`."""
 
+    def submit(self, prepared: Any) -> None:
+        """Begin to register the next scan."""
+
+    def collect(self) -> Registration:
+        """Wait for the pose of the submitted scan."""
+
     def register(self, prepared: Any) -> Registration:
-        """See `Odometry.register`."""
+        """Find the pose of the next scan: submit it, then collect."""
 
-    def configure(self, parameters: ParameterSet) -> None:
-        """See `Odometry.configure`."""
+    def apply(self, selection: Selection) -> None:
+        """Change to what was selected, before the next scan.
+
+        A single odometry takes the parameters. A bank takes the weights; if there are none, the
+        member with the selected trial gets all the weight.
+
+        Raises
+        ------
+        OdometryError
+            If the odometry cannot change its parameters, or a bank does not hold the set.
+        """
+
+    def close(self) -> None:
+        """End all processes of this odometry."""
 
 
-class Odometry(ABC):
-    """A LiDAR odometry, seen from outside.
+class _Record:
+    """The last two poses of an instance, and the CPU time of its registrations."""
+
+    def __init__(self) -> None:
+        self.active = False
+        self.cpu = 0.0
+        self._started_with: Poses | None = np.eye(4)
+        self._T_before = self._T_now = np.eye(4)
+
+    def call(self, method: Callable[..., Any], *arguments: Any) -> tuple[Any, bool]:
+        """Call a method. False if it is part of another call, which is recorded instead."""
+        if self.active:
+            return method(*arguments), False
+        self.active = True
+        try:
+            return method(*arguments), True
+        finally:
+            self.active = False
+
+    def start(self, T_odom_sensor: Poses, T_previous_current: Poses | None) -> None:
+        self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
+        self._T_now = np.array(T_odom_sensor)
+
+    def register(self, T_odom_sensor: Poses) -> None:
+        # A copy, in case the odometry changes its pose in place.
+        self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor)
+        self._started_with = None
+
+    @property
+    def motion(self) -> Poses:
+        if self._started_with is not None:
+            return self._started_with
+        return invert(self._T_before) @ self._T_now
+
+
+def _recorded_start(start: Callable[..., None]) -> Callable[..., None]:
+    @functools.wraps(start)
+    def recorded(
+        self: "Recorded",
+        prepared: Any,
+        T_odom_sensor: Poses,
+        T_previous_current: Poses | None = None,
+    ) -> None:
+        record = self._odometry_record
+        if record.call(start, self, prepared, T_odom_sensor, T_previous_current)[1]:
+            record.start(T_odom_sensor, T_previous_current)
+
+    return recorded
+
+
+def _recorded_registration(register: Callable[..., Registration]) -> Callable[..., Registration]:
+    @functools.wraps(register)
+    def recorded(self: "Recorded", *prepared: Any) -> Registration:
+        record, begin = self._odometry_record, time.process_time()
+        registration: Registration
+        registration, outermost = record.call(register, self, *prepared)
+        if outermost:
+            record.cpu += time.process_time() - begin
+            record.register(registration.T_odom_sensor)
+        return registration
+
+    return recorded
+
+
+class Recorded(ABC):
+    """Records motion and CPU time, whatever a subclass does to find poses.
+
+    For that it wraps `start`, `register` and `collect` of each subclass.
+    """
+
+    def __init_subclass__(cls, **keywords: Any):
+        super().__init_subclass__(**keywords)
+        for name in ("start", "register", "collect"):
+            if method := vars(cls).get(name):
+                wrap: Any = _recorded_start if name == "start" else _recorded_registration
+                setattr(cls, name, wrap(method))
+
+    @functools.cached_property
+    def _odometry_record(self) -> _Record:
+        return _Record()
+
+    @property
+    def usage(self) -> Usage:
+        """CPU time of the registrations; the memory is that of this process."""
+        return Usage(self._odometry_record.cpu, None)
+
+    @property
+    def motions(self) -> Motions:
+        """See `OdometryInstance.motions`."""
+        return Motions(self._odometry_record.motion, {})
+
+    @abstractmethod
+    def submit(self, prepared: Any) -> None:
+        """See `OdometryInstance.submit`."""
+
+    @abstractmethod
+    def collect(self) -> Registration:
+        """See `OdometryInstance.collect`."""
+
+    def register(self, prepared: Any) -> Registration:
+        """See `OdometryInstance.register`."""
+        self.submit(prepared)
+        return self.collect()
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to close
+        """See `OdometryInstance.close`."""
+
+
+class Odometry(Recorded):
+    """A LiDAR odometry in this process; base class of adapters.
 
     A new instance knows nothing; `start` places it, `register` moves it on scan by scan. All of
-    it runs on one thread, so that the same scans give the same poses.
+    it runs on one thread, so that the same scans give the same poses. An adapter implements
+    `prepare`, `start` and `register`, and `configure` if it is `live`.
 
     Attributes
     ----------
     space : ParameterSpace
-        What can be tuned, with sensible ranges; class attribute.
+        The parameters that can be tuned, with sensible ranges; class attribute.
     settings_type : type
-        What is set once, as a pydantic model; class attribute.
+        Pydantic model of what is set once; class attribute.
     live : bool
         Whether `configure` may be called between scans; class attribute.
     clean : bool
         Whether a second instance in the same process knows nothing of the first, and no scan ends
-        the process; class attribute. One that is not known to be clean runs in a process of its
-        own.
+        the process; class attribute. Others run in a process of their own.
     needs_imu : bool
         Whether scans must bring along what an IMU measured; class attribute.
     warm_up : WarmUp
-        What serves where a new instance takes over, unless a study says otherwise; class attribute.
+        The warm-up of a new instance that takes over, unless a study sets another; class attribute.
     parameters : dict
         The present value of every parameter in `space`.
 
     Parameters
     ----------
     parameters
-        Values of any of the parameters in `space`; the others keep their baseline. Values
-        outside the range in `space` are the caller's to judge.
+        Values of any of the parameters in `space`; the others keep their baseline. The caller
+        checks ranges.
     settings
         An instance of `settings_type`.
 
@@ -142,6 +319,7 @@ class Odometry(ABC):
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
     warm_up: ClassVar[WarmUp] = WarmUp()
+    faults: Sequence[str] = ()
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -151,15 +329,14 @@ class Odometry(ABC):
 
     @classmethod
     def describe(cls, settings: Any) -> Description:  # noqa: ARG003
-        """What a study must know of it, with these settings."""
+        """What a study must know of the odometry with these settings."""
         return Description(cls.space, cls.live, cls.needs_imu, cls.warm_up)
 
     @abstractmethod
     def prepare(self, scan: Scan) -> Any:
         """Do to a scan all that does not depend on parameters, pose or earlier scans.
 
-        What it returns serves every instance with the same settings, and must not be changed by
-        any.
+        All instances with the same settings share the result, and none may change it.
         """
 
     @abstractmethod
@@ -171,20 +348,32 @@ class Odometry(ABC):
         Parameters
         ----------
         prepared
-            A scan, prepared.
+            A prepared scan.
         T_odom_sensor
-            Where the sensor is, of shape (4, 4).
+            Pose of the sensor, of shape (4, 4).
         T_previous_current
-            The last motion, of shape (4, 4), for odometries that predict by it; none means that
-            the sensor stood still.
+            The last motion, of shape (4, 4), for odometries that predict by it; None if the sensor
+            stood still.
         """
 
     @abstractmethod
     def register(self, prepared: Any) -> Registration:
         """Find the pose of the next scan."""
 
+    def submit(self, prepared: Any) -> None:
+        """See `OdometryInstance.submit`; `collect` does the work."""
+        self.__submitted = prepared
+
+    def collect(self) -> Registration:
+        """See `OdometryInstance.collect`."""
+        return self.register(self.__submitted)
+
+    def apply(self, selection: Selection) -> None:
+        """See `OdometryInstance.apply`."""
+        self.configure(selection.parameters)
+
     def configure(self, parameters: ParameterSet) -> None:
-        """Change parameters between scans; those not named stay.
+        """Change parameters between scans; the others stay.
 
         Raises
         ------
@@ -203,60 +392,6 @@ class Odometry(ABC):
                     f"{nearest(name, self.space.names)}"
                 )
         return parameters
-
-
-class Anchored(Odometry):
-    """An odometry that can only begin at rest, in a frame of its own, and with a usable scan.
-
-    Its own frame is placed by the first pose that comes back. Where none comes back, the last
-    motion goes on.
-    """
-
-    @abstractmethod
-    def _usable(self, prepared: Any) -> bool:
-        """Whether it can begin with a scan."""
-
-    @abstractmethod
-    def _begin(self, prepared: Any) -> None:
-        """Make a new one for a usable scan, which it is handed next."""
-
-    @abstractmethod
-    def _hand_over(self, prepared: Any) -> Poses | None:
-        """Hand a scan over, usable or not, and return ``T_own_sensor`` if a pose comes back."""
-
-    def start(
-        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None:
-        """See `Odometry.start`."""
-        self._T_odom_sensor = T_odom_sensor
-        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
-        self._T_odom_own: Poses | None = None
-        self._begun = False
-        self._go_on(prepared)
-
-    def register(self, prepared: Any) -> Registration:
-        """See `Odometry.register`."""
-        T_odom_previous = self._T_odom_sensor
-        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
-        registered = self._go_on(prepared)
-        if registered:
-            self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
-        return Registration(self._T_odom_sensor, registered)
-
-    def _go_on(self, prepared: Any) -> bool:
-        """Correct the predicted pose, and tell whether there was something to correct it by."""
-        if not self._begun:
-            if not self._usable(prepared):
-                return False
-            self._begin(prepared)
-            self._begun = True
-        T_own_sensor = self._hand_over(prepared)
-        if T_own_sensor is None:
-            return False
-        if self._T_odom_own is None:
-            self._T_odom_own = self._T_odom_sensor @ invert(T_own_sensor)
-        self._T_odom_sensor = self._T_odom_own @ T_own_sensor
-        return True
 
 
 def prepared_bytes(prepared: Any) -> int:

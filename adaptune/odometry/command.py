@@ -1,9 +1,6 @@
-"""Odometries that are programs: a recording and a parameter file in, a trajectory out."""
+"""Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
 import contextlib
-import fcntl
-import json
-import logging
 import os
 import shutil
 import signal
@@ -11,37 +8,39 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from logging import getLogger
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
-from adaptune.files import replacing_folder
-from adaptune.geometry import Poses, invert, rotation_angle
-from adaptune.metrics import window_ends
-from adaptune.odometry.base import BaseSettings, Description, OdometryError, Registration
+from adaptune.geometry import Poses, invert
+from adaptune.odometry.base import BaseSettings, Description, OdometryError, Recorded, Registration
+from adaptune.odometry.frame_check import check_frame
 from adaptune.odometry.isolation import (
     ONE_THREAD,
     Arguments,
     Limits,
     bounded,
     last_lines,
-    nonsense,
+    pose_fault,
     verdict,
 )
+from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.template import Template, check_names, placeholders, replace
-from adaptune.sequence import Scan, Sequence, SequenceConfig
+from adaptune.selection import Selection
 from adaptune.sequence.config import Transform, resolve, to_pose
-from adaptune.sequence.export import IMU, POINTS, Layout, export
+from adaptune.sequence.export import Layout
+from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, nearest
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tum
 
-_log = logging.getLogger(__name__)
+_log = getLogger(__name__)
 
 _COVERAGE = 0.9
-"""Share of the scans for which a whole trajectory has poses."""
+"""Least share of the scans for which a program must write poses."""
 
 _PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
 
@@ -53,19 +52,19 @@ class Settings(BaseSettings):
     ----------
     command : list of str
         The program and its arguments. In these ``{input}`` is the recording, ``{parameters}`` the
-        file made of the template, ``{output}`` where the trajectory shall be, ``{points}`` and
+        file made from the template, ``{output}`` the path of the trajectory, ``{points}`` and
         ``{imu}`` are topics, ``{study}`` is the folder of the study's file, and the name of any
-        parameter its value.
+        parameter stands for its value.
     template : str, optional
-        A parameter file: YAML, JSON or TOML, also as ROS 1 and ROS 2 have it.
+        A parameter file: YAML, JSON or TOML, also in the layouts of ROS 1 and ROS 2.
     output : str
-        The trajectory, in the empty folder in which the program is run.
+        Name of the trajectory, in the empty folder in which the program runs.
     format : {"tum", "kitti", "evalio"}
-        Of the trajectory.
+        Format of the trajectory.
     input : {"bag", "ros2", "kitti"}
         What the program reads.
     extrinsic : Transform, optional
-        The LiDAR's pose in the frame that the program's poses are of.
+        The LiDAR's pose in the frame whose poses the program writes.
     """
 
     command: Arguments
@@ -76,107 +75,10 @@ class Settings(BaseSettings):
     extrinsic: Transform | None = None
 
 
-class Material(NamedTuple):
-    """What a program is given of a sequence, and what its trajectory is read by.
+class Command(Recorded):
+    """A program that runs once on a whole recording, and its trajectory.
 
-    Attributes
-    ----------
-    path : Path
-        The recording.
-    points : str
-        Topic of the clouds in it.
-    imu : str
-        Topic of the IMU; empty where there is none.
-    stamps : ndarray of shape (n,)
-        Nanoseconds, of the scans.
-    T_ref_sensor : ndarray of shape (n, 4, 4), optional
-        Reference poses, NaN where there is none.
-    """
-
-    path: Path
-    points: str
-    imu: str
-    stamps: NDArray[np.int64]
-    T_ref_sensor: Poses | None
-
-
-def material(
-    sequence: Sequence, config: SequenceConfig, about: Any, folder: Path, layout: Layout
-) -> Material:
-    """A recording for a program: the sequence's own bag where that is just what is wanted.
-
-    Parameters
-    ----------
-    sequence
-        What `config` describes.
-    config
-        The sequence's description.
-    about
-        All that the sequence depends on, as plain data; what was written for another is replaced.
-    folder
-        Where to keep what has to be written; processes wait for each other.
-    layout
-        What the program reads.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    own = _own_bag(config, layout)
-    name = {"bag": "input.bag", "ros2": "input", "kitti": "input"}[layout]
-    with (folder.parent / f".{folder.name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if _about(folder) != about:
-            stamps: list[int] = []
-            with replacing_folder(folder) as beside:
-                beside.mkdir()
-                if own is None:
-                    export(_noted(sequence, stamps), sequence.imu(), beside / name, layout)
-                else:
-                    stamps += [scan.stamp for scan in sequence]
-                np.save(beside / "stamps.npy", np.array(stamps, np.int64))
-                (beside / "about.json").write_text(json.dumps(about), encoding="utf-8")
-        at = np.load(folder / "stamps.npy")
-    reference = sequence.reference()
-    T_ref_sensor = None if reference is None else reference.at(at)
-    if own is None:
-        imu = "" if sequence.imu() is None else IMU
-        return Material(folder / name, POINTS, imu, at, T_ref_sensor)
-    source: Any = getattr(sequence, "source", None)
-    imu = "" if config.imu is None else config.imu.topic or ""
-    return Material(own, config.points or source.points, imu, at, T_ref_sensor)
-
-
-def _noted(sequence: Sequence, stamps: list[int]) -> Iterator[Scan]:
-    for scan in sequence:
-        stamps.append(scan.stamp)
-        yield scan
-
-
-def _own_bag(config: SequenceConfig, layout: Layout) -> Path | None:
-    """The sequence's bag, if it is one, whole and of the right kind."""
-    if not isinstance(config.bag, str) or layout == "kitti":
-        return None
-    plain = SequenceConfig(bag=config.bag)
-    for key in ("start", "stop", "stride", "views", "compensate"):
-        if getattr(config, key) != getattr(plain, key):
-            return None
-    path = Path(config.bag)
-    right = path.is_file() and path.suffix == ".bag"
-    if layout == "ros2":
-        right = (path / "metadata.yaml").exists()
-    return path if right else None
-
-
-def _about(folder: Path) -> Any:
-    try:
-        return json.loads((folder / "about.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-
-
-class Command:
-    """A program that is run once on a whole recording, and its trajectory.
-
-    It cannot begin anew on the way: where `start` places it elsewhere, the motions that it has
-    found go on from there.
+    It cannot restart on the way: where `start` places it elsewhere, its motions go on from there.
 
     Parameters
     ----------
@@ -185,17 +87,16 @@ class Command:
     settings
         The program and its files.
     limits
-        What it may take: memory, and of time as much as for all scans together.
-    material
-        Gives the recording when it is wanted; none where scans are only prepared.
+        What it may use: memory, and time for all scans together.
+    read
+        Gives the recording at the first start; None if scans are only prepared.
     strict
         Whether a run that fails is an error, not a fault.
 
     Attributes
     ----------
     faults : list of str
-        What went wrong, with the last lines that the program wrote. Poses that are not known are
-        NaN.
+        What went wrong, with the last lines that the program wrote. Unknown poses are NaN.
     """
 
     settings_type = Settings
@@ -205,24 +106,24 @@ class Command:
         parameters: ParameterSet,
         settings: Settings,
         limits: Limits,
-        material: Callable[[], Material] | None = None,
+        read: Callable[[], ProgramInput] | None = None,
         strict: bool = False,
     ):
         self.parameters = dict(parameters)
         self.settings = settings
         self.faults: list[str] = []
-        self._limits, self._material, self._strict = limits, material, strict
+        self._limits, self._read_input, self._strict = limits, read, strict
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_odom_own = np.eye(4)
 
     @staticmethod
     def describe(settings: Settings) -> Description:  # noqa: ARG004
-        """Parameters are the study's to define, and nothing can be changed on the way."""
+        """The study defines the parameters, and nothing can change on the way."""
         return Description(space=None, live=False, whole=True)
 
     @staticmethod
     def check(settings: Settings, parameters: ParameterSet) -> None:
-        """Make sure that the program is there, and that every parameter reaches it.
+        """Make sure that the program exists, and that every parameter reaches it.
 
         Raises
         ------
@@ -240,7 +141,7 @@ class Command:
         check_names(parameters, template, arguments)
 
     def prepare(self, scan: Scan) -> NDArray[np.int64]:
-        """See `Odometry.prepare`; all that is wanted of a scan is its stamp."""
+        """See `Odometry.prepare`; only the scan's stamp is needed."""
         return np.array(scan.stamp, np.int64)
 
     def start(
@@ -249,27 +150,31 @@ class Command:
         T_odom_sensor: Poses,
         T_previous_current: Poses | None = None,  # noqa: ARG002
     ) -> None:
-        """See `Odometry.start`; the program is run when this is called first.
+        """See `Odometry.start`; the first call runs the program.
 
         Raises
         ------
         OdometryError
-            If the program cannot be run, or its poses are another frame's.
+            If the program cannot run, or its poses belong to another frame.
         """
         if self._T_own_sensor is None:
-            if self._material is None:
-                raise OdometryError("a program is run on a recording, not on single scans")
-            given = self._material()
+            if self._read_input is None:
+                raise OdometryError("a program runs on a recording, not on single scans")
+            given = self._read_input()
             poses = self._run(given)
             self._T_own_sensor = dict(zip(given.stamps.tolist(), poses, strict=True))
         self._T_odom_own = T_odom_sensor @ invert(self._own(prepared))
 
-    def register(self, prepared: NDArray[np.int64]) -> Registration:
-        """See `Odometry.register`."""
-        T_odom_sensor = self._T_odom_own @ self._own(prepared)
+    def submit(self, prepared: NDArray[np.int64]) -> None:
+        """See `OdometryInstance.submit`."""
+        self._submitted = prepared
+
+    def collect(self) -> Registration:
+        """See `OdometryInstance.collect`."""
+        T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
 
-    def configure(self, parameters: ParameterSet) -> None:  # noqa: ARG002
+    def apply(self, selection: Selection) -> None:  # noqa: ARG002
         """Refuse.
 
         Raises
@@ -282,8 +187,8 @@ class Command:
         assert self._T_own_sensor is not None
         return self._T_own_sensor.get(int(stamp), np.full((4, 4), np.nan))
 
-    def _run(self, given: Material) -> Poses:
-        """Poses at the scans' stamps, of shape (n, 4, 4), NaN where the program tells none."""
+    def _run(self, given: ProgramInput) -> Poses:
+        """Poses at the scans' stamps, of shape (n, 4, 4), NaN where the program wrote none."""
         T_own_sensor = np.full((len(given.stamps), 4, 4), np.nan)
         with tempfile.TemporaryDirectory(prefix="adaptune-") as name:
             folder = Path(name) / "run"
@@ -309,12 +214,12 @@ class Command:
         if failure is not None:
             self._fault(failure, words)
         try:
-            _check_frame(T_own_sensor, given.T_ref_sensor)
+            check_frame(T_own_sensor, given.T_ref_sensor)
         except OdometryError as error:
-            raise OdometryError(self._told(str(error), words)) from error
+            raise OdometryError(self._message(str(error), words)) from error
         return T_own_sensor
 
-    def _command(self, given: Material, output: Path, folder: Path) -> list[str]:
+    def _command(self, given: ProgramInput, output: Path, folder: Path) -> list[str]:
         values: dict[str, Any] = {
             "input": given.path.resolve(),
             "output": output,
@@ -329,11 +234,11 @@ class Command:
         return [replace(argument, values) for argument in self.settings.command]
 
     def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:
-        """Run the program, and tell how it ended if not well."""
+        """Run the program; how it ended if not well."""
         seconds = self._limits.seconds * n
         with log.open("wb") as file:
             process = subprocess.Popen(
-                # Should this process be killed, the time on the core is bounded still.
+                # The limit on its CPU time holds even if this process is killed.
                 bounded(command, self._limits.memory, f"-t {round(seconds) + 1}"),
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
@@ -368,20 +273,20 @@ class Command:
             trajectory = read_tum(path)
             poses, stamps_own = trajectory.T_world_sensor, trajectory.stamps
         for number, T in enumerate(poses):
-            if what := nonsense(T):
+            if what := pose_fault(T):
                 raise OdometryError(f"{self.settings.output}, pose {number + 1}: {what}")
         if self.settings.extrinsic is not None:
             poses = poses @ to_pose(self.settings.extrinsic)
         return _at(Trajectory(stamps_own, poses), stamps)
 
-    def _told(self, what: str, words: str) -> str:
-        """What went wrong, of which program, and the last lines that it wrote."""
-        told = f"{self.settings.command[0]}, with {self.parameters}: {what}"
-        return f"{told}: {words}" if words else told
+    def _message(self, what: str, words: str) -> str:
+        """What went wrong, with which program, and the last lines that it wrote."""
+        message = f"{self.settings.command[0]}, with {self.parameters}: {what}"
+        return f"{message}: {words}" if words else message
 
     def _fault(self, what: str, words: str) -> None:
         if self._strict:
-            raise OdometryError(self._told(what, words))
+            raise OdometryError(self._message(what, words))
         what = f"{what}: {words}" if words else what
         self.faults.append(what)
         _log.warning("%s with %s: %s", self.settings.command[0], self.parameters, what)
@@ -417,56 +322,23 @@ def _seconds(stamps: NDArray[np.int64], known: NDArray[np.bool_]) -> str:
     return f"{1e-9 * (last - stamps[0]):.1f} s of {1e-9 * (stamps[-1] - stamps[0]):.1f} s"
 
 
-def _check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
-    """Refuse poses whose motion is the reference's, seen from other axes.
-
-    Displacements over a metre are compared before and after the rotation that brings them nearest
-    to each other (Kabsch, Acta Cryst. 1976).
-
-    Raises
-    ------
-    OdometryError
-    """
-    if T_ref_sensor is None:
-        return
-    ends = window_ends(T_ref_sensor, 1.0)
-    starts = np.flatnonzero((ends >= 0) & np.isfinite(T_own_sensor[:, 0, 0]))
-    starts = starts[np.isfinite(T_own_sensor[ends[starts], 0, 0])]
-    if len(starts) < 10:
-        return
-    own, truth = (
-        (invert(T[starts]) @ T[ends[starts]])[:, :3, 3] for T in (T_own_sensor, T_ref_sensor)
-    )
-    U, _, Vt = np.linalg.svd(truth.T @ own)
-    T_truth_own = np.eye(4)
-    T_truth_own[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    before = np.linalg.norm(own - truth, axis=1).mean()
-    after = np.linalg.norm(own @ T_truth_own[:3, :3].T - truth, axis=1).mean()
-    if before > 0.3 and after < 0.2 * before:
-        angle = np.degrees(rotation_angle(T_truth_own))
-        raise OdometryError(
-            f"the program's poses are those of another frame: turned by {angle:.0f} degrees, they "
-            f"are the reference's; give the LiDAR's pose in it (odometry.settings.extrinsic)"
-        )
-
-
 @contextmanager
 def _ending(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """End a program and its children with the block, or when this process is told to end."""
+    """End a program and its children after the block, or when this process receives SIGTERM."""
 
     def end() -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
-    def told(number: int, _: object) -> None:
+    def terminate(number: int, _: object) -> None:
         end()
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
     before = None
     with contextlib.suppress(ValueError):  # only the main thread may
-        before = signal.signal(signal.SIGTERM, told)
+        before = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     finally:

@@ -1,77 +1,119 @@
-"""The one place that makes an odometry from its name."""
+"""Make an odometry from its name, wherever it runs."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
 from functools import cached_property, partial
 from typing import Any
 
-from adaptune.odometry.base import Box, Description
-from adaptune.odometry.command import Command, Material
+from adaptune.odometry.base import BaseSettings, Description, OdometryInstance
+from adaptune.odometry.command import Command
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import Process
-from adaptune.odometry.registry import box_class
+from adaptune.odometry.program_input import ProgramInput
+from adaptune.odometry.registry import AnyOdometry, odometry_class, versions
 from adaptune.space import ParameterSet, ParameterSpace
 
 
-@dataclass(frozen=True)
 class OdometryFactory:
-    """Makes instances of an odometry.
+    """Makes instances of one odometry.
+
+    It pickles: class and settings are looked up where they are first used.
+
+    Parameters
+    ----------
+    name
+        The odometry, see `odometry_class`.
+    settings
+        What the odometry's `settings_type` validates, or an instance of it.
+    space
+        The parameters that are tuned.
+    limits
+        Limits of odometries in processes of their own.
+    program_input
+        Gives the recording of a sequence, for programs that run whole recordings.
+    strict_sequences
+        Sequences on which such a program must not fail with the baseline's parameters: there its
+        failure is an error, not a fault.
 
     Attributes
     ----------
     name : str
-    settings : BaseSettings
     space : ParameterSpace
-        The parameters that are tuned.
-    limits : Limits
-        Limits of an odometry in a process of its own.
-    material : callable, optional
-        Returns a sequence as a program reads it.
-    strict_sequences : tuple of str
-        Sequences on which a program must not fail with the baseline.
+    program_input : callable, optional
     """
 
-    name: str
-    settings: Any
-    space: ParameterSpace
-    limits: Limits
-    material: Callable[[str], Material] | None = None
-    strict_sequences: tuple[str, ...] = ()
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, Any] | BaseSettings,
+        space: ParameterSpace,
+        limits: Limits,
+        program_input: Callable[[str], ProgramInput] | None = None,
+        strict_sequences: Collection[str] = (),
+    ):
+        self.name = name
+        self.space = space
+        self._given = settings
+        self._limits = limits
+        self.program_input = program_input
+        self._strict_sequences = strict_sequences
+
+    def __getstate__(self) -> dict[str, Any]:
+        cached = ("odometry_class", "settings", "description")
+        return {key: value for key, value in vars(self).items() if key not in cached}
 
     @cached_property
-    def odometry_class(self) -> Any:
+    def odometry_class(self) -> AnyOdometry:
         """Class of the odometry."""
-        programs: dict[str, Any] = {"command": Command, "process": Process}
-        return programs.get(self.name) or box_class(self.name)
+        return odometry_class(self.name)
+
+    @cached_property
+    def settings(self) -> Any:
+        """Settings of the odometry, validated."""
+        return self.odometry_class.settings_type.model_validate(self._given)
 
     @cached_property
     def description(self) -> Description:
         """What a study must know of the odometry."""
-        described: Description = self.odometry_class.describe(self.settings)
-        return described
+        return self.odometry_class.describe(self.settings)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Name and settings of the odometry, as a model keeps them."""
+        """Name and settings, by which a model knows the odometry that it was made for."""
         return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of the packages that the poses depend on."""
+        return versions(self.odometry_class)
 
     def __call__(
         self,
         parameters: ParameterSet | None = None,
         sequence: str | None = None,
         isolated: bool = False,
-    ) -> Box:
-        """Make a new instance, in a process of its own if it is not clean or `isolated` asks."""
-        given = self.space.baseline | (parameters or {})
-        if issubclass(self.odometry_class, Command):
-            strict = sequence in self.strict_sequences and given == self.space.baseline
-            material = None
-            if self.material is not None and sequence is not None:
-                material = partial(self.material, sequence)
-            return Command(given, self.settings, self.limits, material, strict)
-        if issubclass(self.odometry_class, Process):
-            return Process(given, self.settings, self.limits)
-        if self.odometry_class.clean and not isolated:
-            made: Box = self.odometry_class(given, self.settings)
-            return made
-        return Isolated(self.name, given, self.settings, self.limits)
+    ) -> OdometryInstance:
+        """Make a new instance.
+
+        Parameters
+        ----------
+        parameters
+            Parameters not given keep their baseline.
+        sequence
+            Name of the sequence on which the instance will run; programs that run whole recordings
+            need it.
+        isolated
+            Run in a process of its own even if the odometry is clean, to measure its memory.
+        """
+        cls, given = self.odometry_class, self.space.baseline | (parameters or {})
+        if issubclass(cls, Command):
+            # A failure with the baseline's parameters means that something is missing.
+            strict = sequence in self._strict_sequences and given == self.space.baseline
+            read = None
+            if sequence is not None and self.program_input is not None:
+                read = partial(self.program_input, sequence)
+            return cls(given, self.settings, self._limits, read, strict)
+        if issubclass(cls, Process):
+            return cls(given, self.settings, self._limits)
+        if cls.clean and not isolated:
+            return cls(given, self.settings)
+        return Isolated(self.name, given, self.settings, self._limits)

@@ -1,7 +1,7 @@
 """Forks processes in which odometries live, see `adaptune.odometry.isolation`.
 
-Run with the number of a socket and the name of an odometry. It imports the odometry, and for
-every socket that comes forks a watcher, which forks the instance and tells what became of it.
+Run with the number of a socket and the name of an odometry. It imports the odometry. For every
+socket that it receives it forks a watcher, which forks the instance and reports how that ended.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ from adaptune.cores import pin
 from adaptune.odometry import wire
 from adaptune.odometry.base import OdometryError
 from adaptune.odometry.isolation import Limits, last_lines, verdict
-from adaptune.odometry.registry import box_class
+from adaptune.odometry.registry import odometry_class
 
 
 def main(control: socket.socket, name: str) -> None:
-    """Fork an instance for every socket that comes, until none can come any more."""
-    # What cannot be imported is told by the instance that needs it.
+    """Fork an instance for every socket received, until the other side closes."""
+    # The instance reports what cannot be imported.
     with contextlib.suppress(OdometryError):
-        box_class(name)
+        odometry_class(name)
     while True:
         limits, sockets, _, _ = socket.recv_fds(control, 1 << 12, 1)
         if not sockets:
@@ -36,14 +36,14 @@ def main(control: socket.socket, name: str) -> None:
                 _watch(connection, Limits.model_validate_json(limits))
             os._exit(0)
         os.close(sockets[0])
-        # Watchers that have ended are not to stay as zombies.
+        # Collect watchers that have ended, or they stay as zombies.
         with contextlib.suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG) != (0, 0):
                 pass
 
 
 def _watch(connection: socket.socket, limits: Limits) -> None:
-    """Run an instance in a child, and tell what became of it should it not end well."""
+    """Run an instance in a child, and report how it ended if that was not well."""
     with tempfile.TemporaryFile() as output:
         child = os.fork()
         if child == 0:
@@ -67,7 +67,7 @@ def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:
     """Answer messages and end the process."""
     code = 1
     try:
-        # TBB knows no other bound on its threads, and sums in the order in which they finish.
+        # Nothing else limits TBB's threads, and it sums in the order in which they finish.
         pin(os.getpid())
         os.dup2(output, 1)
         os.dup2(output, 2)
@@ -82,7 +82,7 @@ def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:
         sys.excepthook(*sys.exc_info())
         sys.stderr.flush()
     finally:
-        # What is registered to run at exit is the server's.
+        # Exit handlers belong to the server.
         os._exit(code)
 
 
@@ -94,9 +94,9 @@ def _bound_memory(gigabytes: float) -> None:
 
 
 class _Timed:
-    """A stream behind which a clock runs from every read to the next; at its end the process dies.
+    """A stream with a time limit from every read to the next, at which the process dies.
 
-    No handler is set, so that the signal works inside compiled code too.
+    The signal has no handler, so it also works inside compiled code.
     """
 
     def __init__(self, stream: BinaryIO, seconds: float):

@@ -17,8 +17,8 @@ _WALK = 0.5
 class HealthCheck(BaseModel):
     """Bounds on a platform's motion.
 
-    Odometries that predict by constant velocity run away after a failure and do not come back. A
-    step that the platform cannot have made shows it.
+    An odometry that predicts by constant velocity runs away after a failure and does not come
+    back. A step that the platform cannot have made reveals it.
 
     Attributes
     ----------
@@ -31,11 +31,10 @@ class HealthCheck(BaseModel):
         Degrees a second.
     max_freeze : float
         Seconds for which the pose may stay where it is to the micrometre, after a step faster than
-        half a metre a second. A robot that comes to a stand slows down before, and the noise of
-        its scans moves the pose of one that registers them: only an odometry that has given up
-        stops dead.
+        half a metre a second. A robot slows down before it stops, and the noise of its scans moves
+        the pose: only an odometry that has given up stops dead.
     max_unregistered : int
-        Scans in a row that the odometry says it could not register.
+        Scans in a row that the odometry reports as not registered.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -53,14 +52,14 @@ class HealthCheck(BaseModel):
         elapsed: float,
         turn_rate: float = 0.0,
     ) -> str | None:
-        """The bound that the platform would have exceeded to move like this, if any.
+        """The bound that this motion exceeds, if any.
 
         Parameters
         ----------
         velocity
             Metres a second in the sensor's frame, of shape (3,).
         last_velocity
-            The last healthy one; none if there is none yet.
+            The last healthy one; None if there is none yet.
         elapsed
             Seconds since `last_velocity`.
         turn_rate
@@ -82,12 +81,12 @@ class HealthCheck(BaseModel):
         return bool(max(moved, rotation_angle(T_previous_current)) < _STILL)
 
     def frozen(self, seconds: float, speed: float) -> bool:
-        """Whether a pose has frozen, and not come to a stand.
+        """Whether a pose has frozen, and the robot not stopped.
 
         Parameters
         ----------
         seconds
-            For which it has been still.
+            How long it has been still.
         speed
             Metres a second, of the last step before.
         """
@@ -95,7 +94,7 @@ class HealthCheck(BaseModel):
 
 
 class Guard:
-    """Goes along with a drive: remembers the last healthy motion, and how long none came.
+    """Checks motion after motion, and remembers the last healthy one.
 
     Parameters
     ----------
@@ -125,7 +124,7 @@ class Guard:
         elapsed
             Seconds that it took.
         registered
-            What the odometry says.
+            Whether the odometry registered the scan.
         """
         self._since += elapsed
         self._unregistered = 0 if registered else self._unregistered + 1
@@ -171,7 +170,7 @@ def unhealthy(
     stamps: NDArray[np.int64],
     registered: NDArray[np.bool_],
 ) -> dict[str, int]:
-    """How often the check would have spoken on a drive, by what it would have said.
+    """How often the check finds each fault in a trajectory.
 
     Parameters
     ----------
@@ -191,5 +190,5 @@ def unhealthy(
     """
     guard = Guard(check)
     elapsed = (np.diff(stamps) * 1e-9).tolist()
-    said = map(guard.check, T_previous_current, elapsed, registered[1:].tolist())
-    return dict(Counter(what for what in said if what is not None))
+    found = map(guard.check, T_previous_current, elapsed, registered[1:].tolist())
+    return dict(Counter(what for what in found if what is not None))

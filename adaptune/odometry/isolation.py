@@ -1,7 +1,7 @@
-"""Odometries in processes of their own, which may end without taking anything with them.
+"""Odometries in processes of their own: a crash ends that process and nothing else.
 
-A small server that has imported the odometry forks a fresh process for every start: that takes
-milliseconds, and what an odometry keeps beside its instances is gone with its process.
+A small server imports the odometry once and forks a fresh process for every start. That takes
+milliseconds, and global state of the odometry ends with its process.
 """
 
 import contextlib
@@ -20,19 +20,19 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
-from adaptune.odometry.base import BaseSettings, OdometryError, Registration
-from adaptune.odometry.registry import box_class
-from adaptune.sequence import Scan
+from adaptune.odometry.base import BaseSettings, OdometryError, Recorded, Registration, Usage
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 
 MOST_FAULTS = 10
-"""After so many an instance is not started again: what is left of its sequence is lost."""
+"""An instance with so many faults does not start again: the rest of its sequence is lost."""
 
-_SHAKE = 1e-3
-"""By which a rotation times its transpose may depart from the identity."""
+_TOLERANCE = 1e-3
+"""By how much a rotation times its transpose may differ from the identity."""
 
 _TAIL, _LINES = 1 << 14, 5
-"""Of what it has written, the last lines of the last bytes are told."""
+"""Messages quote the last lines, out of the last bytes, that a program wrote."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment of programs that must not start threads of their own."""
@@ -50,14 +50,14 @@ Arguments = Annotated[tuple[Annotated[str, AfterValidator(_in_study)], ...], Fie
 
 
 class Limits(BaseModel):
-    """What an odometry in a process of its own may take.
+    """Limits of an odometry in a process of its own.
 
     Attributes
     ----------
     seconds : float
-        For one scan.
+        Time for one scan.
     memory : float
-        Gigabytes, beside what the process begins with.
+        Gigabytes, in addition to what the process begins with.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,47 +66,47 @@ class Limits(BaseModel):
     memory: float = Field(4.0, gt=0)
 
 
-class Isolated:
+class Isolated(Recorded):
     """An odometry that lives in another process, a new one with every start.
 
-    What ends that process, or makes no sense as a pose, is a *fault*: the pose of that scan is
-    NaN, and so are all that follow until a new start.
+    If that process ends, or returns a pose that is none, this is a *fault*: the pose of that scan
+    is NaN, and so are all that follow until a new start.
 
     Parameters
     ----------
     name
-        Of the odometry.
+        The odometry.
     parameters, settings
         See `Odometry`.
     limits
-        What it may take.
+        What each process may use.
 
     Attributes
     ----------
     faults : list of str
         What went wrong, each with the last lines that the odometry wrote.
-    cpu : float
-        Seconds that its processes have computed.
-    memory : float
-        Megabytes that they took at most, what they began with included.
     """
 
     _fresh = True
-    """Whether each start wants a new process."""
+    """Whether each start needs a new process."""
 
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
         self.name: str | None = name
-        self.parameters = box_class(name).space.baseline | parameters
+        self.parameters = dict(parameters)
         self.faults: list[str] = []
-        self.cpu = self.memory = 0.0
-        self._cpu_before = 0.0
+        self._cpu = self._cpu_before = self._memory = 0.0
         self._settings = settings.model_dump(mode="json")
         self._limits = limits
         self._stream: BinaryIO | None = None
 
     @property
-    def _called(self) -> str:
-        """What it goes by where something is told of it."""
+    def usage(self) -> Usage:
+        """CPU time and peak memory that the other processes report."""
+        return Usage(self._cpu, self._memory)
+
+    @property
+    def _label(self) -> str:
+        """Name in messages."""
         return str(self.name)
 
     def prepare(self, scan: Scan) -> Scan:
@@ -137,44 +137,39 @@ class Isolated:
             motion=T_previous_current,
         )
 
-    def register(self, prepared: Scan) -> Registration:
-        """See `Odometry.register`."""
-        self.request(prepared)
-        return self.result()
-
-    def request(self, prepared: Scan) -> None:
-        """Begin to `register`: several instances may be at work at once."""
-        self._asked = prepared.stamp
+    def submit(self, prepared: Scan) -> None:
+        """See `OdometryInstance.submit`."""
+        self._submitted = prepared.stamp
         self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
 
-    def result(self) -> Registration:
-        """What became of the `request`."""
+    def collect(self) -> Registration:
+        """See `OdometryInstance.collect`."""
         answer = self._receive()
         if answer is None:
             return Registration(np.full((4, 4), np.nan), registered=False)
         try:
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
-            late, registered = answer.header["stamp"] - self._asked, answer.header["registered"]
+            late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
             cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
         except (KeyError, TypeError, ValueError) as error:
             lacking = isinstance(error, KeyError)
-            told = f"without {error}" if lacking else f"of other types ({error})"
-            self._fault(f"it gave an answer {told}")
+            what = f"without {error}" if lacking else f"of other types ({error})"
+            self._fault(f"it gave an answer {what}")
             return Registration(np.full((4, 4), np.nan), registered=False)
-        what = nonsense(T_odom_sensor)
+        wrong = pose_fault(T_odom_sensor)
         if late:
-            what = f"of another time, {1e-9 * late:+.3f} s from the scan's"
-        if what is not None:
-            self._fault(f"it gave a pose {what}")
+            wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
+        if wrong is not None:
+            self._fault(f"it gave a pose {wrong}")
             return Registration(np.full((4, 4), np.nan), registered=False)
-        self.cpu = self._cpu_before + cpu
-        self.memory = max(self.memory, memory)
+        self._cpu = self._cpu_before + cpu
+        self._memory = max(self._memory, memory)
         return Registration(T_odom_sensor.copy(), bool(registered))
 
-    def configure(self, parameters: ParameterSet) -> None:
-        """See `Odometry.configure`."""
-        self.parameters |= parameters
-        self._ask({"type": "configure", "parameters": parameters})
+    def apply(self, selection: Selection) -> None:
+        """See `OdometryInstance.apply`."""
+        self.parameters |= selection.parameters
+        self._ask({"type": "configure", "parameters": selection.parameters})
 
     def close(self) -> None:
         """End the other process."""
@@ -182,7 +177,7 @@ class Isolated:
             with contextlib.suppress(OSError):
                 self._stream.close()
             self._stream = None
-            self._cpu_before = self.cpu
+            self._cpu_before = self._cpu
 
     def __del__(self) -> None:
         self.close()
@@ -193,12 +188,12 @@ class Isolated:
 
     def _send(self, header: dict[str, Any], **arrays: Any) -> None:
         if self._stream is not None:
-            # One that does not listen any more has told why, or will have ended.
+            # A process that does not listen any more has said why, or has ended.
             with contextlib.suppress(OSError):
                 wire.send(self._stream, header, **arrays)
 
     def _receive(self) -> wire.Message | None:
-        """Wait for the answer; None if there is none any more."""
+        """Wait for the answer; None if there is none."""
         if self._stream is None:
             return None
         answer, what = None, "its process ended"
@@ -217,34 +212,34 @@ class Isolated:
             self._fault(str(answer.header.get("message")))
             return None
         if answer.header.get("type") == "refused":
-            raise OdometryError(f"{self._called}: {answer.header.get('message')}")
+            raise OdometryError(f"{self._label}: {answer.header.get('message')}")
         return answer
 
     def _connect(self) -> BinaryIO:
-        """A stream to a process that has yet to be told which odometry it is."""
+        """A stream to a new process, which first receives a hello."""
         assert self.name is not None
         return _fork(self.name, self._limits)
 
     def _verdict(self, what: str) -> str:
-        """What is known of the end of a conversation; a process that ended has told by itself."""
+        """Add to `what` how the process ended; here the process itself reports that."""
         return what
 
     def _fault(self, what: str) -> None:
         self.close()
         self.faults.append(what)
-        _log.warning("%s with %s: %s", self._called, self.parameters, what)
+        _log.warning("%s with %s: %s", self._label, self.parameters, what)
         if len(self.faults) == MOST_FAULTS:
-            _log.warning("%s: that was fault number %d, giving up", self._called, MOST_FAULTS)
+            _log.warning("%s: fault number %d, it does not start again", self._label, MOST_FAULTS)
 
 
-def nonsense(T_odom_sensor: Poses) -> str | None:
+def pose_fault(T_odom_sensor: Poses) -> str | None:
     """What is wrong with a pose, if anything."""
     if T_odom_sensor.shape != (4, 4):
         return f"of shape {T_odom_sensor.shape}"
     if not np.isfinite(T_odom_sensor).all():
         return "that is not finite"
     R = T_odom_sensor[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _SHAKE or np.linalg.det(R) < 0:
+    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         return "that is not rigid"
     return None
 
@@ -257,7 +252,7 @@ def verdict(code: int) -> str:
 
 
 def bounded(command: Sequence[str], memory: float, *limits: str) -> list[str]:
-    """A command whose address space is bounded by so many gigabytes, and by more of ulimit's."""
+    """A command with a limit on its address space in gigabytes, and further limits of ulimit."""
     bounds = "; ".join(f"ulimit {limit}" for limit in (f"-v {round(memory * 1e6)}", *limits))
     return ["/bin/sh", "-c", f'{bounds}; exec "$@"', "sh", *command]
 
@@ -270,14 +265,16 @@ def last_lines(output: BinaryIO) -> str:
     return " | ".join(lines[-_LINES:])
 
 
-class _Server(NamedTuple):
+class ForkServer(NamedTuple):
+    """A process that forks instances of an odometry, and the socket that asks it to."""
+
     process: subprocess.Popen[bytes]
     control: socket.socket
 
 
 @cache
-def _server(name: str) -> _Server:
-    """What forks instances of an odometry, begun when the first one is wanted."""
+def fork_server(name: str) -> ForkServer:
+    """Fork server of an odometry, started at the first call."""
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
     path = os.pathsep.join(filter(None, sys.path))
     with there:
@@ -286,18 +283,18 @@ def _server(name: str) -> _Server:
             pass_fds=[there.fileno()],
             stdin=subprocess.DEVNULL,
             env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
-            # Ctrl-C is for the process that drives.
+            # Ctrl-C is for this process only.
             start_new_session=True,
         )
-    return _Server(process, here)
+    return ForkServer(process, here)
 
 
 def _fork(name: str, limits: Limits) -> BinaryIO:
     """A stream to a fresh process."""
-    if _server(name).process.poll() is not None:
-        _server.cache_clear()
+    if fork_server(name).process.poll() is not None:
+        fork_server.cache_clear()
     here, there = socket.socketpair()
     with here, there:
         request = limits.model_dump_json().encode()
-        socket.send_fds(_server(name).control, [request], [there.fileno()])
+        socket.send_fds(fork_server(name).control, [request], [there.fileno()])
         return cast("BinaryIO", here.makefile("rwb"))

@@ -5,16 +5,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert, rectify, scale
+from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
 from adaptune.odometry.base import Odometry, Registration
+from adaptune.sequence.scan import Scan
 
 JITTER = 0.1
-"""Share by which the time between two scans may differ from that before and count as the same: a
-LiDAR turns more steadily than its stamps tell, and a missing scan makes it twice as long."""
+"""Two times between scans count as the same if they differ by no more than this share: a LiDAR
+turns more steadily than its stamps say, and a missing scan doubles the time."""
 
 
 class Alignment(NamedTuple):
-    """What a registration of two clouds gave; `ok` is False where it cannot be believed."""
+    """Result of a registration of two clouds; `ok` is False if it is not reliable."""
 
     T_target_source: Poses
     ok: bool
@@ -24,9 +25,8 @@ class KeyframeOdometry(Odometry):
     """Scan-to-keyframe odometry with a constant-velocity prediction.
 
     A scan becomes the new keyframe when it lies `keyframe_interval` metres or more from the old
-    one. Where scans are missing, the last motion is predicted to go on for as long as it took the
-    next one to come; for that, what `prepare` returns has a `stamp` in nanoseconds. After Koide et
-    al., IROS 2021.
+    one. Where scans are missing, the prediction lasts until the next one; for that, what `prepare`
+    returns has a `stamp` in nanoseconds. After Koide et al., IROS 2021.
     """
 
     live = True
@@ -38,7 +38,7 @@ class KeyframeOdometry(Odometry):
         """See `Odometry.start`."""
         self._begin_keyframe(prepared, T_odom_sensor)
         self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
-        # What is given goes on for one scan, whatever time it was of.
+        # The given motion goes on for one scan, whatever time it took.
         self._stamp, self._duration = prepared.stamp, 0
 
     def _begin_keyframe(self, prepared: Any, T_odom_sensor: Poses) -> None:
@@ -64,7 +64,7 @@ class KeyframeOdometry(Odometry):
             T_keyframe_sensor, ok = T_keyframe_guess, False
         self._T_keyframe_sensor = T_keyframe_sensor
         T_odom_sensor = self._T_odom_keyframe @ T_keyframe_sensor
-        # What cannot be matched to the keyframe now will not be later, from further away.
+        # A scan that cannot be matched now cannot be later, from further away.
         interval = self.parameters["keyframe_interval"]
         if not ok or np.linalg.norm(T_keyframe_sensor[:3, 3]) >= interval:
             self._begin_keyframe(prepared, T_odom_sensor)
@@ -84,3 +84,11 @@ class KeyframeOdometry(Odometry):
     @abstractmethod
     def align(self, target: Any, source: Any, T_target_guess: Poses) -> Alignment:
         """Register two usable scans."""
+
+
+def crop(scan: Scan, min_range: float) -> Any:
+    """Points no nearer than `min_range` metres, as float64 of shape (n, 3)."""
+    points = scan.points.astype(np.float64)
+    kept = squared_ranges(points) >= min_range**2
+    # Numbers are picked in a quarter of the time that a mask takes.
+    return points if kept.all() else points.take(np.flatnonzero(kept), axis=0)

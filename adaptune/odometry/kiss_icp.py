@@ -13,7 +13,7 @@ from pydantic import Field
 
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import BaseSettings, Odometry, Registration
-from adaptune.sequence import Scan
+from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 
 MIN_POINTS = 20
@@ -44,8 +44,8 @@ class Prepared:
 class Kiss(Odometry):
     """KISS-ICP (Vizzo et al., RA-L 2023).
 
-    Its parts are made anew between scans where their parameters change: the points of the old
-    local map are put into the new one. With `deskew`, its poses are those at the scans' ends.
+    A change of parameters between scans rebuilds the parts that use them, and the new local map
+    keeps the points of the old one. With `deskew`, poses belong to the scans' ends.
     """
 
     space = ParameterSpace(
@@ -81,8 +81,8 @@ class Kiss(Odometry):
     def configure(self, parameters: ParameterSet) -> None:
         """See `Odometry.configure`.
 
-        A new `initial_threshold` is where the adaptive threshold begins again; a new
-        `min_motion_th` alone lets it begin where it is.
+        The adaptive threshold restarts at a new `initial_threshold`; with a new `min_motion_th`
+        alone it goes on from its value.
         """
         before = dict(self.parameters)
         super().configure(parameters)

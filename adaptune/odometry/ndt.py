@@ -8,9 +8,8 @@ from pydantic import Field
 from adaptune import open3d
 from adaptune.geometry import Poses
 from adaptune.odometry.base import BaseSettings
-from adaptune.odometry.gicp import crop
-from adaptune.odometry.keyframe import Alignment, KeyframeOdometry
-from adaptune.sequence import Scan
+from adaptune.odometry.keyframe import Alignment, KeyframeOdometry, crop
+from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 
 MIN_POINTS = 20

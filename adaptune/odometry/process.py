@@ -1,22 +1,18 @@
-"""Odometries that are programs which run on: scans in and poses out, one after the other."""
+"""Odometries in programs of the user that receive scans and return poses, one after the other."""
 
 import contextlib
-import logging
 import os
 import signal
 import socket
 import subprocess
 import tempfile
-import threading
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, BinaryIO, Self, cast
 
 from pydantic import Field, model_validator
 
 from adaptune.odometry import wire
-from adaptune.odometry.base import BaseSettings, Box, Description, OdometryError
+from adaptune.odometry.base import BaseSettings, Description, OdometryError
 from adaptune.odometry.isolation import (
     ONE_THREAD,
     Arguments,
@@ -26,16 +22,20 @@ from adaptune.odometry.isolation import (
     last_lines,
     verdict,
 )
-from adaptune.odometry.registry import box_class
 from adaptune.space import ParameterSet
 
-_log = logging.getLogger(__name__)
-
 _FIRST_ANSWER = 60.0
-"""Seconds that a program may take to begin."""
+"""Seconds that a program may need to begin."""
 
 
-def _parse(address: str) -> tuple[socket.AddressFamily, Any]:
+def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
+    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``.
+
+    Raises
+    ------
+    OdometryError
+        If it is neither.
+    """
     kind, colon, rest = address.partition(":")
     if kind == "unix" and colon and rest:
         return socket.AF_UNIX, rest
@@ -51,11 +51,11 @@ class Settings(BaseSettings):
     Attributes
     ----------
     command : list of str, optional
-        Starts it; it speaks over its standard input and output.
+        Starts the program, which uses its standard input and output.
     address : str, optional
-        Where it listens: ``tcp://HOST:PORT`` or ``unix:PATH``.
+        Where the program listens: ``tcp://HOST:PORT`` or ``unix:PATH``.
     settings : dict
-        What the program is told as its settings.
+        Settings that the program receives.
     """
 
     command: Arguments | None = None
@@ -70,10 +70,10 @@ class Settings(BaseSettings):
 
 
 class Process(Isolated):
-    """An odometry in a program of the user's.
+    """An odometry in a program of the user.
 
-    Each instance has a program, or a connection, of its own, and keeps it from start to start:
-    a new one is wanted only after a fault.
+    Each instance has its own program or connection. It keeps that from start to start, and needs a
+    new one only after a fault.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class Process(Isolated):
         self.name = None
         self.parameters = dict(parameters)
         self.faults: list[str] = []
-        self.cpu = self.memory = self._cpu_before = 0.0
+        self._cpu = self._cpu_before = self._memory = 0.0
         self._settings = settings.settings
         self._limits = limits
         self._reach = settings
@@ -100,17 +100,17 @@ class Process(Isolated):
         self._written: Any = None
 
     @property
-    def _called(self) -> str:
+    def _label(self) -> str:
         return self._reach.command[0] if self._reach.command else str(self._reach.address)
 
     @staticmethod
     def describe(settings: Settings) -> Description:
-        """What the program says of itself.
+        """What the program reports about itself.
 
         Raises
         ------
         OdometryError
-            If it cannot be reached, or says something else.
+            If the program cannot be reached, or does not describe itself.
         """
         return _describe(settings.model_dump_json())
 
@@ -130,7 +130,7 @@ class Process(Isolated):
             self.close()
 
     def close(self) -> None:
-        """End the conversation, and the program if it was started here."""
+        """End the conversation, and the program if this instance started it."""
         super().close()
         if self._socket is not None:
             self._socket.close()
@@ -146,7 +146,7 @@ class Process(Isolated):
             self._socket = self._begin(self._reach.command)
         else:
             address = cast("str", self._reach.address)
-            family, where = _parse(address)
+            family, where = parse_address(address)
             self._socket = socket.socket(family)
             try:
                 self._socket.connect(where)
@@ -177,7 +177,7 @@ class Process(Isolated):
         return answer
 
     def _verdict(self, what: str) -> str:
-        """How the program ended, if it did, and the last lines that it wrote."""
+        """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._program is None:
             return what.replace("its process ended", "it ended the conversation")
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -190,60 +190,3 @@ class Process(Isolated):
 def _describe(settings: str) -> Description:
     reach = Settings.model_validate_json(settings)
     return Process({}, reach, Limits()).ask()
-
-
-def anywhere(name: str, parameters: ParameterSet, settings: BaseSettings) -> Box:
-    """An odometry in this process, or in one of its own if it is not clean."""
-    if box_class(name).clean:
-        return wire.here(name, parameters, settings)
-    return Isolated(name, parameters, settings, Limits())
-
-
-def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
-    """Answer all who connect, each with an instance of its own, until interrupted.
-
-    Parameters
-    ----------
-    address
-        ``tcp://HOST:PORT``, any free port if that is 0, or ``unix:PATH``.
-    name
-        Of the odometry.
-    ready
-        Called with the address when connections are accepted.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such odometry, or the address cannot be had.
-    """
-    box_class(name)
-    family, where = _parse(address)
-    with socket.socket(family) as server:
-        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            server.bind(where)
-        except OSError as error:
-            raise OdometryError(f"{address}: cannot listen there ({error.strerror})") from error
-        server.listen()
-        if family == socket.AF_INET:
-            host, port = server.getsockname()
-            address = f"tcp://{host}:{port}"
-        try:
-            ready(address)
-            while True:
-                connection, _ = server.accept()
-                threading.Thread(target=_converse, args=(connection, name), daemon=True).start()
-        finally:
-            if family == socket.AF_UNIX:
-                Path(where).unlink(missing_ok=True)
-
-
-def _converse(connection: socket.socket, name: str) -> None:
-    """Answer one who has connected; what goes wrong ends this conversation only."""
-    try:
-        with connection, connection.makefile("rb") as reader, connection.makefile("wb") as writer:
-            wire.serve(reader, writer, name, anywhere)
-    except (OSError, wire.WireError) as error:
-        _log.warning("a conversation ended: %s", error)
-    except Exception:
-        _log.exception("a conversation ended")

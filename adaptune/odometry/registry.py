@@ -1,42 +1,81 @@
 """The odometries by name, imported when they are asked for."""
 
 from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING
 
 from adaptune import plugins
 from adaptune.odometry.base import Odometry, OdometryError
 
+if TYPE_CHECKING:
+    from adaptune.odometry.command import Command
+    from adaptune.odometry.process import Process
+
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
 
-BOXES = {
-    "ct_icp": "adaptune.odometry.evalio:CtIcp",
-    "dlio": "adaptune.odometry.evalio:Dlio",
-    "evalio_kiss_icp": "adaptune.odometry.evalio:KissIcp",
-    "form": "adaptune.odometry.evalio:Form",
-    "genz_icp": "adaptune.odometry.evalio:GenzIcp",
+ODOMETRIES = {
+    "ct_icp": "adaptune.odometry.evalio.lidar:CtIcp",
+    "dlio": "adaptune.odometry.evalio.lidar_inertial:Dlio",
+    "evalio_kiss_icp": "adaptune.odometry.evalio.lidar:KissIcp",
+    "form": "adaptune.odometry.evalio.lidar:Form",
+    "genz_icp": "adaptune.odometry.evalio.lidar:GenzIcp",
     "gicp": "adaptune.odometry.gicp:KeyframeGicp",
     "kiss_icp": "adaptune.odometry.kiss_icp:Kiss",
-    "lio_sam": "adaptune.odometry.evalio:LioSam",
-    "loam": "adaptune.odometry.evalio:Loam",
-    "mad_icp": "adaptune.odometry.evalio:MadIcp",
+    "lio_sam": "adaptune.odometry.evalio.lidar_inertial:LioSam",
+    "loam": "adaptune.odometry.evalio.lidar:Loam",
+    "mad_icp": "adaptune.odometry.evalio.lidar:MadIcp",
     "ndt": "adaptune.odometry.ndt:KeyframeNdt",
     "rko_lio": "adaptune.odometry.rko_lio:RkoLio",
-    "vgicp": "adaptune.odometry.vgicp:KeyframeVgicp",
+    "vgicp": "adaptune.odometry.gicp:KeyframeVgicp",
 }
 
-_PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgicp": "small_gicp"}
-"""Packages that odometries of ours run on, where their module is not named as those are."""
+PROGRAMS = {
+    "command": "adaptune.odometry.command:Command",
+    "process": "adaptune.odometry.process:Process",
+}
+"""Programs of the user."""
+
+_PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
+"""Packages that our adapters run on, if the adapter's module has another name."""
+
+AnyOdometry = type[Odometry] | type["Command"] | type["Process"]
 
 
-def versions(box: type[Any]) -> dict[str, str]:
+def odometry_class(name: str) -> "AnyOdometry":
+    """Class of an odometry.
+
+    Parameters
+    ----------
+    name
+        One of `ODOMETRIES` or `PROGRAMS`, one that an installed package announces in the
+        entry-point group ``adaptune.odometries``, or ``module:Class``.
+
+    Raises
+    ------
+    OdometryError
+        If there is no such odometry, with the nearest name, or if the class cannot be used.
+    """
+    try:
+        found = plugins.load(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
+    except plugins.PluginError as error:
+        raise OdometryError(str(error)) from error
+    if name in PROGRAMS:
+        return found  # type: ignore[no-any-return]
+    if not (isinstance(found, type) and issubclass(found, Odometry)):
+        raise OdometryError(f"{name}: is not a class derived from adaptune.odometry.Odometry")
+    if lacking := [key for key in ("space", "live") if not hasattr(found, key)]:
+        raise OdometryError(f"{name}: the class has no attribute {' and no '.join(lacking)}")
+    return found
+
+
+def versions(odometry: "AnyOdometry") -> dict[str, str]:
     """Versions of what a trial's outcome may depend on: adaptune, numpy, the odometry's package."""
     names = {"adaptune", "numpy"}
-    package, _, module = box.__module__.rpartition(".")
-    if package == __package__:
-        names.add(_PACKAGES.get(module, module))
+    module = odometry.__module__
+    top = module.removeprefix(f"{__package__}.").partition(".")[0]
+    if module.startswith(f"{__package__}."):
+        names.add(_PACKAGES.get(top, top))
     else:
-        top = box.__module__.partition(".")[0]
         names |= set(metadata.packages_distributions().get(top, ()))
     found = {}
     for name in sorted(names):
@@ -44,36 +83,4 @@ def versions(box: type[Any]) -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue  # written by the user, or built in
-    return found
-
-
-PROGRAMS = {
-    "command": "adaptune.odometry.command:Command",
-    "process": "adaptune.odometry.process:Process",
-}
-"""Programs of the user's, which are no Python classes."""
-
-
-def box_class(name: str) -> type[Odometry]:
-    """Class of an odometry.
-
-    Parameters
-    ----------
-    name
-        One of `BOXES`, one that an installed package announces in the entry-point group
-        ``adaptune.odometries``, or ``module:Class``.
-
-    Raises
-    ------
-    OdometryError
-        Naming the nearest odometry there is, or telling why the class cannot be used.
-    """
-    try:
-        found = plugins.load(name, "odometry", BOXES | PROGRAMS, ENTRY_POINTS, "Class")
-    except plugins.PluginError as error:
-        raise OdometryError(str(error)) from error
-    if not (isinstance(found, type) and issubclass(found, Odometry)):
-        raise OdometryError(f"{name}: is not a class derived from adaptune.odometry.Odometry")
-    if lacking := [key for key in ("space", "live") if not hasattr(found, key)]:
-        raise OdometryError(f"{name}: the class has no attribute {' and no '.join(lacking)}")
     return found

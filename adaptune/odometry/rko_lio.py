@@ -16,14 +16,16 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import Anchored, BaseSettings, OdometryError
-from adaptune.sequence import Imu, Scan
+from adaptune.odometry.base import BaseSettings, OdometryError
+from adaptune.odometry.own_frame import OwnFrameOdometry
+from adaptune.sequence.imu import Imu
+from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
 
 MIN_POINTS = 20
 
 _LATER = 10**9
-"""Nanoseconds added to all stamps: at time 0 it believes that nothing has come yet."""
+"""Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
 
 
 class Settings(BaseSettings):
@@ -87,16 +89,16 @@ def _bindings() -> Any:
 
 
 with contextlib.suppress(OdometryError):
-    # Processes that are forked from one that has this module find it loaded.
+    # Processes that are forked from one with this module find it loaded.
     _bindings()
 
 
-class RkoLio(Anchored):
+class RkoLio(OwnFrameOdometry):
     """RKO-LIO (Malladi et al., RA-L 2026).
 
-    It reads its parameters when it begins, and begins at rest. It takes its first frame for level:
-    here that frame is turned so that the mean of the first accelerations points up. Its pose is
-    that of a scan's end.
+    It reads its parameters when it begins, and begins at rest. It assumes that its first frame is
+    level: the adapter turns that frame so that the mean of the first accelerations points up. Its
+    pose belongs to a scan's end.
     """
 
     space = ParameterSpace(
@@ -155,7 +157,7 @@ class RkoLio(Anchored):
         self._T_base_imu = self._T_base_sensor @ T_sensor_imu
         self._early: Sequence[tuple[int, Any, Any]] = ()
 
-    def _hand_over(self, prepared: Prepared) -> Poses | None:
+    def _process(self, prepared: Prepared) -> Poses | None:
         imu = prepared.imu
         measured = [
             *self._early,
@@ -163,7 +165,7 @@ class RkoLio(Anchored):
                 (imu.stamps + _LATER).tolist(), imu.acceleration, imu.angular_velocity, strict=True
             ),
         ]
-        # A measurement after the scan's end is of the motion to the next one.
+        # A measurement after the scan's end belongs to the motion to the next one.
         self._early = [one for one in measured if one[0] >= prepared.end]
         for stamp, acceleration, gyro in measured[: len(measured) - len(self._early)]:
             self._lio.add_imu_measurement(self._T_base_imu, acceleration, gyro, stamp)

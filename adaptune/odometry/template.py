@@ -24,14 +24,14 @@ _Place = tuple[tuple[str, ...], Any, Any]
 class Template:
     """A parameter file with values to be replaced.
 
-    A parameter goes by its keys from the outermost on, with points or slashes between them;
-    leading ones may be left out where what remains names one value only. Keys that hold points or
-    slashes themselves, as those of ROS do, are several; ROS 2's ``ros__parameters`` is none.
+    A parameter's name is its keys from the outermost on, with points or slashes between them.
+    Leading keys may be left out if the rest names one value only. Points and slashes within a key,
+    as in ROS, separate keys too; ROS 2's ``ros__parameters`` does not count.
 
     Parameters
     ----------
     path
-        Its suffix tells the format.
+        Its suffix gives the format.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class Template:
         return [".".join(path) for path, *_ in self._places]
 
     def fill(self, parameters: Mapping[str, Any]) -> str:
-        """The file's text with other values; those that are not in it are left aside."""
+        """The file's text with new values; parameters that are not in it are ignored."""
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
                 _, holder, key = place
@@ -124,7 +124,7 @@ def placeholders(argument: str) -> list[str]:
 
 
 def replace(argument: str, values: Mapping[str, Any]) -> str:
-    """Put values in the place of names in braces; those without a value stay."""
+    """Replace names in braces by their values; names without a value stay."""
     return _PLACEHOLDER.sub(
         lambda match: _text(values[match[1]]) if match[1] in values else match[0], argument
     )
@@ -140,7 +140,7 @@ def check_names(parameters: ParameterSet, template: Template | None, command: li
     Raises
     ------
     OdometryError
-        Naming the parameter that is neither in the template nor in the arguments.
+        If one is neither in the template nor in the arguments.
     """
     inside = {name for argument in command for name in placeholders(argument)}
     for name in parameters:

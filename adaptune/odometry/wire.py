@@ -17,18 +17,18 @@ type           holds                                                    answer
 ``configure``  parameters                                               ``done``
 =============  =======================================================  =========================
 
-or with ``refused`` and a ``message``, where it cannot do what is asked, or with ``fault`` and a
-``message``, where it has ended. What answers a hello holds version, odometry (its name), live,
+or with ``refused`` and a ``message`` if it cannot do what is asked, or with ``fault`` and a
+``message`` if it has ended. The answer to a hello holds version, odometry (its name), live,
 needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline.
-A pose comes with the stamp of its scan, with registered, and where they are known with cpu, the
-seconds that the odometry's process has computed, and memory, its peak in megabytes. A ``start``
+A pose comes with the stamp of its scan, with registered, and if they are known with cpu, the
+seconds of CPU time of the odometry's process, and memory, its peak in megabytes. A ``start``
 forgets all scans.
 
 Points are float32 of shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16,
-intensities float32, poses and motions float64 of shape (4, 4), stamps integer nanoseconds. What an
-IMU measured since the scan before are four arrays: imu_stamps, int64; imu, float64 of shape (n, 6),
-rad/s and m/s^2; imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,), see
-`adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
+intensities float32, poses and motions float64 of shape (4, 4), stamps integer nanoseconds. Four
+arrays hold what an IMU measured since the scan before: imu_stamps, int64; imu, float64 of shape
+(n, 6), rad/s and m/s^2; imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,),
+see `adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
 """
 
 import json
@@ -43,10 +43,17 @@ from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.odometry.base import BaseSettings, Box, Description, Odometry, OdometryError
-from adaptune.odometry.registry import box_class
-from adaptune.sequence import Imu, Scan
-from adaptune.sequence.imu import ImuNoise
+from adaptune.odometry.base import (
+    BaseSettings,
+    Description,
+    Odometry,
+    OdometryError,
+    OdometryInstance,
+)
+from adaptune.odometry.registry import odometry_class
+from adaptune.selection import Selection
+from adaptune.sequence.imu import Imu, ImuNoise
+from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
 
 VERSION = 2
@@ -61,14 +68,14 @@ _LONGEST_HEADER = 1 << 24
 
 
 class Readable(Protocol):
-    """What messages are read from."""
+    """A stream of messages."""
 
     def read(self, size: int, /) -> bytes:
-        """Read so many bytes, less only at the end."""
+        """Read so many bytes; fewer only at the end."""
 
 
 class WireError(AdaptuneError):
-    """A stream that does not hold messages of this version."""
+    """A stream without messages of this version."""
 
 
 class Message(NamedTuple):
@@ -130,7 +137,7 @@ def _exactly(stream: Readable, size: int) -> bytes:
 
 
 def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
-    """What a message holds of a scan beside its stamp."""
+    """A scan as the arrays of a message."""
     arrays: dict[str, NDArray[Any] | None] = {
         "points": scan.points,
         "times": scan.times,
@@ -157,19 +164,33 @@ def to_scan(message: Message) -> Scan:
     return Scan(message.header["stamp"], arrays["points"], times, rings, imu, intensities)
 
 
-Make = Callable[[str, ParameterSet, BaseSettings], Box]
+Make = Callable[[str, ParameterSet, BaseSettings], OdometryInstance]
 """Makes an odometry by its name."""
 
 
-def here(name: str, parameters: ParameterSet, settings: BaseSettings) -> Box:
-    """An odometry in this process."""
-    return box_class(name)(parameters, settings)
+def python_class(name: str) -> type[Odometry]:
+    """Class of an odometry that this process can run.
+
+    Raises
+    ------
+    OdometryError
+        If there is none, or it is a program of the user.
+    """
+    cls = odometry_class(name)
+    if not issubclass(cls, Odometry):
+        raise OdometryError(f"{name}: is a program of the user, not a class that can be served")
+    return cls
+
+
+def make_here(name: str, parameters: ParameterSet, settings: BaseSettings) -> OdometryInstance:
+    """Make an odometry in this process."""
+    return python_class(name)(parameters, settings)
 
 
 def hello(
     odometry: str | None, parameters: ParameterSet, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What begins a conversation; no name where the other side serves one odometry only."""
+    """First message of a conversation; no name if the other side serves one odometry only."""
     return {
         "type": "hello",
         "version": VERSION,
@@ -180,12 +201,12 @@ def hello(
 
 
 def announced(answer: Message) -> Description:
-    """What an odometry says of itself when it answers a hello.
+    """Description of an odometry in its answer to a hello.
 
     Raises
     ------
     WireError
-        If that is no answer of this version.
+        If the answer is not one of this version.
     """
     header = answer.header
     if header.get("version") != VERSION:
@@ -199,7 +220,9 @@ def announced(answer: Message) -> Description:
         raise WireError(f"its answer to hello does not describe it: {error}") from error
 
 
-def serve(reader: Readable, writer: BinaryIO, name: str | None = None, make: Make = here) -> None:
+def serve(
+    reader: Readable, writer: BinaryIO, name: str | None = None, make: Make = make_here
+) -> None:
     """Answer messages with an odometry until the stream ends.
 
     Parameters
@@ -214,14 +237,14 @@ def serve(reader: Readable, writer: BinaryIO, name: str | None = None, make: Mak
     Raises
     ------
     WireError
-        If what comes is no message.
+        If the stream holds something else than messages.
     """
-    box: Box | None = None
+    odometry: OdometryInstance | None = None
     while (message := receive(reader)) is not None:
         try:
             _check(message)
             if message.header["type"] == "hello":
-                served, cls, box = _make(message.header, name, make)
+                served, cls, odometry = _make(message.header, name, make)
                 send(
                     writer,
                     {
@@ -233,10 +256,10 @@ def serve(reader: Readable, writer: BinaryIO, name: str | None = None, make: Mak
                         "space": cls.space.dump(),
                     },
                 )
-            elif box is None:
+            elif odometry is None:
                 raise OdometryError("the first message must be a hello")
             else:
-                _answer(box, message, writer)
+                _answer(odometry, message, writer)
         except AdaptuneError as error:
             send(writer, {"type": "refused", "message": str(error)})
 
@@ -255,7 +278,7 @@ def _check(message: Message) -> None:
 
 def _make(
     hello: Mapping[str, Any], only: str | None, make: Make
-) -> tuple[str, type[Odometry], Box]:
+) -> tuple[str, type[Odometry], OdometryInstance]:
     if hello["version"] != VERSION:
         raise OdometryError(
             f"this adaptune speaks version {VERSION} of the protocol, not {hello['version']}"
@@ -265,7 +288,7 @@ def _make(
         raise OdometryError("the hello names no odometry; name it, or serve one: adaptune serve X")
     if only not in (None, name):
         raise OdometryError(f"only {only} is served here, not {name}")
-    cls = box_class(name)
+    cls = python_class(name)
     try:
         settings = cls.settings_type.model_validate(hello["settings"])
     except ValidationError as error:
@@ -279,21 +302,22 @@ def _usage() -> dict[str, float]:
     return {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
 
 
-def _answer(box: Box, message: Message, writer: BinaryIO) -> None:
+def _answer(odometry: OdometryInstance, message: Message, writer: BinaryIO) -> None:
     header, arrays = message
     if header["type"] == "register":
-        T_odom_sensor, registered = box.register(box.prepare(to_scan(message)))
+        T_odom_sensor, registered = odometry.register(odometry.prepare(to_scan(message)))
         pose: Poses = np.asarray(T_odom_sensor, np.float64)
-        if (faults := getattr(box, "faults", None)) and not np.isfinite(pose).all():
-            send(writer, {"type": "fault", "message": faults[-1]})
+        if odometry.faults and not np.isfinite(pose).all():
+            send(writer, {"type": "fault", "message": odometry.faults[-1]})
             return
         answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
         send(writer, answer | _usage(), pose=pose)
         return
     if header["type"] == "start":
-        # Arrays from the stream are read-only; poses are an odometry's own to keep.
+        # Arrays from the stream are read-only; an odometry may change its poses.
         motion = arrays["motion"].copy() if "motion" in arrays else None
-        box.start(box.prepare(to_scan(message)), arrays["pose"].copy(), motion)
+        odometry.start(odometry.prepare(to_scan(message)), arrays["pose"].copy(), motion)
     else:
-        box.configure(header["parameters"])
+        # A single odometry applies the parameters only.
+        odometry.apply(Selection(trial=-1, parameters=header["parameters"]))
     send(writer, {"type": "done"})

@@ -7,12 +7,14 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
-from adaptune.odometry import Command, Description, Odometry, OdometryError
+from adaptune.odometry.base import Description, Odometry, OdometryError
+from adaptune.odometry.command import Command
+from adaptune.odometry.registry import odometry_class
 from adaptune.sequence.config import SequenceConfig, check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import Mistake, validated
-from adaptune.study.tuned import describe_odometry, odometry_type, tuned_space, whole_definition
+from adaptune.study.tuned import describe_odometry, tuned_space, whole_definition
 
 C = TypeVar("C", bound=StudyConfig)
 
@@ -105,7 +107,7 @@ def _check_odometry(data: dict[str, Any], mistakes: list[Mistake], folder: Path)
     if not isinstance(name, str):
         return
     try:
-        odometry = odometry_type(name)
+        odometry = odometry_class(name)
     except OdometryError as error:
         mistakes.append(Mistake(("odometry", "name"), str(error)))
         return

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adaptune.odometry.command import Material, material
+from adaptune.odometry.program_input import ProgramInput, program_input
 from adaptune.sequence.bag import bag_paths
 from adaptune.sequence.config import SequenceConfig, ViewConfig, open_sequence
 from adaptune.sequence.export import Layout
@@ -15,7 +15,7 @@ from adaptune.sequence.views import OF_VIEW, WithImu, origin
 from adaptune.simulation.course import Course
 from adaptune.study.mistakes import ConfigurationError
 
-_materials: dict[tuple[str, str], Material] = {}
+_inputs: dict[tuple[str, str], ProgramInput] = {}
 """What programs read, by folder and everything that it depends on."""
 
 
@@ -103,13 +103,13 @@ class StudySequences:
             "recording": self.recording_size(name),
         }
 
-    def material(self, name: str) -> Material:
+    def program_input(self, name: str) -> ProgramInput:
         """A sequence as a program reads it."""
         folder = self.folder / "inputs" / name
         # 2: with intensities.
         about = {"version": 2, "input": self.layout} | self.identity(name)
         key = str(folder), json.dumps(about)
-        if key not in _materials:
+        if key not in _inputs:
             config = self.config(name)
-            _materials[key] = material(self.open(name), config, about, folder, self.layout)
-        return _materials[key]
+            _inputs[key] = program_input(self.open(name), config, about, folder, self.layout)
+        return _inputs[key]

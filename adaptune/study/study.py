@@ -11,7 +11,7 @@ from typing import Any, Generic, Literal
 from typing_extensions import TypeVar
 
 from adaptune.cores import available
-from adaptune.odometry import WarmUp
+from adaptune.odometry.base import WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.sequence.views import OF_VIEW
 from adaptune.study.config import StudyConfig
@@ -67,7 +67,7 @@ class Study(Generic[C_co]):
             odometry_settings(config),
             tuned_space(config, described),
             self.config.isolation,
-            self.sequences.material if described.whole else None,
+            self.sequences.program_input if described.whole else None,
             self.config.training,
         )
 

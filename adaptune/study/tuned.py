@@ -3,27 +3,20 @@
 from collections.abc import Mapping
 from typing import Any
 
-from adaptune.odometry import Command, Description, Odometry, Process, box_class
+from adaptune.odometry.base import Description
+from adaptune.odometry.registry import odometry_class
 from adaptune.space import ParameterSpace
 from adaptune.study.config import OdometryConfig
 
 
-def odometry_type(name: str) -> type[Odometry] | type[Command] | type[Process]:
-    """Class of an odometry or a program."""
-    if name == "command":
-        return Command
-    return Process if name == "process" else box_class(name)
-
-
 def odometry_settings(config: OdometryConfig) -> Any:
     """Settings of the odometry."""
-    return odometry_type(config.name).settings_type.model_validate(config.settings)
+    return odometry_class(config.name).settings_type.model_validate(config.settings)
 
 
 def describe_odometry(config: OdometryConfig) -> Description:
     """Description of the odometry with its settings."""
-    described: Any = odometry_type(config.name)
-    return described.describe(odometry_settings(config))  # type: ignore[no-any-return]
+    return odometry_class(config.name).describe(odometry_settings(config))
 
 
 def tuned_space(config: OdometryConfig, described: Description) -> ParameterSpace:

@@ -6,8 +6,10 @@ import pytest
 from adaptune.archive import Frames, Trial
 from adaptune.geometry import invert, steps
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import Bank, Odometry, WarmUp
+from adaptune.odometry import Odometry, WarmUp
+from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Registration
+from adaptune.selection import Selection
 from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
@@ -145,12 +147,12 @@ def test_it_is_what_a_bank_does():
     weights = rng.dirichlet(np.ones(3), 6)
     simulation, _ = simulated(trials, weights[0])
     sets = [{"number": float(i)} for i in range(3)]
-    box = Bank(lambda p: Recorded(p, trials), sets, WarmUp(), 1e9)
+    box = Bank(lambda p: Recorded(p, trials), dict(enumerate(sets)), WarmUp(), 1e9)
     f = frames()
     poses = [np.eye(4)]
     for i, stamp in enumerate(f.stamps):
         prepared = box.prepare(Scan(int(stamp), np.zeros((30, 3), np.float32)))
-        box.weigh(weights[i // 10])
+        box.apply(Selection(0, {}, dict(enumerate(weights[i // 10]))))
         if i == 0:
             box.start(prepared, np.eye(4))
         else:

@@ -10,8 +10,9 @@ from adaptune.descriptor import DescriptorError
 from adaptune.descriptor.ndt import describe
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, PairedFusion, Selection
-from adaptune.odometry import HealthCheck, Odometry, OdometryError, Registration
+from adaptune.odometry import Odometry, OdometryError, Registration
 from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.health import HealthCheck
 from adaptune.sequence import Scan
 from adaptune.simulation import Course, simulate
 from adaptune.space import Float, ParameterSpace

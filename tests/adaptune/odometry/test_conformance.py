@@ -7,36 +7,36 @@ import hashlib
 import os
 import subprocess
 import sys
-import tempfile
-import threading
-from functools import cache
-from pathlib import Path
 
-import drives
 import numpy as np
-import program
 import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
+from street import (
+    N_SCANS,
+    STEP,
+    drive,
+    is_live,
+    make,
+    poor_scan,
+    prepared_drive,
+    scan,
+    space_of,
+    usual_drive,
+)
 
 from adaptune import cores
 from adaptune.geometry import invert
-from adaptune.odometry import BOXES, Command, Limits, OdometryError, Process, box_class
+from adaptune.odometry import OdometryError
 from adaptune.odometry.base import prepared_bytes
-from adaptune.odometry.command import Material
-from adaptune.odometry.process import listen
-from adaptune.odometry.registry import PROGRAMS
+from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
+from adaptune.selection import Selection
 from adaptune.sequence import Scan
-from adaptune.space import Float, ParameterSpace
 
-STEP = 0.4
-"""Metres between scans."""
-N_SCANS = 16
-
-CLEAN = [name for name in BOXES if box_class(name).clean]
+CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 """Those that live in this process; test_conformance_isolated.py holds what the others must do."""
 
-every_box = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS])
+every_odometry = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS])
 
 # The program registers each scan to the one before.
 DRIFT = {"command": 0.15}
@@ -46,115 +46,6 @@ scan_by_scan = pytest.mark.parametrize("name", [*CLEAN, "process"])
 
 # A study gives programs a value for every parameter.
 in_python = pytest.mark.parametrize("name", CLEAN)
-
-
-def make(name, parameters=None):
-    """A new instance; of programs, keyframe GICP that is served and program.py."""
-    if name == "process":
-        return Process(parameters or {}, _served(), Limits(seconds=60.0))
-    if name == "command":
-        given = space_of(name).baseline | (parameters or {})
-        settings, recording = _run_on_the_drive()
-        Command.check(settings, given)
-        return Command(given, settings, Limits(seconds=10.0), lambda: recording, strict=True)
-    return box_class(name)(parameters)
-
-
-def space_of(name):
-    if name == "command":
-        return ParameterSpace(
-            {
-                "registration.voxel": Float(low=0.2, high=2.0, baseline=0.5, log=True),
-                "registration.distance": Float(low=0.5, high=4.0, baseline=2.0, log=True),
-            }
-        )
-    return Process.describe(_served()).space if name == "process" else box_class(name).space
-
-
-def is_live(name):
-    return name != "command" and box_class("gicp" if name == "process" else name).live
-
-
-@cache
-def _served():
-    """How to reach keyframe GICP behind a socket."""
-    there, ready = [], threading.Event()
-
-    def tell(at):
-        there.append(at)
-        ready.set()
-
-    threading.Thread(target=listen, args=("tcp://127.0.0.1:0", "gicp", tell), daemon=True).start()
-    assert ready.wait(10.0)
-    return Process.settings_type(address=there[0])
-
-
-@cache
-def _run_on_the_drive():
-    """A program's settings, and the drive as a bag for it."""
-    folder = Path(_folder.name)
-    scans = [(scan(i).stamp, scan(i).points, np.eye(4)) for i in range(N_SCANS)]
-    bag = drives.write_bag(folder / "drive.bag", scans)
-    (folder / "program.json").write_text('{"registration": {"voxel": 1, "distance": 1}}')
-    arguments = (program.__file__, "{input}", "{points}", "{output}", "{parameters}")
-    settings = Command.settings_type(
-        command=(sys.executable, *arguments), template=str(folder / "program.json")
-    )
-    stamps = np.array([stamp for stamp, *_ in scans], np.int64)
-    return settings, Material(bag, "/points", "", stamps, None)
-
-
-_folder = tempfile.TemporaryDirectory()
-
-
-@cache
-def street():
-    """Points of a ground, two walls and poles along x, of shape (n, 3)."""
-    rng = np.random.default_rng(1)
-    u = rng.uniform(-1, 1, (9000, 2))
-    ground = np.c_[45 * u[:3000, 0], 9 * u[:3000, 1], np.full(3000, -1.7)]
-    walls = np.c_[45 * u[3000:, 0], 9 * rng.choice([-1, 1], 6000), 2 + 4 * u[3000:, 1]]
-    at = rng.uniform((-35, -8), (45, 8), (16, 2))[rng.integers(0, 16, 3500)]
-    around = rng.uniform(0, 2 * np.pi, 3500)
-    poles = np.c_[
-        at[:, 0] + 0.3 * np.cos(around), at[:, 1] + 0.3 * np.sin(around), rng.uniform(-1.7, 3, 3500)
-    ]
-    return np.concatenate([ground, walls, poles])
-
-
-@cache
-def scan(i):
-    """Scan `i` of a drive straight ahead."""
-    rng = np.random.default_rng(i)
-    points = street()[rng.random(len(street())) < 0.5] - [STEP * i, 0.0, 0.0]
-    points += rng.normal(0, 0.01, points.shape)
-    return Scan(i * 10**8, points.astype(np.float32))
-
-
-def poor_scan(n, i=0):
-    """A scan of `n` points all over the place, or one that is all NaN, in the place of scan `i`."""
-    if n == "NaN":
-        return Scan(i * 10**8, np.full((5000, 3), np.nan, np.float32))
-    points = np.random.default_rng(n).uniform(2.0, 9.0, (n, 3))
-    return Scan(i * 10**8, points.astype(np.float32))
-
-
-@cache
-def prepared_drive(name):
-    box = make(name)
-    return [box.prepare(scan(i)) for i in range(N_SCANS)]
-
-
-def drive(box, prepared, T_odom_sensor=None):
-    """Start with the first scan and register the others; poses of shape (n, 4, 4)."""
-    T = np.eye(4) if T_odom_sensor is None else T_odom_sensor
-    box.start(prepared[0], T)
-    return np.array([T, *(box.register(p).T_odom_sensor for p in prepared[1:])])
-
-
-@cache
-def usual_drive(name):
-    return drive(make(name), prepared_drive(name))
 
 
 def assert_rigid(T):
@@ -167,22 +58,22 @@ def assert_rigid(T):
     np.testing.assert_array_equal(T[..., 3, :], np.broadcast_to([0, 0, 0, 1], T[..., 3, :].shape))
 
 
-@every_box
+@every_odometry
 def test_begins_at_the_identity(name):
     first = prepared_drive(name)[0]
-    box = make(name)
-    box.start(first, np.eye(4))
-    T_odom_sensor, registered = box.register(first)
+    odometry = make(name)
+    odometry.start(first, np.eye(4))
+    T_odom_sensor, registered = odometry.register(first)
     assert registered
     np.testing.assert_allclose(T_odom_sensor, np.eye(4), atol=1e-2)
 
 
-@every_box
+@every_odometry
 def test_straight_ahead_is_along_x(name):
-    box = make(name)
+    odometry = make(name)
     prepared = prepared_drive(name)
-    box.start(prepared[0], np.eye(4))
-    registrations = [box.register(p) for p in prepared[1:]]
+    odometry.start(prepared[0], np.eye(4))
+    registrations = [odometry.register(p) for p in prepared[1:]]
     assert all(r.registered for r in registrations)
     T = np.array([r.T_odom_sensor for r in registrations])
     assert_rigid(T)
@@ -191,7 +82,7 @@ def test_straight_ahead_is_along_x(name):
     np.testing.assert_allclose(T[:, :3, :3], np.tile(np.eye(3), (len(T), 1, 1)), atol=0.01)
 
 
-@every_box
+@every_odometry
 def test_the_same_scans_give_the_same_bytes_on_one_core(name):
     # A process of its own: threads that Open3D has already started would not be pinned.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -213,7 +104,7 @@ def digests(name):
         sys.stdout.write(hashlib.sha256(poses.tobytes()).hexdigest() + "\n")
 
 
-@every_box
+@every_odometry
 def test_a_second_instance_is_fresh(name):
     prepared = prepared_drive(name)
     first, second = make(name), make(name)
@@ -221,7 +112,7 @@ def test_a_second_instance_is_fresh(name):
     np.testing.assert_allclose(drive(second, prepared), usual_drive(name), atol=1e-6)
 
 
-@every_box
+@every_odometry
 def test_two_instances_side_by_side_do_not_meet(name):
     prepared = prepared_drive(name)
     there, back = make(name), make(name)
@@ -234,15 +125,15 @@ def test_two_instances_side_by_side_do_not_meet(name):
     assert T_back[0, 3] == pytest.approx(-STEP * (N_SCANS - 1), abs=DRIFT.get(name, 0.1))
 
 
-@every_box
+@every_odometry
 def test_start_forgets_all_before(name):
     prepared = prepared_drive(name)
-    box = make(name)
-    drive(box, prepared[::-1])
-    np.testing.assert_allclose(drive(box, prepared), usual_drive(name), atol=1e-6)
+    odometry = make(name)
+    drive(odometry, prepared[::-1])
+    np.testing.assert_allclose(drive(odometry, prepared), usual_drive(name), atol=1e-6)
 
 
-@every_box
+@every_odometry
 def test_where_it_starts_does_not_matter(name):
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.2, -0.3]).as_matrix()
@@ -261,22 +152,22 @@ def test_it_goes_on_from_a_pose_and_a_motion(name):
     T[:3, 3] = 5.0, 6.0, 7.0
     T_previous_current = np.eye(4)
     T_previous_current[0, 3] = STEP
-    box = make(name)
-    box.start(prepared[4], T, T_previous_current)
+    odometry = make(name)
+    odometry.start(prepared[4], T, T_previous_current)
     # With nothing to register, the motion it was given goes on.
-    T_next, registered = box.register(box.prepare(poor_scan(0, 5)))
+    T_next, registered = odometry.register(odometry.prepare(poor_scan(0, 5)))
     assert not registered
     np.testing.assert_allclose(T_next, T @ T_previous_current, atol=1e-9)
     for i in range(6, N_SCANS):
-        T_next = box.register(prepared[i]).T_odom_sensor
+        T_next = odometry.register(prepared[i]).T_odom_sensor
         np.testing.assert_allclose(T_next[:3, 3], [5.0, 6.0 + STEP * (i - 4), 7.0], atol=0.1)
 
 
 @scan_by_scan
 def test_without_a_motion_it_stood_still(name):
-    box = make(name)
-    box.start(prepared_drive(name)[0], np.eye(4))
-    T_odom_sensor, registered = box.register(box.prepare(poor_scan(3)))
+    odometry = make(name)
+    odometry.start(prepared_drive(name)[0], np.eye(4))
+    T_odom_sensor, registered = odometry.register(odometry.prepare(poor_scan(3)))
     assert not registered
     np.testing.assert_allclose(T_odom_sensor, np.eye(4), atol=1e-12)
 
@@ -285,15 +176,15 @@ def test_without_a_motion_it_stood_still(name):
 @pytest.mark.parametrize("n", [0, 1, 4, 19, "NaN"])
 def test_a_poor_scan_keeps_the_last_motion(name, n):
     prepared = prepared_drive(name)
-    box = make(name)
-    T_before, T = drive(box, prepared[:6])[-2:]
+    odometry = make(name)
+    T_before, T = drive(odometry, prepared[:6])[-2:]
     for i in (6, 7):
-        T_next, registered = box.register(box.prepare(poor_scan(n, i)))
+        T_next, registered = odometry.register(odometry.prepare(poor_scan(n, i)))
         assert not registered
         np.testing.assert_allclose(T_next, T @ invert(T_before) @ T, atol=1e-6)
         T_before, T = T, T_next
     for i in range(8, N_SCANS):
-        T_next, registered = box.register(prepared[i])
+        T_next, registered = odometry.register(prepared[i])
         assert registered
         np.testing.assert_allclose(T_next[:3, 3], [STEP * i, 0, 0], atol=0.1)
 
@@ -302,11 +193,11 @@ def test_a_poor_scan_keeps_the_last_motion(name, n):
 @pytest.mark.parametrize("n", [0, 5, 19])
 def test_a_poor_first_scan(name, n):
     prepared = prepared_drive(name)
-    box = make(name)
+    odometry = make(name)
     T = np.eye(4)
     T[:3, 3] = 1.0, 2.0, 3.0
-    box.start(box.prepare(poor_scan(n)), T)
-    poses = np.array([box.register(p).T_odom_sensor for p in prepared])
+    odometry.start(odometry.prepare(poor_scan(n)), T)
+    poses = np.array([odometry.register(p).T_odom_sensor for p in prepared])
     assert_rigid(poses)
     np.testing.assert_allclose(poses[0], T, atol=1e-9)
     way = poses[:, :3, 3] - T[:3, 3]
@@ -317,10 +208,10 @@ def test_a_poor_first_scan(name, n):
 @scan_by_scan
 @pytest.mark.parametrize("scale", [0.005, 1e4], ids=["near", "far"])
 def test_points_that_are_all_too_near_or_too_far_make_a_poor_scan(name, scale):
-    box = make(name)
-    T_before, T = drive(box, prepared_drive(name)[:6])[-2:]
+    odometry = make(name)
+    T_before, T = drive(odometry, prepared_drive(name)[:6])[-2:]
     points = scan(6).points * np.float32(scale)
-    T_next, registered = box.register(box.prepare(Scan(scan(6).stamp, points)))
+    T_next, registered = odometry.register(odometry.prepare(Scan(scan(6).stamp, points)))
     assert not registered
     np.testing.assert_allclose(T_next, T @ invert(T_before) @ T, atol=1e-6)
 
@@ -328,18 +219,18 @@ def test_points_that_are_all_too_near_or_too_far_make_a_poor_scan(name, scale):
 @scan_by_scan
 @pytest.mark.parametrize("n", [26, 32, 36])
 def test_a_scan_that_stays_where_it_was_predicted_is_counted(name, n):
-    box = make(name)
-    T_before, T = drive(box, prepared_drive(name)[:6])[-2:]
-    T_next, registered = box.register(box.prepare(poor_scan(n, 6)))
+    odometry = make(name)
+    T_before, T = drive(odometry, prepared_drive(name)[:6])[-2:]
+    T_next, registered = odometry.register(odometry.prepare(poor_scan(n, 6)))
     if np.allclose(T_next, T @ invert(T_before) @ T, atol=1e-9):
         assert not registered
 
 
 @scan_by_scan
 def test_prepared_scans_say_what_they_take(name):
-    box, points = make(name), np.random.default_rng(0).uniform(-50, 50, (200_000, 3))
+    odometry, points = make(name), np.random.default_rng(0).uniform(-50, 50, (200_000, 3))
     times = np.linspace(0, 0.1, len(points), dtype=np.float32)
-    prepared = box.prepare(Scan(0, points.astype(np.float32), times))
+    prepared = odometry.prepare(Scan(0, points.astype(np.float32), times))
     cloud = getattr(prepared, "cloud", prepared).points
     held = np.asarray(cloud() if callable(cloud) else cloud).nbytes
     assert prepared_bytes(prepared) >= 0.9 * held > 1e5
@@ -364,15 +255,15 @@ def test_every_parameter_takes_effect(name, parameter):
 
 @in_python
 def test_parameters_not_given_keep_their_baseline(name):
-    cls = box_class(name)
+    cls = odometry_class(name)
     first = cls.space.names[0]
     given = {first: cls.space.parameters[first].from_unit(0.9)}
-    box = cls(given)
-    assert box.parameters == cls.space.baseline | given
+    odometry = cls(given)
+    assert odometry.parameters == cls.space.baseline | given
     assert cls().parameters == cls.space.baseline
-    cls.space.check(box.parameters)
+    cls.space.check(odometry.parameters)
     if cls.live:
-        box.configure({first: cls.space.parameters[first].from_unit(0.1)})
+        odometry.configure({first: cls.space.parameters[first].from_unit(0.1)})
     assert given == {first: cls.space.parameters[first].from_unit(0.9)}
     assert cls().parameters == cls.space.baseline
 
@@ -382,41 +273,41 @@ def test_the_same_parameters_again_change_nothing(name):
     prepared = prepared_drive(name)
     if not is_live(name):
         return
-    box = make(name, space_of(name).baseline)
-    box.start(prepared[0], np.eye(4))
+    odometry = make(name, space_of(name).baseline)
+    odometry.start(prepared[0], np.eye(4))
     poses = [np.eye(4)]
     for p in prepared[1:]:
-        box.configure(dict(box.parameters))
-        poses.append(box.register(p).T_odom_sensor)
+        odometry.apply(Selection(0, dict(odometry.parameters)))
+        poses.append(odometry.register(p).T_odom_sensor)
     np.testing.assert_allclose(poses, usual_drive(name), atol=1e-6)
 
 
-@every_box
+@every_odometry
 def test_parameters_change_between_scans_or_not_at_all(name):
     space, prepared = space_of(name), prepared_drive(name)
     (other,) = space.from_unit(np.zeros((1, len(space))))
-    box = make(name, space.baseline)
-    T = drive(box, prepared[:6])[-1]
+    odometry = make(name, space.baseline)
+    T = drive(odometry, prepared[:6])[-1]
     if not is_live(name):
         with pytest.raises(OdometryError, match="cannot change its parameters"):
-            box.configure(other)
-        assert box.parameters == space.baseline
+            odometry.apply(Selection(0, other))
+        assert odometry.parameters == space.baseline
         return
-    box.configure(other)
-    assert box.parameters == other
-    poses = np.array([box.register(p).T_odom_sensor for p in prepared[6:]])
+    odometry.apply(Selection(0, other))
+    assert odometry.parameters == other
+    poses = np.array([odometry.register(p).T_odom_sensor for p in prepared[6:]])
     # From here on it is another odometry, at the same place.
     assert np.abs(poses - usual_drive(name)[6:]).max() > 1e-5
     assert np.linalg.norm(poses[0, :3, 3] - T[:3, 3] - [STEP, 0, 0]) < 0.2
     # What is given before the start is as if given to a new instance.
     early = make(name)
-    early.configure(other)
+    early.apply(Selection(0, other))
     np.testing.assert_allclose(
         drive(early, prepared), drive(make(name, other), prepared), atol=1e-6
     )
 
 
-@every_box
+@every_odometry
 def test_preparing_leaves_the_scan_and_serves_all_instances(name):
     points = scan(0).points.copy()
     times = np.linspace(0.0, 0.09, len(points), dtype=np.float32)
@@ -429,24 +320,23 @@ def test_preparing_leaves_the_scan_and_serves_all_instances(name):
     assert prepared_bytes(prepared[0]) > 0
 
 
-@every_box
+@every_odometry
 def test_parameters_that_do_not_exist_are_refused(name):
     words = "voxl: no argument holds|has no parameter 'voxl'"
     with pytest.raises(OdometryError, match=words):  # noqa: PT012 - a program is asked at its start
-        box = make(name, space_of(name).baseline | {"voxl": 1.0})
-        box.start(prepared_drive(name)[0], np.eye(4))
+        odometry = make(name, space_of(name).baseline | {"voxl": 1.0})
+        odometry.start(prepared_drive(name)[0], np.eye(4))
     if is_live(name):
-        box = make(name)
-        box.start(prepared_drive(name)[0], np.eye(4))
+        odometry = make(name)
+        odometry.start(prepared_drive(name)[0], np.eye(4))
         with pytest.raises(OdometryError, match="has no parameter 'voxl'"):
-            box.configure({"voxl": 1.0})
+            odometry.apply(Selection(0, {"voxl": 1.0}))
 
 
-@every_box
+@every_odometry
 def test_settings_that_do_not_exist_are_refused(name):
-    cls = {"process": Process, "command": Command}.get(name) or box_class(name)
     with pytest.raises(ValidationError, match="donwsampling"):
-        cls.settings_type(donwsampling=0.5)
+        odometry_class(name).settings_type(donwsampling=0.5)
 
 
 @pytest.mark.parametrize(
@@ -454,7 +344,7 @@ def test_settings_that_do_not_exist_are_refused(name):
 )
 def test_an_odometry_that_does_not_exist(name, help_):
     with pytest.raises(OdometryError, match=help_):
-        box_class(name)
+        odometry_class(name)
 
 
 if __name__ == "__main__":

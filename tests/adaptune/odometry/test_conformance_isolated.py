@@ -8,19 +8,22 @@ from needs import lacking
 from turns import STEP, measured
 
 from adaptune.geometry import invert
-from adaptune.odometry import BOXES, Isolated, Limits, OdometryError, box_class
+from adaptune.odometry import OdometryError
+from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.registry import ODOMETRIES, odometry_class
+from adaptune.selection import Selection
 from adaptune.sequence import Scan
 
-NAMES = [name for name in BOXES if not box_class(name).clean]
+NAMES = [name for name in ODOMETRIES if not odometry_class(name).clean]
 """test_conformance.py holds what the others must do."""
 
-every_box = pytest.mark.parametrize("name", NAMES)
+every_odometry = pytest.mark.parametrize("name", NAMES)
 
 
 @pytest.fixture(autouse=True)
 def _installed(name):
     try:
-        box_class(name)()
+        odometry_class(name)()
     except OdometryError as error:
         lacking("rko_lio" if name == "rko_lio" else "evalio", str(error))
 
@@ -31,17 +34,19 @@ TOLERANCE = {"ct_icp": 0.1, "form": 0.1, "loam": 0.1, "dlio": 0.8, "lio_sam": 0.
 
 
 def isolated(name, parameters=None):
-    return Isolated(name, parameters or {}, box_class(name).settings_type(), Limits(seconds=60.0))
+    return Isolated(
+        name, parameters or {}, odometry_class(name).settings_type(), Limits(seconds=60.0)
+    )
 
 
-def drive(box, T_odom_sensor=None, n=N_SCANS):
+def drive(odometry, T_odom_sensor=None, n=N_SCANS):
     """Start with the first scan and register the others; poses of shape (n, 4, 4)."""
     T = np.eye(4) if T_odom_sensor is None else T_odom_sensor
     moved = np.eye(4)
     moved[0, 3] = STEP
     # LIO-SAM waits for two scans more before its first pose.
-    box.start(box.prepare(measured(0)), T, moved if box.name == "lio_sam" else None)
-    registrations = (box.register(box.prepare(measured(i))) for i in range(1, n))
+    odometry.start(odometry.prepare(measured(0)), T, moved if odometry.name == "lio_sam" else None)
+    registrations = (odometry.register(odometry.prepare(measured(i))) for i in range(1, n))
     return np.array([T, *(registration.T_odom_sensor for registration in registrations)])
 
 
@@ -50,7 +55,7 @@ def usual_drive(name):
     return drive(isolated(name))
 
 
-@every_box
+@every_odometry
 def test_straight_ahead_is_along_x(name):
     T = usual_drive(name)
     tolerance = TOLERANCE.get(name, 0.3)
@@ -63,14 +68,16 @@ def test_straight_ahead_is_along_x(name):
 REPEATS = {"dlio": 0.02}
 
 
-@every_box
+@every_odometry
 def test_a_new_start_is_fresh_and_the_same_to_the_last_bit(name):
-    box = isolated(name)
-    drive(box, n=3)
-    np.testing.assert_allclose(drive(box), usual_drive(name), rtol=0.0, atol=REPEATS.get(name, 0.0))
+    odometry = isolated(name)
+    drive(odometry, n=3)
+    np.testing.assert_allclose(
+        drive(odometry), usual_drive(name), rtol=0.0, atol=REPEATS.get(name, 0.0)
+    )
 
 
-@every_box
+@every_odometry
 def test_where_it_starts_does_not_matter(name):
     T = np.eye(4)
     T[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -80,38 +87,38 @@ def test_where_it_starts_does_not_matter(name):
     )
 
 
-@every_box
+@every_odometry
 @pytest.mark.parametrize("poor", ["empty", "few", "NaN"])
 def test_a_poor_scan_keeps_the_last_motion(name, poor):
-    box = isolated(name)
-    T_before, T = drive(box, n=4)[-2:]
+    odometry = isolated(name)
+    T_before, T = drive(odometry, n=4)[-2:]
     full = measured(4)
     points = np.full_like(full.points, np.nan) if poor == "NaN" else full.points
     n = {"empty": 0, "few": 15, "NaN": None}[poor]
     scan = Scan(full.stamp, points[:n], full.times[:n], full.rings[:n], full.imu)
-    T_next, registered = box.register(box.prepare(scan))
+    T_next, registered = odometry.register(odometry.prepare(scan))
     assert not registered
     np.testing.assert_allclose(T_next, T @ invert(T_before) @ T, atol=1e-6)
-    assert box.register(box.prepare(measured(5))).registered
-    assert not box.faults
+    assert odometry.register(odometry.prepare(measured(5))).registered
+    assert not odometry.faults
 
 
-@every_box
+@every_odometry
 def test_a_poor_first_scan(name):
-    box = isolated(name)
+    odometry = isolated(name)
     T, T_previous_current = np.eye(4), np.eye(4)
     T[1, 3], T_previous_current[0, 3] = 5.0, 0.3
     few = measured(0).select(np.arange(10))
-    box.start(box.prepare(few), T, T_previous_current)
-    T_next, _ = box.register(box.prepare(measured(1)))
+    odometry.start(odometry.prepare(few), T, T_previous_current)
+    T_next, _ = odometry.register(odometry.prepare(measured(1)))
     np.testing.assert_allclose(T_next, T @ T_previous_current, atol=1e-12)
     for i in range(2, 6):
-        T_next, registered = box.register(box.prepare(measured(i)))
+        T_next, registered = odometry.register(odometry.prepare(measured(i)))
     assert registered
     np.testing.assert_allclose(T_next[:3, 3], [0.3 + 4 * STEP, 5.0, 0.0], atol=1.0)
 
 
-@every_box
+@every_odometry
 def test_two_instances_side_by_side_do_not_meet(name):
     there, other = isolated(name), isolated(name)
     other.start(other.prepare(measured(9)), np.eye(4))
@@ -126,15 +133,15 @@ def test_two_instances_side_by_side_do_not_meet(name):
     np.testing.assert_allclose(poses, drive_there[1:], rtol=0.0, atol=REPEATS.get(name, 0.0))
 
 
-@every_box
+@every_odometry
 def test_what_it_does_not_know_is_refused(name):
-    box = isolated(name, {"voxl": 1.0})
+    odometry = isolated(name, {"voxl": 1.0})
     with pytest.raises(OdometryError, match="has no parameter 'voxl'"):
-        box.start(box.prepare(measured(0)), np.eye(4))
-    box = isolated(name)
-    box.start(box.prepare(measured(0)), np.eye(4))
+        odometry.start(odometry.prepare(measured(0)), np.eye(4))
+    odometry = isolated(name)
+    odometry.start(odometry.prepare(measured(0)), np.eye(4))
     with pytest.raises(OdometryError, match="cannot change its parameters between scans"):
-        box.configure(box.parameters)
+        odometry.apply(Selection(0, odometry_class(name).space.baseline))
 
 
 LATE = {
@@ -151,14 +158,14 @@ def parameter_cases():
     return [
         (name, parameter)
         for name in NAMES
-        for parameter in box_class(name).space.names
+        for parameter in odometry_class(name).space.names
         if parameter not in LATE.get(name, ())
     ]
 
 
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())
 def test_every_parameter_takes_effect(name, parameter):
-    space = box_class(name).space
+    space = odometry_class(name).space
     usual = usual_drive(name)
     changed = (
         drive(isolated(name, {parameter: space.parameters[parameter].from_unit(u)}))

@@ -5,8 +5,10 @@ import pytest
 import turns
 from needs import lacking
 
-from adaptune.odometry import OdometryError, box_class
-from adaptune.odometry.evalio import Loam, MadIcp, Pipeline
+from adaptune.odometry import OdometryError
+from adaptune.odometry.evalio.base import Pipeline
+from adaptune.odometry.evalio.lidar import Loam, MadIcp
+from adaptune.odometry.registry import odometry_class
 from adaptune.sequence import Scan
 
 try:
@@ -44,13 +46,13 @@ class Listener:
 @pytest.mark.parametrize("name", NAMES)
 def test_what_evalio_receives_is_the_scan(name):
     scan = turns.measured(0, turns.ROWS, turns.COLUMNS)
-    box = box_class(name)()
-    box.start(box.prepare(scan), np.eye(4))
-    box._pipeline = Listener()
-    box.register(box.prepare(scan))
-    points = box._pipeline.given
+    odometry = odometry_class(name)()
+    odometry.start(odometry.prepare(scan), np.eye(4))
+    odometry._pipeline = Listener()
+    odometry.register(odometry.prepare(scan))
+    points = odometry._pipeline.given
     near = np.linalg.norm(scan.points, axis=1) >= 1.0
-    ringed = hasattr(box.settings, "rows")
+    ringed = hasattr(odometry.settings, "rows")
     sent = {
         (np.float32(p.x), np.float32(p.y), np.float32(p.z), round(p.t.nsec / 1e5), p.row)
         for p in points
@@ -87,13 +89,13 @@ def test_images_are_complete_whatever_the_phase_of_the_firings():
 @pytest.mark.parametrize("name", ["loam", "form", "lio_sam"])
 def test_images_need_the_lasers(name):
     with pytest.raises(OdometryError, match="record clouds with a `ring` field"):
-        box_class(name)().prepare(replace(turns.measured(0), rings=None))
+        odometry_class(name)().prepare(replace(turns.measured(0), rings=None))
 
 
 @pytest.mark.parametrize("name", ["dlio", "lio_sam"])
 def test_some_need_an_imu(name):
     with pytest.raises(OdometryError, match="needs an IMU, and the scans do not bring along"):
-        box_class(name)().prepare(turns.turn(0))
+        odometry_class(name)().prepare(turns.turn(0))
 
 
 def test_more_lasers_than_rows():
@@ -103,33 +105,33 @@ def test_more_lasers_than_rows():
 
 
 def test_an_image_of_another_size_does_not_reach_the_pipeline():
-    box, wide = Loam(), Loam(settings=Loam.settings_type(columns=512))
-    box.start(box.prepare(turns.turn(0)), np.eye(4))
+    odometry, wide = Loam(), Loam(settings=Loam.settings_type(columns=512))
+    odometry.start(odometry.prepare(turns.turn(0)), np.eye(4))
     with pytest.raises(OdometryError, match="began with scans of 32 x 450"):
-        box.register(wide.prepare(turns.turn(1)))
+        odometry.register(wide.prepare(turns.turn(1)))
 
 
 def test_ct_icp_needs_times():
     with pytest.raises(OdometryError, match="record clouds with a time field"):
-        box_class("ct_icp")().prepare(Scan(0, turns.turn(0).points))
+        odometry_class("ct_icp")().prepare(Scan(0, turns.turn(0).points))
 
 
 def test_a_scan_without_times_among_others_with_them_keeps_the_last_motion():
     # It would end the process.
-    box = box_class("evalio_kiss_icp")()
-    box.start(box.prepare(turns.turn(0)), np.eye(4))
-    box.register(box.prepare(turns.turn(1)))
-    _, registered = box.register(box.prepare(Scan(0, turns.turn(2).points)))
+    odometry = odometry_class("evalio_kiss_icp")()
+    odometry.start(odometry.prepare(turns.turn(0)), np.eye(4))
+    odometry.register(odometry.prepare(turns.turn(1)))
+    _, registered = odometry.register(odometry.prepare(Scan(0, turns.turn(2).points)))
     assert not registered
 
 
 def test_parameters_that_are_not_tuned():
     settings = MadIcp.settings_type(parameters={"b_max": 1, "num_keyframes": 4})
     # An integer where a float is meant; and what is tuned comes before what is set.
-    box = MadIcp({"num_keyframes": 2}, settings)
-    box.start(box.prepare(turns.turn(0)), np.eye(4))
-    assert box.register(box.prepare(turns.turn(1))).registered
-    assert box.parameters["num_keyframes"] == 2
+    odometry = MadIcp({"num_keyframes": 2}, settings)
+    odometry.start(odometry.prepare(turns.turn(0)), np.eye(4))
+    assert odometry.register(odometry.prepare(turns.turn(1))).registered
+    assert odometry.parameters["num_keyframes"] == 2
 
 
 @pytest.mark.parametrize(
@@ -146,7 +148,7 @@ def test_parameters_that_do_not_exist_or_fit(given, message):
 
 
 def test_what_is_not_tuned_is_checked_before_anything_runs():
-    cls = box_class("mad_icp")
+    cls = odometry_class("mad_icp")
     assert cls.describe(cls.settings_type(parameters={"num_keyframes": 8})).space == cls.space
     with pytest.raises(OdometryError, match=r"parameters\.b_maxx: mad has no such parameter"):
         cls.describe(cls.settings_type(parameters={"b_maxx": 0.2}))
@@ -154,7 +156,7 @@ def test_what_is_not_tuned_is_checked_before_anything_runs():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_tuned_is_the_pipelines_own(name):
-    cls: type[Pipeline] = box_class(name)
+    cls: type[Pipeline] = odometry_class(name)
     from evalio.pipelines import all_pipelines
 
     defaults = all_pipelines()[cls.pipeline].default_params()

@@ -13,9 +13,11 @@ import turns
 from setups import setup_of
 
 from adaptune.archive import Archive
-from adaptune.odometry import HealthCheck, Isolated, Limits, OdometryError, wire
+from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.gicp import KeyframeGicp, Settings
-from adaptune.odometry.isolation import _server
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.isolation import Isolated, Limits, fork_server
+from adaptune.selection import Selection
 from adaptune.sequence import Imu, Scan
 from adaptune.sequence.imu import ImuNoise
 from offline.offline_study import load_study
@@ -47,66 +49,65 @@ def scan(i):
 
 @pytest.mark.parametrize("fault", faulty.FAULTS)
 def test_every_fault_is_told_and_another_start_goes_on(fault):
-    box = isolated(fault)
-    box.start(scan(0), np.eye(4))
+    odometry = isolated(fault)
+    odometry.start(scan(0), np.eye(4))
     first = 1 if fault == "shape" else 3
     for i in range(1, first):
-        assert box.register(scan(i)).T_odom_sensor[0, 3] == pytest.approx(0.1 * i)
+        assert odometry.register(scan(i)).T_odom_sensor[0, 3] == pytest.approx(0.1 * i)
     for i in range(first, 6):
-        T, registered = box.register(scan(i))
+        T, registered = odometry.register(scan(i))
         assert np.isnan(T).all()
         assert not registered
-    (told,) = box.faults
+    (told,) = odometry.faults
 
     assert re.search(TOLD[fault], told), told
     T = np.eye(4)
     T[1, 3] = 4.0
-    box.start(scan(6), T)
+    odometry.start(scan(6), T)
     if fault != "shape":
-        T, registered = box.register(scan(7))
+        T, registered = odometry.register(scan(7))
         np.testing.assert_allclose(T[:3, 3], [0.1, 4.0, 0.0])
         # The class counts its instances in a variable of its module.
         assert registered
 
 
 def test_one_that_cannot_begin_is_given_up():
-    box = isolated("never begins")
+    odometry = isolated("never begins")
     begin = time.perf_counter()
     for _ in range(30):
-        box.start(scan(0), np.eye(4))
-        assert np.isnan(box.register(scan(1)).T_odom_sensor).all()
-    assert len(box.faults) == 10
+        odometry.start(scan(0), np.eye(4))
+        assert np.isnan(odometry.register(scan(1)).T_odom_sensor).all()
+    assert len(odometry.faults) == 10
     assert time.perf_counter() - begin < 5.0
 
 
 def test_a_server_that_was_killed_is_replaced():
-    box = isolated("none")
-    box.start(scan(0), np.eye(4))
-    _server("faulty:Faulty").process.kill()
-    _server("faulty:Faulty").process.wait()
+    odometry = isolated("none")
+    odometry.start(scan(0), np.eye(4))
+    fork_server("faulty:Faulty").process.kill()
+    fork_server("faulty:Faulty").process.wait()
     # Those it has forked live on.
-    assert box.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
-    box.start(scan(2), np.eye(4))
-    assert box.register(scan(3)).T_odom_sensor[0, 3] == pytest.approx(0.1)
-    assert not box.faults
+    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
+    odometry.start(scan(2), np.eye(4))
+    assert odometry.register(scan(3)).T_odom_sensor[0, 3] == pytest.approx(0.1)
+    assert not odometry.faults
 
 
 def test_what_it_refuses_is_an_error():
-    box = Isolated("ndt", {}, faulty.Settings(), Limits())
-    box.name = "ntd"
+    odometry = Isolated("ntd", {}, faulty.Settings(), Limits())
     with pytest.raises(OdometryError, match="ntd: there is no odometry 'ntd': did you mean 'ndt'"):
-        box.start(scan(0), np.eye(4))
+        odometry.start(scan(0), np.eye(4))
 
 
 def test_parameters_change_between_scans():
-    box = isolated("none", x=0.1)
-    box.start(scan(0), np.eye(4))
-    assert box.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
-    box.configure({"x": 0.95})
-    assert box.register(scan(2)).T_odom_sensor[0, 3] == pytest.approx(0.4)
+    odometry = isolated("none", x=0.1)
+    odometry.start(scan(0), np.eye(4))
+    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
+    odometry.apply(Selection(0, {"x": 0.95}))
+    assert odometry.register(scan(2)).T_odom_sensor[0, 3] == pytest.approx(0.4)
     # A process that begins later has them too.
-    box.start(scan(3), np.eye(4))
-    assert box.register(scan(4)).T_odom_sensor[0, 3] == pytest.approx(0.3)
+    odometry.start(scan(3), np.eye(4))
+    assert odometry.register(scan(4)).T_odom_sensor[0, 3] == pytest.approx(0.3)
 
 
 def test_it_is_the_same_odometry_in_another_process():

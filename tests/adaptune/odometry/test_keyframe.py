@@ -42,11 +42,11 @@ def scan(number, stamp=None, usable=True, ok=True):
 
 
 def drive(scans):
-    box = Turning()
-    box.start(scans[0], np.eye(4), STEP)
+    odometry = Turning()
+    odometry.start(scans[0], np.eye(4), STEP)
     for one in scans[1:]:
-        box.register(one)
-    return np.array(box.guesses)
+        odometry.register(one)
+    return np.array(odometry.guesses)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,12 @@ import pytest
 import server
 import turns
 
-from adaptune.odometry import Limits, OdometryError, Process
+from adaptune.odometry import OdometryError
 from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.process import Settings, listen
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.process import Process, Settings
+from adaptune.odometry.serving import listen
+from adaptune.selection import Selection
 from adaptune.sequence import Scan
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
@@ -28,16 +31,16 @@ def scan(i):
 
 
 def test_it_drives_and_changes_its_parameters():
-    box = Process({"speed": 0.5}, program(), LIMITS)
-    box.start(scan(0), np.eye(4))
-    assert box.register(scan(1)).T_odom_sensor[0, 3] == 0.5
-    box.configure({"speed": 2.0})
-    assert box.register(scan(2)).T_odom_sensor[0, 3] == 2.5
+    odometry = Process({"speed": 0.5}, program(), LIMITS)
+    odometry.start(scan(0), np.eye(4))
+    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == 0.5
+    odometry.apply(Selection(0, {"speed": 2.0}))
+    assert odometry.register(scan(2)).T_odom_sensor[0, 3] == 2.5
     T = np.eye(4)
     T[0, 3] = 7.0
-    box.start(scan(3), T)
-    assert box.register(scan(4)).T_odom_sensor[0, 3] == 9.0
-    assert not box.faults
+    odometry.start(scan(3), T)
+    assert odometry.register(scan(4)).T_odom_sensor[0, 3] == 9.0
+    assert not odometry.faults
 
 
 def test_it_says_what_it_is():
@@ -59,17 +62,17 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_are_told_and_another_start_goes_on(fault, caplog):
-    box = Process({}, program(fault), Limits(seconds=0.5 if fault == "hang" else 20.0))
-    box.start(scan(0), np.eye(4))
+    odometry = Process({}, program(fault), Limits(seconds=0.5 if fault == "hang" else 20.0))
+    odometry.start(scan(0), np.eye(4))
     for i in (1, 2):
-        assert np.isfinite(box.register(scan(i)).T_odom_sensor).all()
+        assert np.isfinite(odometry.register(scan(i)).T_odom_sensor).all()
     for i in (3, 4):
-        assert np.isnan(box.register(scan(i)).T_odom_sensor).all()
-    (told,) = box.faults
+        assert np.isnan(odometry.register(scan(i)).T_odom_sensor).all()
+    (told,) = odometry.faults
     assert re.search(FAULTS[fault], told), told
     assert f"{sys.executable} with {{}}: {told}" in caplog.messages
-    box.start(scan(5), np.eye(4))
-    assert box.register(scan(6)).T_odom_sensor[0, 3] == 1.0
+    odometry.start(scan(5), np.eye(4))
+    assert odometry.register(scan(6)).T_odom_sensor[0, 3] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -111,13 +114,13 @@ def listening():
     return begin
 
 
-def drive(box, n=12):
+def drive(odometry, n=12):
     poses = []
-    box.start(box.prepare(turns.turn(0)), np.eye(4))
+    odometry.start(odometry.prepare(turns.turn(0)), np.eye(4))
     for i in range(1, n):
         if i == 6:
-            box.configure({"keyframe_interval": 2.0})
-        poses.append(box.register(box.prepare(turns.turn(i))).T_odom_sensor)
+            odometry.apply(Selection(0, {"keyframe_interval": 2.0}))
+        poses.append(odometry.register(odometry.prepare(turns.turn(i))).T_odom_sensor)
     return np.array(poses)
 
 
@@ -143,9 +146,9 @@ def test_it_is_the_same_odometry_behind_a_socket(listening, tmp_path, kind):
 def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     command = (sys.executable, "-m", "adaptune.cli", "serve", "gicp")
-    box = Process(NEAR, Settings(command=command), Limits(seconds=60.0))
-    np.testing.assert_array_equal(drive(box), drive(KeyframeGicp(NEAR)))
-    assert not box.faults
+    odometry = Process(NEAR, Settings(command=command), Limits(seconds=60.0))
+    np.testing.assert_array_equal(drive(odometry), drive(KeyframeGicp(NEAR)))
+    assert not odometry.faults
 
 
 def test_a_server_that_hangs_up():
@@ -179,9 +182,9 @@ def test_a_study_takes_its_space(study_file, tmp_path):
     study = load_study(study_file, overrides, tmp_path / "study")
     assert study.odometry.space.parameters["speed"].high == 2.0
     assert study.odometry.description.live
-    box = study.odometry({"speed": 1.5})
-    box.start(scan(0), np.eye(4))
-    assert box.register(scan(1)).T_odom_sensor[0, 3] == 1.5
+    odometry = study.odometry({"speed": 1.5})
+    odometry.start(scan(0), np.eye(4))
+    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == 1.5
     for more, words in (
         ("odometry.parameters={sped: {high: 2.0}}", "process has no parameter 'sped': did you"),
         ("odometry.settings={address: 'tcp://127.0.0.1:9'}", "odometry.settings: nothing listens"),

@@ -3,8 +3,9 @@ from importlib import metadata
 
 import pytest
 
-from adaptune.odometry import BOXES, OdometryError, box_class, versions
+from adaptune.odometry import OdometryError
 from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.registry import ODOMETRIES, odometry_class, versions
 
 MINE = """
 from adaptune.odometry import Odometry
@@ -32,17 +33,17 @@ def mine(tmp_path, monkeypatch):
     sys.modules.pop("my_odometry", None)
 
 
-@pytest.mark.parametrize("name", BOXES)
+@pytest.mark.parametrize("name", ODOMETRIES)
 def test_every_odometry_can_be_described_without_running_it(name):
     # evalio need not be installed for that.
-    cls = box_class(name)
+    cls = odometry_class(name)
     cls.space.check(cls.space.baseline)
     assert cls.settings_type().model_config["extra"] == "forbid"
 
 
 @pytest.mark.usefixtures("mine")
 def test_a_class_of_the_users():
-    assert box_class("my_odometry:Mine").space.names == ("x",)
+    assert odometry_class("my_odometry:Mine").space.names == ("x",)
 
 
 @pytest.mark.usefixtures("mine")
@@ -59,7 +60,7 @@ def test_a_class_of_the_users():
 )
 def test_names_that_do_not_do(name, message):
     with pytest.raises(OdometryError, match=message):
-        box_class(name)
+        odometry_class(name)
 
 
 def test_an_odometry_that_a_package_announces(monkeypatch):
@@ -67,9 +68,9 @@ def test_an_odometry_that_a_package_announces(monkeypatch):
         "theirs", "adaptune.odometry.gicp:KeyframeGicp", "adaptune.odometries"
     )
     monkeypatch.setattr("adaptune.plugins.entry_points", lambda group: [point][: "odom" in group])
-    assert box_class("theirs") is KeyframeGicp
+    assert odometry_class("theirs") is KeyframeGicp
     with pytest.raises(OdometryError, match="did you mean 'theirs'"):
-        box_class("thiers")
+        odometry_class("thiers")
 
 
 @pytest.mark.usefixtures("mine")
@@ -80,6 +81,6 @@ def test_an_odometry_that_a_package_announces(monkeypatch):
 def test_versions_of_what_an_odometry_runs_on(name, package):
     if package == "evalio":
         pytest.importorskip("evalio")
-    found = versions(box_class(name))
+    found = versions(odometry_class(name))
     assert set(found) == {"adaptune", "numpy", package} - {None}
     assert found["numpy"] == metadata.version("numpy")

@@ -23,9 +23,9 @@ def _rko_lio():
         lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko_lio]'")
 
 
-def poses(box, scans):
-    box.start(box.prepare(scans[0]), np.eye(4))
-    return np.array([box.register(box.prepare(scan)).T_odom_sensor for scan in scans[1:]])
+def poses(odometry, scans):
+    odometry.start(odometry.prepare(scans[0]), np.eye(4))
+    return np.array([odometry.register(odometry.prepare(scan)).T_odom_sensor for scan in scans[1:]])
 
 
 def test_it_needs_an_imu():
@@ -45,9 +45,9 @@ def test_a_sensor_that_does_not_stand_upright():
         )
         for scan in map(turns.measured, range(8))
     ]
-    box = RkoLio()
-    T = poses(box, scans)
-    up = box._T_base_sensor[:3, :3] @ T_tilted_sensor[:3, 2]
+    odometry = RkoLio()
+    T = poses(odometry, scans)
+    up = odometry._T_base_sensor[:3, :3] @ T_tilted_sensor[:3, 2]
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-3)
     np.testing.assert_allclose(T[-1, :3, 3], 7 * turns.STEP * T_tilted_sensor[:3, 0], atol=0.2)
     np.testing.assert_allclose(T[:, :3, :3], np.tile(np.eye(3), (7, 1, 1)), atol=0.03)

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import box_class
+from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, Course, simulate
 
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_odometry_survives(scene):
-    cls = box_class("gicp")
+    cls = odometry_class("gicp")
     odometry = cls({"max_correspondence_distance": 1.5, "keyframe_interval": 3.0})
     T_world_sensor, poses = [], []
     for scan in simulate(Course(scenes=(scene,), length=26.0, columns=300)):

@@ -1,0 +1,1 @@
+"""The odometries that evalio carries, compiled."""

@@ -1,0 +1,63 @@
+"""Odometries that begin at rest in a frame of their own."""
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+
+from adaptune.geometry import Poses, invert, rectify
+from adaptune.odometry.base import Odometry, Registration
+
+
+class OwnFrameOdometry(Odometry):
+    """An odometry that can begin only at rest, in its own frame, and with a usable scan.
+
+    The first pose that it returns places its frame. Where it returns none, the last motion goes
+    on.
+    """
+
+    @abstractmethod
+    def _usable(self, prepared: Any) -> bool:
+        """Whether it can begin with a scan."""
+
+    @abstractmethod
+    def _begin(self, prepared: Any) -> None:
+        """Make a new one for a usable scan, which `_process` receives next."""
+
+    @abstractmethod
+    def _process(self, prepared: Any) -> Poses | None:
+        """Process a scan, usable or not, and return ``T_own_sensor`` if there is a pose."""
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """See `Odometry.start`."""
+        self._T_odom_sensor = T_odom_sensor
+        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
+        self._T_odom_own: Poses | None = None
+        self._begun = False
+        self._correct(prepared)
+
+    def register(self, prepared: Any) -> Registration:
+        """See `Odometry.register`."""
+        T_odom_previous = self._T_odom_sensor
+        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
+        registered = self._correct(prepared)
+        if registered:
+            self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
+        return Registration(self._T_odom_sensor, registered)
+
+    def _correct(self, prepared: Any) -> bool:
+        """Correct the predicted pose; False if the odometry returned none."""
+        if not self._begun:
+            if not self._usable(prepared):
+                return False
+            self._begin(prepared)
+            self._begun = True
+        T_own_sensor = self._process(prepared)
+        if T_own_sensor is None:
+            return False
+        if self._T_odom_own is None:
+            self._T_odom_own = self._T_odom_sensor @ invert(T_own_sensor)
+        self._T_odom_sensor = self._T_odom_own @ T_own_sensor
+        return True

@@ -1,0 +1,140 @@
+"""The scans of the last seconds, on which a new instance builds its map before it takes over."""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adaptune.geometry import Poses, invert
+from adaptune.odometry.base import OdometryInstance, WarmUp
+from adaptune.sequence.imu import Imu, joined
+from adaptune.sequence.scan import Scan
+from adaptune.space import ParameterSet
+
+Make = Callable[[ParameterSet], OdometryInstance]
+"""Makes a new instance with these parameters."""
+
+
+class PreparedScan(NamedTuple):
+    """A prepared scan and its stamp in nanoseconds; the scan too, if it brings an IMU along."""
+
+    stamp: int
+    prepared: Any
+    scan: Scan | None
+
+    @classmethod
+    def by(cls, odometry: OdometryInstance, scan: Scan) -> "PreparedScan":
+        """Let an odometry prepare a scan."""
+        return cls(scan.stamp, odometry.prepare(scan), scan if scan.imu is not None else None)
+
+
+class PastScan(NamedTuple):
+    """A scan with the pose and the motion that were found for it."""
+
+    scan: PreparedScan
+    T_odom_sensor: Poses
+    T_previous_current: Poses | None
+
+    @property
+    def imu(self) -> Imu | None:
+        """What the IMU measured since the scan before."""
+        return None if self.scan.scan is None else self.scan.scan.imu
+
+
+class RecentScans:
+    """The scans of the last seconds.
+
+    Parameters
+    ----------
+    warm_up
+        Which of them a new instance sees.
+    odometry
+        Prepares scans again if the IMU measurements of several are joined.
+    """
+
+    def __init__(self, warm_up: WarmUp, odometry: OdometryInstance):
+        self._warm_up = warm_up
+        self._odometry = odometry
+        self._past: deque[PastScan] = deque()
+        self._n_dropped = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._past)
+
+    def start(self, scan: PreparedScan, T_odom_sensor: Poses, motion: Poses | None) -> None:
+        """Forget all scans and begin with this one."""
+        self._past.clear()
+        self._past.append(PastScan(scan, T_odom_sensor, motion))
+        self._n_dropped = 0
+
+    def add(self, scan: PreparedScan, T_odom_sensor: Poses) -> None:
+        """Add the newest scan and drop those that are too old."""
+        T_previous_current = invert(self.last.T_odom_sensor) @ T_odom_sensor
+        self._past.append(PastScan(scan, T_odom_sensor, T_previous_current))
+        while len(self._past) > 1 and self._age(self._past[0]) > self._warm_up.seconds:
+            self._past.popleft()
+            self._n_dropped += 1
+
+    @property
+    def last(self) -> PastScan:
+        """The newest scan."""
+        return self._past[-1]
+
+    def replay_to(self, odometry: OdometryInstance) -> "Successor":
+        """Start an instance with the first of these scans; the others wait for it."""
+        _, full_rate, stride = self._warm_up
+        seen: list[PastScan] = []
+        missed: list[Imu] = []
+        for number, past in enumerate(self._past, self._n_dropped):
+            if self._age(past) <= full_rate or number % stride == 0:
+                seen.append(self._with_imu(past, missed))
+                missed = []
+            elif seen and past.imu is not None:
+                missed.append(past.imu)
+        return Successor(odometry, seen)
+
+    def _with_imu(self, past: PastScan, missed: list[Imu]) -> PastScan:
+        """A scan with all IMU measurements since the last scan that the instance sees."""
+        scan = past.scan.scan
+        if not missed or scan is None or scan.imu is None:
+            return past
+        scan = replace(scan, imu=joined([*missed, scan.imu]))
+        return past._replace(scan=PreparedScan.by(self._odometry, scan))
+
+    def _age(self, past: PastScan) -> float:
+        return (self.last.scan.stamp - past.scan.stamp) * 1e-9
+
+
+class Successor:
+    """A new instance on its way through scans of the past.
+
+    Attributes
+    ----------
+    odometry : OdometryInstance
+    waiting : deque of PastScan
+        The scans that it has not seen yet.
+    T_own_sensor : ndarray of shape (4, 4)
+        Its own newest pose.
+    """
+
+    def __init__(self, odometry: OdometryInstance, past: Iterable[PastScan]):
+        self.odometry = odometry
+        self.waiting = deque(past)
+        self._start(self.waiting.popleft())
+
+    def catch_up(self, n: int | None = None) -> None:
+        """See at most `n` more scans, or all."""
+        for _ in range(len(self.waiting) if n is None else min(n, len(self.waiting))):
+            past = self.waiting.popleft()
+            self.T_own_sensor = self.odometry.register(past.scan.prepared).T_odom_sensor
+            if not np.isfinite(self.T_own_sensor).all():
+                # It begins without a past.
+                self._start(self.waiting.pop() if self.waiting else past)
+                self.waiting.clear()
+                return
+
+    def _start(self, past: PastScan) -> None:
+        self.odometry.start(past.scan.prepared, past.T_odom_sensor, past.T_previous_current)
+        self.T_own_sensor = past.T_odom_sensor

@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+import turns
+from walker import at, every, makes, selected, x_of, x_on
+
+from adaptune.geometry import invert
+from adaptune.odometry import OdometryError
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.selection import Selection
+
+NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+FAR = {"max_correspondence_distance": 1.0, "keyframe_interval": 4.0}
+
+
+def weigh(bank, *weights):
+    """Apply weights of the members, in their order."""
+    bank.apply(Selection(bank.trials[0], {}, dict(zip(bank.trials, weights, strict=True))))
+
+
+def test_the_mean_of_all_motions_is_taken_by_their_weights():
+    make, made = makes()
+    odometry = Bank(
+        make, {7: {"speed": 1.0}, 3: {"speed": 1.05}, 5: {"speed": 1.09}}, every(3.0), 0.1
+    )
+    x = x_of(odometry, range(5), {2: 5})
+    np.testing.assert_allclose(np.diff(x), [1.0, 1.09, 1.09, 1.09])
+    weigh(odometry, 0.5, 0.0, 0.5)
+    np.testing.assert_allclose(np.diff([x[-1], *x_on(odometry, range(5, 8))]), 1.045)
+    weigh(odometry, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(np.diff(x_on(odometry, range(8, 10))), (1.0 + 1.05 + 1.09) / 3)
+    assert odometry.restarts == 0
+    assert len(made) == 3
+
+
+def test_a_lost_one_is_left_out_and_started_anew():
+    make, made = makes({1.0: {5: 4.0}})
+    odometry = Bank(
+        make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1
+    )
+    weigh(odometry, 0.4, 0.3, 0.3)
+    x = x_of(odometry, range(9))
+    mean = 0.4 + 0.3 * 1.02 + 0.3 * 1.06
+    np.testing.assert_allclose(np.diff(x), [mean] * 4 + [4.0] + [mean] * 3)
+    assert odometry.restarts == 0  # The first is trusted more than its weight says, ...
+    make, made = makes({1.02: {5: 4.0}})
+    odometry = Bank(
+        make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1
+    )
+    weigh(odometry, 0.4, 0.3, 0.3)
+    x = x_of(odometry, range(9))
+    rest = (0.4 + 0.3 * 1.06) / 0.7  # ... and two are more than one.
+    np.testing.assert_allclose(np.diff(x), [mean] * 4 + [rest] + [mean] * 3)
+    assert odometry.restarts == 1
+    # Scans 3, 4 and 5 lie within two seconds.
+    assert [second for second, _ in made[1].starts] == [0, 3]
+    assert made[1].seen[-7:] == [5, 3, 4, 5, 6, 7, 8]
+
+
+def test_where_two_disagree_the_heavier_is_believed_and_the_first_more():
+    make, _ = makes()
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    assert x_of(odometry, range(5), {3: 3}) == [0, 1, 2, 5, 8]
+    for heavy, step, seconds in ((0.6, 1.0, range(5, 8)), (0.7, 3.0, range(8, 11))):
+        weigh(odometry, 1.0 - heavy, heavy)
+        np.testing.assert_allclose(np.diff(x_on(odometry, seconds)), step)
+    assert odometry.restarts == 0
+
+
+@pytest.mark.parametrize("chosen", [1.0, 3.0])
+def test_no_pose_is_worse_than_any(chosen):
+    make, _ = makes({1.0: {3: np.nan}})
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    x = x_of(odometry, range(6), {0: 7 if chosen == 1.0 else 3})
+    assert np.diff(x).tolist() == [chosen, chosen, 3.0, chosen, chosen]
+    assert odometry.restarts == 1
+
+
+def test_no_pose_at_all_is_told():
+    make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    x = x_of(odometry, range(4))
+    assert np.isnan(x[3])
+    # The caller starts it anew.
+    T = np.eye(4)
+    T[0, 3] = 7.0
+    odometry.start(odometry.prepare(at(3)), T)
+    assert odometry.register(odometry.prepare(at(4))).T_odom_sensor[0, 3] == 8.0
+
+
+def test_a_bank_has_no_other_sets():
+    make, _ = makes()
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}}, every(1.0))
+    with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4"):
+        bank.apply(selected(4))
+    with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4, 5"):
+        bank.apply(Selection(7, {}, {7: 0.5, 5: 0.3, 4: 0.2}))
+
+
+def test_motions_of_the_members_by_trial_number():
+    make, made = makes({1.02: {5: 4.0}})
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1)
+    x_of(bank, range(6))
+    whole, members = bank.motions
+    assert list(members) == [7, 3, 5]
+    # The motion of the lost member before it was restarted.
+    assert [T[0, 3] for T in members.values()] == pytest.approx([1.0, 4.0, 1.06])
+    assert whole[0, 3] == pytest.approx(1.0)
+    motion = np.eye(4)
+    motion[0, 3] = 0.3
+    bank.start(bank.prepare(at(6)), np.eye(4), motion)
+    assert [T[0, 3] for T in (bank.motions[0], *bank.motions[1].values())] == [0.3] * 4
+    made[0].faults, made[2].faults = ["lost"], ["lost, too"]
+    assert bank.faults == ["lost", "lost, too"]
+    assert bank.usage.cpu == sum(walker.usage.cpu for walker in made)
+
+
+def drive(odometry, switch=None, n=30):
+    poses = [np.eye(4)]
+    for i in range(n):
+        if switch and i and i % 5 == 0:
+            odometry.apply(selected(switch[i // 5 % len(switch)]))
+        prepared = odometry.prepare(turns.turn(i % 15))
+        if i == 0:
+            odometry.start(prepared, np.eye(4))
+        else:
+            poses.append(odometry.register(prepared).T_odom_sensor)
+    return np.array(poses)
+
+
+def test_a_bank_of_equal_instances_is_the_single_run():
+    bank = Bank(lambda _: KeyframeGicp(NEAR), {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    switched = drive(bank, [0, 1], n=15)
+    np.testing.assert_allclose(switched, drive(KeyframeGicp(NEAR), n=15), atol=1e-12)
+
+
+def test_a_bank_in_other_processes_is_the_same():
+    def elsewhere(parameters):
+        return Isolated("gicp", parameters, Settings(), Limits())
+
+    a, b = (
+        drive(Bank(make, {0: NEAR, 1: FAR}, every(0.5)), [0, 1], 15)
+        for make in (KeyframeGicp, elsewhere)
+    )
+    np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
+def test_real_odometries_go_straight_on(mechanism):
+    if mechanism == "bank":
+        sets = {0: NEAR, 1: FAR, 2: {**NEAR, "keyframe_interval": 2.0}}
+        poses = drive(Bank(KeyframeGicp, sets, every(0.5)), [1, 0], n=15)
+    else:
+        poses = drive(HandOver(KeyframeGicp, NEAR, every(0.5)), [FAR, NEAR], n=15)
+    steps = invert(poses[:-1]) @ poses[1:]
+    np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
+    np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)

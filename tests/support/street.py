@@ -1,0 +1,133 @@
+"""Odometries by name on a drive straight ahead along a street."""
+
+import sys
+import tempfile
+import threading
+from functools import cache
+from pathlib import Path
+
+import drives
+import numpy as np
+import program
+
+from adaptune.odometry.command import Command
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.process import Process
+from adaptune.odometry.program_input import ProgramInput
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.serving import listen
+from adaptune.sequence import Scan
+from adaptune.space import Float, ParameterSpace
+
+STEP = 0.4
+"""Metres between scans."""
+N_SCANS = 16
+
+
+def make(name, parameters=None):
+    """A new instance; of programs, keyframe GICP that is served and program.py."""
+    if name == "process":
+        return Process(parameters or {}, served(), Limits(seconds=60.0))
+    if name == "command":
+        given = space_of(name).baseline | (parameters or {})
+        settings, recording = command_on_the_street()
+        Command.check(settings, given)
+        return Command(given, settings, Limits(seconds=10.0), lambda: recording, strict=True)
+    return odometry_class(name)(parameters)
+
+
+def space_of(name):
+    if name == "command":
+        return ParameterSpace(
+            {
+                "registration.voxel": Float(low=0.2, high=2.0, baseline=0.5, log=True),
+                "registration.distance": Float(low=0.5, high=4.0, baseline=2.0, log=True),
+            }
+        )
+    return Process.describe(served()).space if name == "process" else odometry_class(name).space
+
+
+def is_live(name):
+    return name != "command" and odometry_class("gicp" if name == "process" else name).live
+
+
+@cache
+def served():
+    """How to reach keyframe GICP behind a socket."""
+    there, ready = [], threading.Event()
+
+    def tell(at):
+        there.append(at)
+        ready.set()
+
+    threading.Thread(target=listen, args=("tcp://127.0.0.1:0", "gicp", tell), daemon=True).start()
+    assert ready.wait(10.0)
+    return Process.settings_type(address=there[0])
+
+
+@cache
+def command_on_the_street():
+    """A program's settings, and the drive as a bag for it."""
+    folder = Path(_folder.name)
+    scans = [(scan(i).stamp, scan(i).points, np.eye(4)) for i in range(N_SCANS)]
+    bag = drives.write_bag(folder / "drive.bag", scans)
+    (folder / "program.json").write_text('{"registration": {"voxel": 1, "distance": 1}}')
+    arguments = (program.__file__, "{input}", "{points}", "{output}", "{parameters}")
+    settings = Command.settings_type(
+        command=(sys.executable, *arguments), template=str(folder / "program.json")
+    )
+    stamps = np.array([stamp for stamp, *_ in scans], np.int64)
+    return settings, ProgramInput(bag, "/points", "", stamps, None)
+
+
+_folder = tempfile.TemporaryDirectory()
+
+
+@cache
+def street():
+    """Points of a ground, two walls and poles along x, of shape (n, 3)."""
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-1, 1, (9000, 2))
+    ground = np.c_[45 * u[:3000, 0], 9 * u[:3000, 1], np.full(3000, -1.7)]
+    walls = np.c_[45 * u[3000:, 0], 9 * rng.choice([-1, 1], 6000), 2 + 4 * u[3000:, 1]]
+    at = rng.uniform((-35, -8), (45, 8), (16, 2))[rng.integers(0, 16, 3500)]
+    around = rng.uniform(0, 2 * np.pi, 3500)
+    poles = np.c_[
+        at[:, 0] + 0.3 * np.cos(around), at[:, 1] + 0.3 * np.sin(around), rng.uniform(-1.7, 3, 3500)
+    ]
+    return np.concatenate([ground, walls, poles])
+
+
+@cache
+def scan(i):
+    """Scan `i` of a drive straight ahead."""
+    rng = np.random.default_rng(i)
+    points = street()[rng.random(len(street())) < 0.5] - [STEP * i, 0.0, 0.0]
+    points += rng.normal(0, 0.01, points.shape)
+    return Scan(i * 10**8, points.astype(np.float32))
+
+
+def poor_scan(n, i=0):
+    """A scan of `n` points all over the place, or one that is all NaN, in the place of scan `i`."""
+    if n == "NaN":
+        return Scan(i * 10**8, np.full((5000, 3), np.nan, np.float32))
+    points = np.random.default_rng(n).uniform(2.0, 9.0, (n, 3))
+    return Scan(i * 10**8, points.astype(np.float32))
+
+
+@cache
+def prepared_drive(name):
+    odometry = make(name)
+    return [odometry.prepare(scan(i)) for i in range(N_SCANS)]
+
+
+def drive(odometry, prepared, T_odom_sensor=None):
+    """Start with the first scan and register the others; poses of shape (n, 4, 4)."""
+    T = np.eye(4) if T_odom_sensor is None else T_odom_sensor
+    odometry.start(prepared[0], T)
+    return np.array([T, *(odometry.register(p).T_odom_sensor for p in prepared[1:])])
+
+
+@cache
+def usual_drive(name):
+    return drive(make(name), prepared_drive(name))
