@@ -17,7 +17,8 @@ from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
 from offline.train import train
-from online.comparison import compare, run_replays
+from online.comparison import compare
+from online.run_replays import run_replays
 
 STUDY = """\
 odometry:
