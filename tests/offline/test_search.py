@@ -6,14 +6,16 @@ import itertools
 import drawn
 import numpy as np
 import pytest
-from offline.validation import labelled_sequences, leave_one_out
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.model import ErrorModel
+from adaptune.parameter_sets import ParameterSets
 from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
+from offline.labelled import labelled_data
+from offline.leave_one_out import leave_one_out
 from offline.objective import choose_fixed
 from offline.offline_study import load_study
 from offline.search import make_stages, owner
@@ -180,19 +182,19 @@ def test_views_search_for_themselves(study_of):
 def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     study = study_of(sets="own")
     verdicts, _, archive = run(study)
-    fixed = choose_fixed(study.config.offline, verdicts)
-    from offline.campaign import fit
-
-    model = fit(study, archive, verdicts, fixed)
-    assert np.isnan(model.errors).any()
-    sequences, unit, _ = labelled_sequences(study, model)
+    parameters = tuple(verdict.parameters for verdict in verdicts.values())
+    sets = ParameterSets(study.odometry.space, tuple(verdicts), parameters)
+    seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
+    data = labelled_data(archive, seen, sets, study.config, study.window)
+    assert any(np.isnan(sequence.errors).any() for sequence in data.sequences)
+    data = data.complete()
     complete = [n for n, v in verdicts.items() if v.complete]
-    assert len(unit) == len(complete)
-    for sequence in sequences:
+    assert list(data.sets) == complete
+    for sequence in data.sequences:
         assert [n for n, own in zip(complete, sequence.own, strict=True) if own] == [
             n for n in complete if owner(study.config.offline, NAMES, n) == sequence.name
         ]
-    validation = leave_one_out(sequences, unit)
+    validation = leave_one_out(data)
     for left_out in validation.left_out:
         known = [
             archive.finished(left_out.name)[n].mean_error
