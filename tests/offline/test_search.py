@@ -6,7 +6,6 @@ import itertools
 import drawn
 import numpy as np
 import pytest
-from offline.validation import leave_one_out
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
@@ -62,6 +61,11 @@ def run(study):
     return verdicts, seen, archive
 
 
+def stages_of(study, finished):
+    space = study.odometry.space
+    return make_stages(study.config.offline, space, study.training, finished)
+
+
 def sets(archive):
     """All parameter sets in the archive, by sequence and number."""
     return {(name, n): s.parameters for name in NAMES for n, s in archive.finished(name).items()}
@@ -71,7 +75,7 @@ def sets(archive):
 def test_every_number_is_of_one_search(study_of, kind):
     study = study_of(sets=kind)
     finished = {name: {} for name in NAMES}
-    stages = make_stages(study, finished)
+    stages = stages_of(study, finished)
     searches = [search for stage in stages for search in stage.searches]
     assert len(searches) == {"shared": 1, "own": 3, "both": 4}[kind]
     numbers = sorted(search.number(i) for search in searches for i in range(1, 20))
@@ -170,7 +174,7 @@ def test_a_search_that_is_over_waits_for_the_others(study_of):
 
 def test_views_search_for_themselves(study_of):
     study = study_of(sets="own", augment="[{reverse: true}]")
-    (stage,) = make_stages(study, {name: {} for name in study.training})
+    (stage,) = stages_of(study, {name: {} for name in study.training})
     assert [search.sequences for search in stage.searches] == [[name] for name in study.training]
     assert len(stage.searches) == 6
 
