@@ -73,8 +73,8 @@ def geometric(data: TrainingData) -> int:
     return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
 
 
-Way = tuple[Callable[[], OdometryInstance], Policy | None]
-"""What is driven, and what chooses its parameters."""
+Way = tuple[Callable[[], OdometryInstance], Policy | None, list[int] | None]
+"""What makes the odometry, what chooses its parameters, and the members of a bank."""
 
 
 def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
@@ -87,11 +87,11 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
     sets = study.space.from_unit(units)
 
     def alone(number: int | None) -> Way:
-        return lambda: study.odometry(None if number is None else sets[number]), None
+        return lambda: study.odometry(None if number is None else sets[number]), None, None
 
     def live(name: str) -> Way:
         rule = RULES[name](settings, 0.0).fit(data)
-        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca)
+        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca), None
 
     def bank(size: int, even: bool = False) -> Way:
         members = choose_bank(sequences, data.fixed, size)
@@ -105,7 +105,8 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
         policy = asking(rule, pca)
         if even:
             policy = lambda *_: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
-        return lambda: Bank(study.odometry, [sets[i] for i in members], WarmUp()), policy
+        in_bank = {i: sets[i] for i in members}
+        return lambda: Bank(study.odometry, in_bank, WarmUp()), policy, members
 
     return sets, {
         "baseline": alone(None),
@@ -145,8 +146,8 @@ def main() -> None:
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
         row = f"{' '.join(scenes):32}"
-        for make, policy in driven.values():
-            result = replay(scans, make(), HealthCheck(), policy, sets)
+        for make, policy, members in driven.values():
+            result = replay(scans, make(), HealthCheck(), policy, sets, members=members)
             errors = sub_trajectory_rte(
                 T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY
             )
