@@ -1,4 +1,4 @@
-# `make demo` and `make test` need Python 3.11 or newer, and nothing else.
+# `make demo` and `make test` need only Python 3.11 or newer.
 
 PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python3)
 VENV ?= .venv
@@ -8,8 +8,9 @@ STUDY := configs/demo.yaml
 .PHONY: help demo test lint types pytest format clean
 
 help:
-	@echo "make demo    simulate, train, replay and compare: the whole way, in a few minutes"
-	@echo "make test    linters, type checker, import contract and tests"
+	@echo "make demo    simulate, train, replay and compare, in a few minutes"
+	@echo "make test    run linters, type checker, import contract and all tests"
+	@echo "make quick   run a part of the tests, in less than 45 seconds"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 

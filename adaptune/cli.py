@@ -247,7 +247,7 @@ def offline(
     and each sequence's own best. Stop it with Ctrl-C and run it again to resume.
     """
     from adaptune import report
-    from offline.campaign import train
+    from offline.train import train
 
     loaded = load_study(study, override, folder)
     console.print(f"Seed {loaded.config.offline.seed}.", highlight=False)
@@ -276,7 +276,7 @@ def offline(
             "which it takes six or more: `paired` will always take the fixed set.",
             highlight=False,
         )
-    console.print(f"Error model: {loaded.folder / 'model.npz'}", highlight=False)
+    console.print(f"Error model: {loaded.folder / 'model.safetensors'}", highlight=False)
 
 
 @app.command()
@@ -346,7 +346,7 @@ def validate(
     fixed set, which is chosen without that sequence too.
     """
     from adaptune import report
-    from offline.validation import validate as validate_study
+    from offline.validate import validate as validate_study
 
     loaded = load_study(study, override, folder)
     with _progress() as progress:
@@ -402,7 +402,9 @@ def online(
     unpin = pin(os.getpid())
     try:
         with _progress() as progress:
-            made = run_replays(loaded, model or loaded.folder / "model.npz", again, progress)
+            made = run_replays(
+                loaded, model or loaded.folder / "model.safetensors", again, progress
+            )
     finally:
         unpin()
     console.print(f"{made} replays made; all are in {loaded.folder / 'replays'}/", highlight=False)
@@ -423,8 +425,9 @@ def switching(
     same ones: by every mechanism that the odometry can have, and for several lengths of warm-up.
     The price of the study's own mechanism is kept with it, for selections to weigh.
     """
-    from adaptune import report
     from online.switching import measure_switching
+
+    from adaptune import report
 
     loaded = load_study(study, override, folder)
     with _progress() as progress:

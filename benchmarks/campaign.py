@@ -34,9 +34,10 @@ import drives
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
 from adaptune.simulation import record
-from adaptune.study import Study, load_study
+from adaptune.study.study import Study
 from offline import campaign
-from offline.workers import Result, Task
+from offline.offline_study import load_study
+from offline.workers import Task, TaskResult
 
 STUDY = """\
 odometry: {{name: gicp, settings: {{downsampling: 0.5}}}}
@@ -49,12 +50,12 @@ N_FRAMES = 600
 
 def bare(study: Study, sets: Sequence[dict[str, Any]]) -> None:
     """What any program would have to do."""
-    settings: Any = study.settings
+    settings: Any = study.odometry.settings
     prepared = [
         small_gicp.preprocess_points(
             crop(scan, settings.min_range), downsampling_resolution=settings.downsampling
         )
-        for scan in study.sequence("cave")
+        for scan in study.sequences.open("cave")
     ]
     for parameters in sets:
         bare_gicp(
@@ -105,13 +106,13 @@ def speed(trials: int, scans: int) -> None:
         file.write_text(STUDY.format(trials=trials, length=0.1 * scans))
         for n in (1, 2):
             study = load_study(file, [f"offline.workers={n}"], folder / f"{n}")
-            study.recording("cave").parent.mkdir(parents=True)
+            study.sequences.recording("cave").parent.mkdir(parents=True)
             if n == 1:
-                record(study.config.courses["cave"], study.recording("cave"))
+                record(study.config.courses["cave"], study.sequences.recording("cave"))
             else:
-                os.link(folder / "1/recordings/cave.bag", study.recording("cave"))
+                os.link(folder / "1/recordings/cave.bag", study.sequences.recording("cave"))
         one, two = (load_study(file, [f"offline.workers={n}"], folder / f"{n}") for n in (1, 2))
-        for _ in one.sequence("cave"):
+        for _ in one.sequences.open("cave"):
             pass  # into the cache
         wall_1, sets = in_child(train, one)
         wall, _ = in_child(bare, one, sets)
@@ -148,7 +149,7 @@ class Drawn:
         self.asked = self.asked or time.monotonic()
         self._task = task
 
-    def wait(self) -> list[tuple[int, Result]]:
+    def wait(self) -> list[tuple[int, TaskResult]]:
         """Draw its trials."""
         assert self._task is not None
         pairs = zip(self._task.numbers, self._task.sets, strict=True)
@@ -159,7 +160,7 @@ class Drawn:
             {"ndt": 90},
             np.zeros(N_FRAMES, np.float32),
         )
-        return [(0, Result([_drawn(*p) for p in pairs], frames if self._task.frames else None))]
+        return [(0, TaskResult([_drawn(*p) for p in pairs], frames if self._task.frames else None))]
 
 
 def _drawn(number: int, parameters: dict[str, Any]) -> Trial:

@@ -42,7 +42,8 @@ from adaptune.model import (
 )
 from adaptune.model.base import complementary
 from adaptune.simulation import Course, simulate
-from adaptune.study import Study, StudyConfig
+from adaptune.study.config import StudyConfig
+from adaptune.study.study import Study
 from offline.fusion import Drive, error_vectors, periods, recorded_motions
 from offline.samplers import make_sampler
 from offline.trial import run_trials
@@ -121,7 +122,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     offline = study.config.offline.model_copy(
         update={"sampler": "sobol", "batch": N_SETS, "seed": seed}
     )
-    sets = make_sampler(study.space, offline).propose([])
+    sets = make_sampler(study.odometry.space, offline).propose([])
     box = study.odometry()
     sequence: Any = Prepared(path.stem, [box.prepare(scan) for scan in scans], frames)
     trials = run_trials(study, sequence, sets)
@@ -134,7 +135,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
             stamps=frames.stamps,
             T_world_sensor=frames.T_ref_sensor,
             histograms=frames.descriptors.astype(np.uint16),
-            sets=study.space.to_unit(sets),
+            sets=study.odometry.space.to_unit(sets),
             errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
             vectors=np.stack(vectors, axis=1),
             motions=motions.astype(np.float32),

@@ -17,9 +17,11 @@ from pathlib import Path
 from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.simulation import record
-from adaptune.study import Study, load_study
-from offline.campaign import run_batches, train
+from adaptune.study.study import Study
+from offline.campaign import run_batches
+from offline.train import train
 from offline.objective import choose_fixed
+from offline.offline_study import load_study
 from offline.workers import Outcome, Result, Task
 
 RULES = ("halving", "hyperband", "wilcoxon")
@@ -99,8 +101,8 @@ def main() -> None:
             path = study_file(folder, seed, given)
             full = load_study(path, [], folder / f"full_{seed}")
             for name, course in full.config.courses.items():
-                if not full.recording(name).exists():
-                    record(course, full.recording(name))
+                if not full.sequences.recording(name).exists():
+                    record(course, full.sequences.recording(name))
             training = train(full)
             value = min(
                 sum(means) / len(means) for means in zip(*training.means.values(), strict=True)

@@ -84,7 +84,7 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
     settings = tune(sequences, units)
     print(f"settings of the paired rule: {settings}")
     study = study_of(odometry)
-    sets = study.space.from_unit(units)
+    sets = study.odometry.space.from_unit(units)
 
     def alone(number: int | None) -> Way:
         return lambda: study.odometry(None if number is None else sets[number]), None, None

@@ -32,7 +32,9 @@ from scipy.stats import wilcoxon
 from adaptune import cores, report
 from adaptune.simulation import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
-from adaptune.study import OfflineConfig, Study, load_study
+from adaptune.study.study import Study
+from offline.config import OfflineConfig
+from offline.offline_study import load_study
 from offline.samplers import make_sampler
 from offline.trial import PreparedSequence, run_trials
 
@@ -153,15 +155,15 @@ def prepare(folder: Path, *overrides: str) -> tuple[Study, PreparedSequence]:
     file = folder / "samplers.yaml"
     file.write_text(STUDY)
     study = load_study(file, overrides, folder / "run")
-    if not study.recording("course").exists():
-        record(study.config.courses["course"], study.recording("course"))
+    if not study.sequences.recording("course").exists():
+        record(study.config.courses["course"], study.sequences.recording("course"))
     return study, PreparedSequence(study, "course", 8e9)
 
 
 def table(folder: Path) -> None:
     """Compare on recorded trials of GICP."""
     study, sequence = prepare(folder)
-    space = study.space
+    space = study.odometry.space
     unit = (np.arange(SIDE) + 0.5) / SIDE
     points = np.stack(np.meshgrid(*[unit] * len(space), indexing="ij"), -1).reshape(-1, len(space))
     trials = run_trials(study, sequence, space.from_unit(points))
@@ -186,21 +188,21 @@ def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, A
             known[repr(s)] = trial.mean_error, trial.metrics["rpe"]
         return known[repr(s)]
 
-    base = measures(study.space.baseline)
+    base = measures(study.odometry.space.baseline)
     rows: list[dict[str, Any]] = [{"": name, "sampler": "defaults", "RTE %": base[0]}]
     rows[0] |= {"RTE change": "", "RPE m": base[1], "RPE change": ""}
     curves: dict[str, Any] = {}
-    side = round((THESIS_TRIALS - 1) ** (1 / len(study.space)))
+    side = round((THESIS_TRIALS - 1) ** (1 / len(study.odometry.space)))
     axes = {
         n: {"low": p.low, "high": p.high, "count": side}
-        for n, p in study.space.parameters.items()
+        for n, p in study.odometry.space.parameters.items()
         if not isinstance(p, Categorical)
     }
     for sampler in ("grid", "random", "annealing", "tpe"):
         best = []
         for seed in THESIS_SEEDS:
             search = make_sampler(
-                study.space,
+                study.odometry.space,
                 OfflineConfig(
                     sampler=sampler,
                     sampler_settings={"grid": axes} if sampler == "grid" else {},

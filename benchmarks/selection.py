@@ -105,7 +105,7 @@ def costs(function: Callable[[Any], object], arguments: Iterable[Any]) -> NDArra
 
 def measure_file(model: ErrorModel, folder: Path) -> ErrorModel:
     """Save and load."""
-    path = folder / "model.npz"
+    path = folder / "model.safetensors"
     saving = seconds(lambda: model.save(path))
     clock, cpu = np.median(costs(ErrorModel.load, [path] * 5), axis=1)
     print(

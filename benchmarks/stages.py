@@ -24,9 +24,10 @@ from adaptune.model import ErrorModel, Selection
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import crop
 from adaptune.sequence import Scan, SequenceConfig, open_sequence
-from adaptune.study import Study, load_study
+from adaptune.study.study import Study
 from adaptune.trajectory import read_kitti
-from offline.campaign import train
+from offline.train import train
+from offline.offline_study import load_study
 from offline.trial import PreparedSequence, run_trials
 from online.replay import adaptive, replay
 
@@ -83,7 +84,7 @@ def trial(study: Study) -> None:
     sequence = PreparedSequence(study, "hall_begin", 8e9)
     prepared = [(scan.cloud, scan.tree) for scan in sequence]
     parameters = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
-    iterations = study.settings.iterations  # type: ignore[attr-defined]
+    iterations = study.odometry.settings.iterations  # type: ignore[attr-defined]
     compare(
         f"trial, {len(prepared)} scans",
         lambda: run_trials(study, sequence, [parameters], whole=True),
@@ -94,9 +95,9 @@ def trial(study: Study) -> None:
 def adaptive_replay(study: Study, model: ErrorModel) -> None:
     """Replay from the bag, selecting once a second, against read, prepare and align."""
     fixed = model.sets[model.fixed]
-    street = study.sequence("street")
+    street = study.sequences.open("street")
     box = study.odometry()
-    settings = study.settings
+    settings = study.odometry.settings
 
     select = adaptive(model, "paired")
 

@@ -1,4 +1,4 @@
-"""When a search has had enough."""
+"""When a search stops."""
 
 import json
 import time
@@ -8,16 +8,17 @@ from pathlib import Path
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.sampling import TRIALS
-from adaptune.study import OfflineConfig
+from offline.config import OfflineConfig
 from offline.objective import Verdict
 
+TRIALS = 64
+"""Trials of a search without a budget."""
 BUDGETS = ("trials", "hours", "stagnation", "target")
-"""Settings that may change from run to run."""
+"""Settings that may change when a study is resumed."""
 
 
 def max_trials(config: OfflineConfig) -> int | None:
-    """Number of trials after which to stop; none if only something else says when."""
+    """Number of trials after which the search stops; None if another budget stops it."""
     if config.budgeted or config.sampler == "grid":
         return config.trials
     return TRIALS
@@ -26,25 +27,25 @@ def max_trials(config: OfflineConfig) -> int | None:
 def spent(
     config: OfflineConfig, verdicts: Sequence[Verdict], best: int, hours: float, number: int
 ) -> str | None:
-    """Tell why a search stops at the border of a batch.
+    """Why a search stops after a batch.
 
     Parameters
     ----------
     config
         The budgets.
     verdicts
-        Of all trials up to the border.
+        Verdicts of all its trials.
     best
-        Number of the best of them.
+        Index of the best of them.
     hours
-        What their batches took.
+        Hours that their batches took.
     number
-        By which users know the best.
+        Trial number of the best of them.
 
     Returns
     -------
     str or None
-        The budget that is used up; none if the search goes on.
+        The budget that is used up; None if the search continues.
     """
     limit = max_trials(config)
     if limit is not None and len(verdicts) >= limit:
@@ -64,9 +65,9 @@ def spent(
 
 
 class Clock:
-    """How long batches took, kept in a file, so that a search that is resumed goes on counting.
+    """The time that batches took, kept in a file, so that a resumed search continues counting.
 
-    What a process that was killed had spent on its last batch is not counted.
+    The last batch of a killed process does not count.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ class Clock:
     Raises
     ------
     AdaptuneError
-        If it is not what this class wrote.
+        If the file is damaged.
     """
 
     def __init__(self, path: Path):
@@ -88,11 +89,11 @@ class Clock:
                 self._seconds = {str(int(batch)): float(s) for batch, s in read.items()}
             except (ValueError, TypeError, AttributeError) as error:
                 raise AdaptuneError(
-                    f"{path}: is damaged ({error}); remove it, and offline.hours counts anew"
+                    f"{path}: is damaged ({error}); remove it, and offline.hours restarts at 0"
                 ) from error
 
     def hours(self, n_batches: int) -> float:
-        """What the first batches took."""
+        """Hours that the first batches took."""
         return sum(s for batch, s in self._seconds.items() if int(batch) < n_batches) / 3600.0
 
     @contextmanager

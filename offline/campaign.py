@@ -1,29 +1,22 @@
-"""The offline stage: run trials batch by batch, then fit the error model."""
+"""The campaign: run the trials of all searches, batch by batch."""
 
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import report, yaml
 from adaptune.archive import Archive
-from adaptune.cores import available
-from adaptune.descriptor import averaged
-from adaptune.files import write_text
-from adaptune.model import ErrorModel
 from adaptune.space import ParameterSet
-from adaptune.study import TIMED, OfflineConfig, Study
-from offline.budget import BUDGETS, Clock
-from offline.cluster import Cluster
-from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
+from offline.budget import Clock
+from offline.config import OfflineConfig
+from offline.objective import Verdict, label
+from offline.offline_study import OfflineStudy
 from offline.pruning import rungs
 from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
-from offline.storage import Told, open_mirror
-from offline.validation import choose_bank, labelled_sequences, tune, tune_bank
-from offline.workers import Pool, Task, Workers, run
+from offline.storage import MirrorRow, open_mirror
+from offline.workers import Pool, Task, run
 
 Progress = Callable[[str, int, int, str], None]
 """Called with what is being done, how much of it is done, how much there is, and a remark."""
@@ -31,158 +24,10 @@ Progress = Callable[[str, int, int, str], None]
 _log = logging.getLogger(__name__)
 
 
-class Training(NamedTuple):
-    """What the offline stage found.
-
-    Attributes
-    ----------
-    model : ErrorModel
-    means : dict
-        For every training sequence the mean capped error in percent of each trial, by rising
-        number, of shape (n_trials,); NaN where it was not run.
-    fixed : int
-        Number of the trial of the fixed set.
-    rows : list of dict
-        For every training sequence what the baseline, the fixed set and its own best set do there.
-    """
-
-    model: ErrorModel
-    means: dict[str, list[float]]
-    fixed: int
-    rows: list[dict[str, Any]]
-
-
-def train(
-    study: Study, progress: Progress = lambda *_: None, cluster: str | None = None
-) -> Training:
-    """Run all trials that are not in the archive yet, and fit the model.
-
-    Parameters
-    ----------
-    study
-        The study; its folder holds the archive and receives the error model (``model.npz``), the
-        fixed set (``fixed.yaml``), a table of all trials (``trials.csv``, ``trials.json``), one of
-        the training sequences (``training.csv``, ``training.json``), and where there are several
-        objectives their Pareto front (``pareto.csv``, ``pareto.json``, ``pareto.png``).
-    progress
-        Told about every finished trial.
-    cluster
-        Address of a Dask scheduler, whose workers run the trials; processes of this machine when
-        left out.
-
-    Raises
-    ------
-    AdaptuneError
-        If a sequence cannot be used, or no set keeps the limits.
-    """
-    study.open()
-    config = study.config.offline
-    if timed := sorted(config.metrics & set(TIMED)):
-        _log.warning(
-            "%s differ from run to run: the same study run again will not find the same sets",
-            " and ".join(timed),
-        )
-    archive = Archive(study.folder / "trials")
-    archive.tidy()
-    n_workers = config.workers or available()
-    where = cluster or f"{n_workers} worker{'s' if n_workers > 1 else ''}"
-    _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    with Cluster(study, cluster) if cluster else Workers(study, n_workers) as workers:
-        verdicts = run_batches(study, archive, workers, progress)
-        fixed = choose_fixed(config, verdicts)
-        whole = _run_whole(study, archive, workers, verdicts, fixed, progress)
-    model = fit(study, archive, verdicts, fixed)
-    model = _tuned(study, model)
-    model = model.thinned(config.max_frames)
-    model.save(study.folder / "model.npz")
-    finished = {
-        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
-        for name in study.training
-    }
-    means = {
-        name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
-        for name, trials in finished.items()
-    }
-    write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
-    table = _trial_rows(config, verdicts, finished)
-    report.write_rows(study.folder, "trials", list(table.values()))
-    if len(config.objective) > 1:
-        _write_pareto(study, verdicts, table)
-    rows = _training_rows(config, verdicts, finished, fixed, whole)
-    report.write_rows(study.folder, "training", rows)
-    return Training(model, means, fixed, rows)
-
-
-def _trial_rows(
-    config: OfflineConfig, verdicts: Mapping[int, Verdict], finished: Finished
-) -> dict[int, dict[str, Any]]:
-    """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
-    rows: dict[int, dict[str, Any]] = {}
-    for n, verdict in verdicts.items():
-        runs = [finished[name][n] for name in verdict.sequences]
-        row = rows[n] = {"trial": n, **verdict.parameters}
-        if config.metrics != {"rte"}:
-            judged = zip(config.objective, verdict.values, strict=True)
-            row |= {label(weights): value for weights, value in judged}
-            for metric in sorted(config.metrics):
-                row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
-        if config.limits:
-            row["excess"] = verdict.excess
-        if config.repeats > 1:
-            row["margin"] = verdict.margin
-        mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
-        row["mean"] = mean
-        for name, trials in finished.items():
-            row[name] = trials[n].mean_error if n in trials else None
-    return rows
-
-
-def _training_rows(
-    config: OfflineConfig,
-    verdicts: Mapping[int, Verdict],
-    finished: Finished,
-    fixed: int,
-    whole: Mapping[str, tuple[float, float]],
-) -> list[dict[str, Any]]:
-    """A row for every training sequence; its own best set is found as the fixed one is."""
-    rows = []
-    for name, runs in finished.items():
-        best = choose_fixed(config, {n: judge(config, [run]) for n, run in runs.items()})
-        rows.append(
-            {
-                "sequence": name,
-                "baseline": runs[0].mean_error,
-                "fixed": runs[fixed].mean_error,
-                "own best": runs[best].mean_error,
-                "lost, baseline": runs[0].lost,
-                "lost, fixed": runs[fixed].lost,
-                "baseline, whole run": whole[name][0],
-                "fixed, whole run": whole[name][1],
-                "_own best trial": best,
-            }
-            | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
-        )
-    return rows
-
-
-def _write_pareto(
-    study: Study, verdicts: Mapping[int, Verdict], trials: Mapping[int, Mapping[str, Any]]
-) -> None:
-    """The sets that none that keeps the limits is better than in every objective."""
-    feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
-    values = np.array([verdicts[n].values for n in feasible])
-    front = [feasible[i] for i in pareto_front(values)]
-    report.write_rows(study.folder, "pareto", [trials[n] for n in front])
-    names = [label(weights) for weights in study.config.offline.objective]
-    report.draw_front(
-        study.folder / "pareto.png", names, values, np.array([verdicts[n].values for n in front])
-    )
-
-
 def run_batches(
-    study: Study, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
 ) -> dict[int, Verdict]:
-    """Run all trials that are not in the archive yet, and tell how each did.
+    """Run all trials that are not in the archive yet, and judge all of them.
 
     Parameters
     ----------
@@ -206,17 +51,19 @@ def run_batches(
 class _Campaign:
     """Searches on their way."""
 
-    def __init__(self, study: Study, archive: Archive, workers: Pool[Any], progress: Progress):
+    def __init__(
+        self, study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
+    ):
         self._study, self._archive, self._workers = study, archive, workers
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
         of_sequences = self._finished.values()
         known = {n: trial.parameters for trials in of_sequences for n, trial in trials.items()}
-        self._mirror = open_mirror(study, known)
+        self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names
         self._unframed = [name for name in self._names if not archive.has_frames(name, described)]
-        self._stages = make_stages(study, self._finished)
+        self._stages = make_stages(self._config, study.odometry.space, self._names, self._finished)
         self._tally = _Tally(progress, self._finished, self._stages)
         # By the trials' numbers, the sequences that they are of.
         self._counted: dict[int, Sequence[str]] = {}
@@ -243,7 +90,7 @@ class _Campaign:
                 if tasks := self._tasks(missing):
                     begun = True
                     with clock.running(batch):
-                        self._tally.watch(_run(self._archive, self._workers, tasks))
+                        self._tally.watch(run_tasks(self._archive, self._workers, tasks))
                 for search in at_work:
                     search.prune(m)
             numbers = sorted({n for search in at_work for n in search.numbers})
@@ -266,7 +113,7 @@ class _Campaign:
         """Run the best set of each sequence on the others, to choose the fixed one among them."""
         missing = {name: [n for n in best if n not in self._finished[name]] for name in self._names}
         tasks = self._tasks([Missing(missing, lambda n: best[n].parameters)])
-        for done, _ in enumerate(_run(self._archive, self._workers, tasks), start=1):
+        for done, _ in enumerate(run_tasks(self._archive, self._workers, tasks), start=1):
             self._progress("best sets of each on the others", done, len(tasks), "")
         self._counted |= dict.fromkeys(best, self._names)
 
@@ -278,8 +125,8 @@ class _Campaign:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
 
     def _tell(self) -> None:
-        self._mirror.tell(
-            self._counted, lambda n: _told(self._config, self._verdict(n), self._finished, n)
+        self._mirror.report(
+            self._counted, lambda n: _mirrored(self._config, self._verdict(n), self._finished, n)
         )
 
 
@@ -326,8 +173,8 @@ def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) 
     return tasks
 
 
-def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> Told:
-    """What the mirror is told of a trial."""
+def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> MirrorRow:
+    """A trial as the mirror receives it."""
     trials = {name: finished[name][n] for name in verdict.sequences}
     attributes = {name: trial.mean_error for name, trial in trials.items()}
     attributes["lost"] = sum(trial.lost for trial in trials.values())
@@ -336,7 +183,7 @@ def _told(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -
         f"{name} <= {limit.max:g}": by
         for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
     }
-    return Told(verdict.parameters, verdict.values, attributes, constraints)
+    return MirrorRow(verdict.parameters, verdict.values, attributes, constraints)
 
 
 class _Tally:
@@ -391,7 +238,9 @@ def _best(config: OfflineConfig, stage: Stage) -> str:
     return f"{what} (trial {search.number(search.best)}){feasible}"
 
 
-def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[tuple[Task, int]]:
+def run_tasks(
+    archive: Archive, workers: Pool[Any], tasks: list[Task]
+) -> Iterator[tuple[Task, int]]:
     """Run tasks; yield each when its results are in the archive, and how many trials run now."""
     for task, result, running in run(workers, tasks):
         if result.frames is not None:
@@ -399,105 +248,3 @@ def _run(archive: Archive, workers: Pool[Any], tasks: list[Task]) -> Iterator[tu
         for number, trial in zip(task.numbers, result.trials, strict=True):
             archive.write(task.sequence, number, trial, task.whole)
         yield task, running
-
-
-def _run_whole(
-    study: Study,
-    archive: Archive,
-    workers: Pool[Any],
-    verdicts: Mapping[int, Verdict],
-    fixed: int,
-    progress: Progress,
-) -> dict[str, tuple[float, float]]:
-    """Mean RTE of baseline and fixed set on the training sequences, in one go from end to end."""
-    names = study.training
-    tasks = [
-        Task(name, (n,), (verdicts[n].parameters,), whole=True)
-        for name in names
-        for n in sorted({0, fixed})
-        if not archive.trial_path(name, n, whole=True).exists()
-    ]
-    for done, _ in enumerate(_run(archive, workers, tasks), start=1):
-        progress("whole runs", done, len(tasks), "")
-    means = {
-        (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))
-        for name in names
-        for n in (0, fixed)
-    }
-    return {name: (means[name, 0], means[name, fixed]) for name in names}
-
-
-def _tuned(study: Study, model: ErrorModel) -> ErrorModel:
-    """Choose the bank, and the settings of the rule and of the bank's weights."""
-    sequences, sets, everywhere = labelled_sequences(study, model)
-    fixed = everywhere.index(model.fixed)
-    switching = study.config.online.switching
-    members = choose_bank(sequences, fixed, switching.size)
-    named = [model.number(n) for n in switching.sets or ()]
-    if named and set(named) <= set(everywhere) and len(set(named)) == len(named):
-        members = [everywhere.index(n) for n in named if n is not None]
-    elif named:
-        _log.warning(
-            "online.switching.sets: not all of them were run on every training sequence, or one is "
-            "named twice; the bank is chosen without them (trials.csv tells which were)"
-        )
-    vectors = [s.vectors[:, members] for s in sequences if s.vectors is not None]
-    return replace(
-        model,
-        paired=tune(sequences, sets),
-        bank=[everywhere[i] for i in members],
-        vectors=np.concatenate(vectors),
-        fusion=tune_bank(sequences, sets, members, fixed),
-    )
-
-
-def fit(study: Study, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int) -> ErrorModel:
-    """Make the error model of all trials that keep the limits.
-
-    Sets have no errors (NaN) on the sequences that they were not run on.
-
-    Parameters
-    ----------
-    study
-        The study.
-    archive
-        Its trials.
-    verdicts
-        How they did, by their numbers.
-    fixed
-        Number of the fixed set's.
-    """
-    numbers = [n for n, verdict in verdicts.items() if verdict.feasible]
-    descriptors, sequence, errors, elevations = [], [], [], []
-    window = study.window
-    for s, name in enumerate(study.training):
-        of_sequence = archive.read_errors(name, numbers)
-        # What another budget has had run besides does not count.
-        of_sequence[:, [name not in verdicts[n].sequences for n in numbers]] = np.nan
-        # Whether there is a sub-trajectory depends on the reference alone.
-        labelled = ~np.isnan(of_sequence).all(axis=1)
-        frames = archive.read_frames(name)
-        period = study.config.online.period
-        described = averaged(frames.descriptors, frames.stamps, window, period)
-        descriptors.append(described[labelled])
-        elevations.append(float(np.nanmedian(frames.elevations)))
-        sequence.append(np.full(labelled.sum(), s))
-        errors.append(of_sequence[labelled])
-    return ErrorModel(
-        odometry=study.identity,
-        space=study.space,
-        sets=[verdicts[n].parameters for n in numbers],
-        fixed=numbers.index(fixed),
-        length=study.config.sub_trajectory,
-        sequences=list(study.training),
-        blocks=frames.blocks,
-        window=window,
-        descriptors=np.concatenate(descriptors),
-        sequence=np.concatenate(sequence),
-        errors=np.concatenate(errors),
-        elevations=elevations,
-        provenance={"versions": study.factory.versions, "trials": numbers}
-        | study.config.offline.model_dump(
-            mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
-        ),
-    )

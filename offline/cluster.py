@@ -1,20 +1,22 @@
 """A Dask cluster whose workers run trials.
 
-Recordings are read where they lie if a worker has them under the same path; else they are sent to
-it once, decoded, and kept in its cache of decoded sequences under a digest of their contents.
-Results always return to the driver.
+A worker reads recordings that it has under the same path. Other recordings are decoded and sent to
+it once; it keeps them in its cache of decoded sequences under a digest of their contents. Results
+always return to the driver.
 """
 
 import base64
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import io
 import logging
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +25,15 @@ from adaptune import __version__
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.sequence import Scan, cache
+from adaptune.sequence import Scan, SequenceConfig, cache
 from adaptune.sequence.imu import Imu, ImuNoise
 from adaptune.sequence.views import WithImu
-from adaptune.study import Study
+from adaptune.study.sequences import StudySequences
+from offline.trial import TrialSetup
 from offline.workers import Death, Outcome, Sequences, Task, attempt
 
 CHUNK = 1 << 26
-"""Bytes of scans that are sent at once."""
+"""Bytes of scans in one message."""
 
 _TIMEOUT = 10.0
 _PERIOD = 1.0
@@ -44,11 +47,11 @@ class ClusterError(AdaptuneError):
 
 
 class LackingError(AdaptuneError):
-    """Raised on a worker that has no such sequence."""
+    """A worker does not have the sequence."""
 
 
 class _Place(NamedTuple):
-    """Where a worker is: its host, and which of the workers there it is."""
+    """The place of a worker: its host, and its number on that host."""
 
     host: str
     rank: int
@@ -57,14 +60,18 @@ class _Place(NamedTuple):
 class Cluster:
     """The workers of a Dask cluster, as a `Pool`.
 
-    Use it as a context: leaving it takes back what is still to be done.
+    Use it as a context: leaving it cancels the tasks that are not done.
 
     Parameters
     ----------
-    study
-        The study.
+    setup
+        What trials need.
+    names
+        The training sequences.
+    memory
+        Bytes that prepared scans may take, in all workers together.
     address
-        Of the scheduler, as ``tcp://scheduler:8786``.
+        Address of the scheduler, as ``tcp://scheduler:8786``.
 
     Raises
     ------
@@ -72,16 +79,19 @@ class Cluster:
         If it cannot be reached, has no workers, or workers of another version.
     """
 
-    def __init__(self, study: Study, address: str):
+    def __init__(self, setup: TrialSetup, names: Iterable[str], memory: float, address: str):
         try:
             import distributed
         except ImportError as error:
             raise ClusterError("--cluster needs Dask: pip install 'adaptune[dask]'") from error
         self._killed = distributed.KilledWorker
-        self._study = study
+        self._sequences = setup.sequences
+        self._memory = memory
         self._address = address
-        digests = tuple((name, fingerprint(study, name)) for name in study.training)
-        self._away = AwayStudy(study.config, study.folder.absolute(), digests)
+        self._digests = {name: fingerprint(setup.sequences.config(name)) for name in names}
+        self._away = _away(setup, self._digests)
+        # Distinguishes this campaign from others on the same workers.
+        self._token = uuid4().hex
         self._places: dict[str, _Place] = {}
         self._tasks: dict[str, Task] = {}
         self._futures: dict[str, Any] = {}
@@ -131,10 +141,11 @@ class Cluster:
 
     def start(self, worker: str, task: Task) -> None:
         """See `Pool`."""
-        memory = self._study.config.offline.memory * 1e9 / max(len(self._places), 1)
+        memory = self._memory / max(len(self._places), 1)
         self._tasks[worker] = task
         future = self._client.submit(
             perform,
+            self._token,
             self._away,
             task,
             self._places[worker].rank,
@@ -148,7 +159,7 @@ class Cluster:
 
     def wait(self) -> list[tuple[str, Outcome]]:
         """See `Pool`."""
-        # Nothing tells when a worker dies: have a look now and then.
+        # Dask does not report the death of a worker: look now and then.
         self._done.wait(_PERIOD)
         self._done.clear()
         hosts = self._hosts()
@@ -178,7 +189,7 @@ class Cluster:
         return Death(f"worker {worker} has gone")
 
     def _hosts(self) -> dict[str, str]:
-        """The host of every worker that the scheduler knows of."""
+        """The host of every worker that the scheduler knows."""
         if self._client.status == "running":
             with contextlib.suppress(OSError):
                 known = self._client.scheduler_info(n_workers=-1)["workers"]
@@ -192,7 +203,7 @@ class Cluster:
         """Refuse workers of another version."""
 
         def version() -> str:
-            # A function within a function is sent as code, and runs where there is no adaptune.
+            # Dask sends an inner function as code, so it runs without adaptune.
             from importlib.metadata import version
 
             return version("adaptune")
@@ -200,7 +211,7 @@ class Cluster:
         versions = self._client.run(version, workers=workers, on_error="return")
         for worker, found in versions.items():
             if isinstance(found, OSError):
-                continue  # gone again
+                continue  # it has gone again
             if found != __version__:
                 what = "no adaptune" if isinstance(found, Exception) else f"adaptune {found}"
                 raise ClusterError(
@@ -209,34 +220,43 @@ class Cluster:
                 )
 
     def _send(self, worker: str, name: str) -> None:
-        """Send a sequence to a worker, unless one on the same host got it before."""
-        digest = dict(self._away.digests)[name]
+        """Send a sequence to a worker, unless a worker on the same host has received it."""
+        digest = self._digests[name]
         try:
             if self._client.run(_has, digest, workers=[worker])[worker]:
                 return
-            sequence = self._study.sequence(name)
+            sequence = self._sequences.open(name)
             _log.info("%s: sending it to %s", name, worker)
             self._client.run(_begin, digest, sequence.name, workers=[worker])
             stamps = []
             for scans in _chunks(sequence):
                 stamps += [scan.stamp for scan in scans]
                 self._client.run(_append, digest, scans, workers=[worker])
-            motion = _pack(
-                sequence, np.array(stamps, np.int64), imu=self._study.described.needs_imu
-            )
+            motion = _pack(sequence, np.array(stamps, np.int64), imu=self._sequences.with_imu)
             if self._client.run(_end, digest, motion, workers=[worker])[worker]:
                 return
-            problem = "its log tells why"
+            problem = "see its log"
         except OSError as error:
             problem = str(error)
-        # One that has gone is noticed by and by.
+        # `wait` notices a worker that has gone.
         if worker in self._hosts():
             raise ClusterError(
                 f"worker {worker} cannot keep the sequence {name} in its cache ({problem})"
             )
 
 
-def _chunks(scans: Iterator[Scan]) -> Iterator[list[Scan]]:
+def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
+    """The setup for workers, which may not have the recordings."""
+    given = {f.name: getattr(setup.sequences, f.name) for f in dataclasses.fields(StudySequences)}
+    given["folder"] = setup.sequences.folder.absolute()
+    sequences, odometry = AwaySequences(**given, digests=digests), setup.odometry
+    if odometry.program_input is not None:
+        odometry = copy.copy(odometry)
+        odometry.program_input = sequences.program_input
+    return TrialSetup(setup.settings, odometry, sequences)
+
+
+def _chunks(scans: Iterable[Scan]) -> Iterator[list[Scan]]:
     chunk: list[Scan] = []
     size = 0
     for scan in scans:
@@ -250,7 +270,7 @@ def _chunks(scans: Iterator[Scan]) -> Iterator[list[Scan]]:
 
 
 def _pack(sequence: Any, stamps: NDArray[np.int64], *, imu: bool) -> str:
-    """What is known of the motion beside the scans."""
+    """Reference poses, and the IMU's measurements, as text."""
     arrays = {}
     if (reference := sequence.reference()) is not None:
         arrays["T_ref_sensor"] = reference.at(stamps)
@@ -261,15 +281,14 @@ def _pack(sequence: Any, stamps: NDArray[np.int64], *, imu: bool) -> str:
     return base64.b64encode(packed.getvalue()).decode()
 
 
-def fingerprint(study: Study, name: str) -> str:
-    """Digest of what a sequence is read from, and how; paths and times of change do not count.
+def fingerprint(config: SequenceConfig) -> str:
+    """Digest of a recording and its settings; paths and times of change do not count.
 
     Raises
     ------
     OSError
         If a file cannot be read.
     """
-    config = study.sequence_config(name)
     settings = config.model_dump_json(exclude={"bag", "kitti", "folder", "reference", "cache"})
     digest = hashlib.blake2b(f"{__version__} {settings}".encode(), digest_size=16)
     paths = config.paths()
@@ -291,35 +310,35 @@ def fingerprint(study: Study, name: str) -> str:
 # What follows runs on the workers.
 
 
-@dataclasses.dataclass(frozen=True)
-class AwayStudy(Study):
-    """A study on a worker, which may not have its recordings.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AwaySequences(StudySequences):
+    """The sequences of a study on a worker, which may not have the recordings.
 
     Attributes
     ----------
-    digests : tuple
-        Pairs of a sequence's name and its `fingerprint` at the driver's.
+    digests : dict
+        `fingerprint` of every sequence at the driver.
     """
 
-    digests: tuple[tuple[str, str], ...]
+    digests: Mapping[str, str]
 
-    def sequence(self, name: str) -> Any:
-        """See `Study.sequence`.
+    def open(self, name: str) -> Any:
+        """See `StudySequences.open`.
 
         Raises
         ------
         LackingError
-            If the sequence is neither here nor was it sent.
+            If the sequence is not here and was not sent.
         """
-        digest = dict(self.digests)[name]
+        digest = self.digests[name]
         with contextlib.suppress(AdaptuneError, OSError):
-            if fingerprint(self, name) == digest:
-                return super().sequence(name)
+            if fingerprint(self.config(name)) == digest:
+                return super().open(name)
         entry = cache.find(digest)
         if entry is None:
             raise LackingError(name)
         sent: Any = _Sent(entry)
-        return WithImu(sent) if self.described.needs_imu else sent
+        return WithImu(sent) if self.with_imu else sent
 
 
 class _Sent:
@@ -341,7 +360,7 @@ class _Sent:
         return _Known(self._entry.stamps, self._motion["T_ref_sensor"])
 
     def imu(self) -> Imu | None:
-        """Measurements of the IMU, if the odometry wants them."""
+        """Measurements of the IMU, if the odometry needs them."""
         if "stamps" not in self._motion:
             return None
         of_imu = {f.name: self._motion[f.name] for f in dataclasses.fields(Imu)}
@@ -353,13 +372,13 @@ class _Sent:
 
 
 class _Known(NamedTuple):
-    """A trajectory of which the poses at some stamps are known."""
+    """A trajectory that is known at some stamps."""
 
     stamps: NDArray[np.int64]
     T_world_sensor: Poses
 
     def at(self, stamps: NDArray[np.int64]) -> Poses:
-        """Poses at stamps that are among those known, of shape (n, 4, 4)."""
+        """Poses at known stamps, of shape (n, 4, 4)."""
         return self.T_world_sensor[np.searchsorted(self.stamps, stamps)]
 
 
@@ -368,14 +387,13 @@ _held: tuple[str, Sequences] | None = None
 _writers: dict[str, cache.Writer] = {}
 
 
-def perform(study: AwayStudy, task: Task, core: int, memory: float) -> Outcome:
-    """Do a task, with the sequences that earlier tasks of the same study have prepared."""
+def perform(token: str, setup: TrialSetup, task: Task, core: int, memory: float) -> Outcome:
+    """Do a task, with the sequences that earlier tasks of the same campaign have prepared."""
     global _held  # noqa: PLW0603 (a Dask worker keeps nothing else from task to task)
     with _lock:
         pin(core)
-        token = f"{study.config.model_dump_json()} {study.digests}"
         if _held is None or _held[0] != token:
-            _held = token, Sequences(study, memory)
+            _held = token, Sequences(setup, memory)
         return attempt(_held[1], task)
 
 

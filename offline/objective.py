@@ -1,4 +1,4 @@
-"""What a trial is judged by: metrics, weighted sums of them, and limits.
+"""How to judge a trial: metrics, weighted sums of them, and limits.
 
 Metrics of one parameter set on one sequence:
 
@@ -7,7 +7,7 @@ Metrics of one parameter set on one sequence:
 ``kitti``        translation error of KITTI's benchmark, percent
 ``rpe``          relative pose error from scan to scan as evo gives it, metres
 ``ape``          absolute pose error after alignment as evo gives it, metres
-``ms_per_scan``  milliseconds that the odometry takes for a scan, without preparing it
+``ms_per_scan``  milliseconds that the odometry takes for a prepared scan
 ``cpu``          CPU time over the recording's duration, percent of a core
 ``memory``       megabytes that the odometry's process takes at most
 ===============  ==================================================================================
@@ -28,15 +28,15 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
 from adaptune.metrics import absolute_error, kitti_error, relative_error
 from adaptune.space import ParameterSet
-from adaptune.study import TIMED, Metric, OfflineConfig
+from offline.config import TIMED, Metric, OfflineConfig
 
 BOUND = 1e6
-"""No metric counts for more, nor one that cannot be told, so that sums stay finite."""
+"""The largest value of a metric, also where it cannot be computed: sums stay finite."""
 SEVERITY = 10.0
-"""How many times the baseline's value is added to that of a set that breaks a limit."""
+"""A set that breaks a limit is worse by so many times the baseline's value."""
 
 Value = float | tuple[float, ...]
-"""What samplers minimise: a tuple where there are several objectives."""
+"""What samplers minimise: a tuple if there are several objectives."""
 
 
 class Verdict(NamedTuple):
@@ -46,16 +46,16 @@ class Verdict(NamedTuple):
     ----------
     parameters : dict
     values : tuple of float
-        Of every objective, the mean over the sequences.
+        Mean of every objective over the sequences.
     constraints : tuple of float
-        For every limit by how much it is exceeded, in parts of it; negative if it is kept.
+        Excess over every limit, as a share of the limit; negative if the limit is kept.
     margin : float
-        From the first value to the upper end of its one-sided 95 % confidence interval, where
-        trials are repeated; 0 where they are not.
+        Distance from the first value to the upper end of its one-sided 95 % confidence interval;
+        0 unless trials are repeated.
     complete : bool
-        Whether it was run on all sequences; if not, its values are estimates.
+        Whether the set was run on all sequences; if not, its values are estimates.
     sequences : tuple of str
-        Those that it was run on.
+        The sequences on which it was run.
     """
 
     parameters: ParameterSet
@@ -67,23 +67,23 @@ class Verdict(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """By how much all limits together are exceeded, each in parts of the limit."""
+        """Sum of the excesses over all limits, each as a share of the limit."""
         return exceeded(self.constraints)
 
     @property
     def feasible(self) -> bool:
-        """Whether it keeps all limits."""
+        """Whether the set keeps all limits."""
         return self.excess == 0.0
 
 
-class Result(NamedTuple):
-    """What samplers are told of a trial.
+class SamplerResult(NamedTuple):
+    """The result of a trial as samplers receive it.
 
     Attributes
     ----------
     parameters : dict
     value : float or tuple of float
-        To be minimised.
+        Samplers minimise it.
     constraints : tuple of float
         See `Verdict`.
     """
@@ -94,19 +94,19 @@ class Result(NamedTuple):
 
 
 def exceeded(constraints: Sequence[float]) -> float:
-    """Sum of what is exceeded."""
+    """Sum of the excesses."""
     return sum(max(0.0, by) for by in constraints)
 
 
 def trajectory_metrics(
     frames: Frames, T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]
 ) -> dict[str, float]:
-    """Those metrics that are of the trajectory as a whole; KITTI's where it is long enough.
+    """The metrics of a whole trajectory; KITTI's error if it is long enough.
 
     Parameters
     ----------
     frames
-        Of the sequence.
+        The sequence's frames.
     T_odom_sensor
         The odometry's poses, of shape (n, 4, 4).
     lost_steps
@@ -124,20 +124,19 @@ def trajectory_metrics(
 
 
 def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
-    """Undo new starts at the reference, each of which would hide the error that led to it.
+    """Undo restarts at the reference, which would hide the errors that led to them.
 
     Parameters
     ----------
     T_odom_sensor
         Poses of shape (n, 4, 4).
     lost_steps
-        For every frame with a new start, the motion since the frame before as the odometry gave
-        it, of shape (4, 4).
+        By frame of a restart, the odometry's motion since the frame before, of shape (4, 4).
 
     Returns
     -------
     ndarray of shape (n, 4, 4)
-        The trajectory as it would have gone on from the wrong pose.
+        The trajectory as it would have continued from the wrong pose.
     """
     T = T_odom_sensor.copy()
     for start, end in pairwise([*sorted(lost_steps), len(T)]):
@@ -152,9 +151,9 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     Parameters
     ----------
     config
-        Its objective and limits. A limit holds on every sequence.
+        Objectives and limits. A limit holds on every sequence.
     runs
-        Its trials, one for each sequence.
+        The set's trials, one for each sequence.
     """
     metrics = [run.metrics for run in runs]
     values = tuple(
@@ -165,7 +164,10 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
         max(of_run[name] for of_run in metrics) / limit.max - 1.0
         for name, limit in config.limits.items()
     )
-    return Verdict(runs[0].parameters, values, constraints, _margin(config.objective[0], runs))
+    above = 0.0
+    if all(run.repeats for run in runs):
+        above = float(margin(np.array([repeated(config.objective[0], r.repeats) for r in runs])))
+    return Verdict(runs[0].parameters, values, constraints, above)
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -173,41 +175,46 @@ def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> f
     return sum(weight * metrics[name] for name, weight in weights.items())
 
 
-def _margin(weights: Mapping[Metric, float], runs: Sequence[Summary]) -> float:
-    """Student's, of the mean over sequences: runs of a set vary, the sequences do not."""
-    if not all(run.repeats for run in runs):
-        return 0.0
+def repeated(weights: Mapping[Metric, float], runs: Sequence[Mapping[str, float]]) -> list[float]:
+    """The weighted sum of the metrics that can repeat, in every run of a trial."""
     repeatable = {name: w for name, w in weights.items() if name not in TIMED}
-    values = np.array([[weighted(repeatable, r) for r in run.repeats] for run in runs])
-    n_runs, n_repeats = values.shape
-    error = np.sqrt(values.var(axis=1, ddof=1).sum() / n_repeats) / n_runs
-    return float(stats.t.ppf(0.95, n_runs * (n_repeats - 1)) * error)
+    return [weighted(repeatable, run) for run in runs]
 
 
-def told(verdicts: Sequence[Verdict]) -> list[Result]:
-    """What samplers are told: values, a tuple of them where there are several objectives.
+def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From a mean over sequences to the upper end of its one-sided 95 % confidence interval.
+
+    The interval is Student's. Runs of a set vary, the sequences do not.
 
     Parameters
     ----------
-    verdicts
-        Of all trials.
+    repeats
+        Values of every run, of shape (n_sequences, ..., n_repeats).
     """
+    n_sequences, n_repeats = len(repeats), repeats.shape[-1]
+    variance = repeats.var(axis=-1, ddof=1).sum(axis=0)
+    error = np.sqrt(variance / n_repeats) / n_sequences
+    return np.asarray(stats.t.ppf(0.95, n_sequences * (n_repeats - 1)) * error)
+
+
+def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
+    """The results of trials as samplers receive them."""
     return [
-        Result(v.parameters, v.values if len(v.values) > 1 else v.values[0], v.constraints)
+        SamplerResult(v.parameters, v.values if len(v.values) > 1 else v.values[0], v.constraints)
         for v in verdicts
     ]
 
 
-def penalised(history: Sequence[Result]) -> list[Result]:
-    """Put limits into the values, for samplers that know nothing of constraints.
+def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
+    """Put limits into the values, for samplers without constraints.
 
-    Sets that break limits are worse by ten times the baseline's value, and the more so the more
-    they exceed: what is proposed next keeps away from them.
+    A set that breaks limits is worse by `SEVERITY` times the baseline's value, and more with a
+    larger excess: the sampler keeps away from it.
 
     Parameters
     ----------
     history
-        Of all trials, the baseline's first.
+        Results of all trials; the first one is the baseline's.
     """
     if not any(result.constraints for result in history):
         return list(history)
@@ -217,20 +224,20 @@ def penalised(history: Sequence[Result]) -> list[Result]:
         if (excess := exceeded(constraints)) > 0.0:
             values = values + SEVERITY * np.where(baseline, baseline, 1.0) * (1.0 + excess)
         several = tuple(values.tolist())
-        made.append(Result(parameters, several if len(several) > 1 else several[0]))
+        made.append(SamplerResult(parameters, several if len(several) > 1 else several[0]))
     return made
 
 
 def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
-    """Number of the set that does best by the first objective among those that keep all limits.
+    """Trial number of the set with the least first objective among those that keep all limits.
 
-    Where trials are repeated, the one whose value is surely least: the upper end of its confidence
-    interval counts. Of equal ones, the first.
+    If trials are repeated, the upper end of the confidence interval counts. Of equal sets, the
+    first one is chosen.
 
     Raises
     ------
     AdaptuneError
-        If there is none.
+        If no set keeps all limits.
     """
     complete = [n for n, verdict in verdicts.items() if verdict.complete]
     feasible = [n for n in complete if verdicts[n].feasible]
@@ -239,7 +246,7 @@ def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
         limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
         raise AdaptuneError(
             f"offline.limits: none of {len(complete)} parameter sets keeps {limits} on every "
-            f"sequence; nearest comes trial {nearest}, {verdicts[nearest].excess:.0%} beyond "
+            f"sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
             f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the "
             f"parameters, or run more trials"
         )
@@ -252,17 +259,17 @@ def label(weights: Mapping[Metric, float]) -> str:
 
 
 def pareto_front(values: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Rows that no other row is as good as in every column and better than in one.
+    """Rows that no other row dominates: as good in every column, and better in one.
 
     Parameters
     ----------
     values
-        To be minimised, of shape (n, n_objectives).
+        Values to minimise, of shape (n, n_objectives).
 
     Returns
     -------
     ndarray of shape (m,)
-        Their numbers, by rising value of the first column; of equal rows the first.
+        Indices of these rows, by rising value of the first column; of equal rows the first one.
     """
     unique, first = np.unique(values, axis=0, return_index=True)
     front = [

@@ -1,19 +1,19 @@
-"""Which trials of a batch go on to more sequences, and which are given up.
+"""Pruning: which trials of a batch continue on more sequences, and which stop.
 
-The first batch is run in full. It tells which sequences are hard, and these come first from then
-on: sets fail on them, if anywhere. Trials of later batches are run on growing shares of the
-sequences; what a trial has seen when it is given up still feeds the model. Who goes on depends on
-the batches before and on the batch itself so far, and on nothing else.
+The first batch runs in full. It shows which sequences are hard, and these come first from then on:
+sets fail on them, if anywhere. Trials of later batches run on growing shares of the sequences. The
+model also uses what a trial saw before it stopped. The choice depends on the batches before and on
+the batch so far, and on nothing else.
 
-- ``halving``: the best third goes on to three times as many sequences (successive halving, Jamieson
-  and Talwalkar, AISTATS 2016), the best of all trials of any batch that have come so far.
+- ``halving``: the best third continues on three times as many sequences (successive halving,
+  Jamieson and Talwalkar, AISTATS 2016): the best third of all trials that came so far.
 - ``hyperband``: the same, but batches begin with three, nine... sequences in turn (Li et al., JMLR
-  2018), for where a few sequences say little about the others.
-- ``wilcoxon``: one sequence after the other; given up is what a signed-rank test finds worse than
-  the best trial on the same sequences (Optuna's pruner).
+  2018), for studies in which a few sequences say little about the others.
+- ``wilcoxon``: one sequence after the other. A trial stops if a signed-rank test finds it worse
+  than the best trial on the same sequences (Optuna's pruner).
 
-All of them give up what cannot win any more: values are never negative, so a trial that comes to
-more on some sequences than the best one on all of them is worse.
+All rules stop a trial that cannot win any more. Values are never negative, so a trial whose sum
+over some sequences exceeds the best trial's sum over all sequences is worse.
 """
 
 import warnings
@@ -26,18 +26,18 @@ import optuna
 Pruning = Literal["none", "halving", "hyperband", "wilcoxon"]
 
 REDUCTION = 3
-"""Of so many trials one goes on, to so many times the sequences."""
+"""One of so many trials continues, on so many times the sequences."""
 FEWEST = 3
-"""Sequences, and not fewer, are taken to stand for the others."""
+"""The least number of sequences that may stand for the others."""
 SIGNIFICANCE = 0.1
-"""A difference is taken for more than chance where the test's p is below this."""
+"""A difference counts as more than chance if the test's p is below this."""
 
 Values = Sequence[float]
-"""A trial's objective on the sequences that it was run on, in their order."""
+"""A trial's objective on the sequences on which it was run, in their order."""
 
 
 def rungs(pruning: Pruning, batch: int, n: int) -> list[int]:
-    """Numbers of sequences after which trials of a batch are given up; the last is all of them.
+    """Numbers of sequences after which trials of a batch stop; the last one is all of them.
 
     Parameters
     ----------
@@ -61,17 +61,17 @@ def rungs(pruning: Pruning, batch: int, n: int) -> list[int]:
 def survivors(
     pruning: Pruning, m: int, batch: Mapping[int, Values], before: Mapping[int, Values]
 ) -> list[int]:
-    """Numbers of the trials of a batch that go on.
+    """Numbers of the trials of a batch that continue.
 
     Parameters
     ----------
     pruning
         The rule.
     m
-        Number of sequences that the trials of the batch have seen.
+        Number of sequences on which the trials of the batch were run.
     batch, before
-        Values of the trials of this batch that are left and of those before, by their numbers, of
-        such that keep all limits.
+        Values by trial number: of the trials of this batch that are left, and of all trials before.
+        Only trials that keep all limits.
     """
     if not before:
         return list(batch)
@@ -90,8 +90,9 @@ def _worse(values: Values, best: Values) -> bool:
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         pruner = optuna.pruners.WilcoxonPruner(p_threshold=SIGNIFICANCE)
     study = optuna.create_study(pruner=pruner)
-    told = {i: float(value) for i, value in enumerate(best)}
-    study.add_trial(optuna.trial.create_trial(value=float(np.mean(best)), intermediate_values=told))
+    steps = {i: float(value) for i, value in enumerate(best)}
+    mean = float(np.mean(best))
+    study.add_trial(optuna.trial.create_trial(value=mean, intermediate_values=steps))
     trial = study.ask()
     for i, value in enumerate(values):
         trial.report(value, i)
@@ -99,14 +100,14 @@ def _worse(values: Values, best: Values) -> bool:
 
 
 def estimate(values: Values, baseline: Values) -> float:
-    """What a trial that was given up would have come to: as far from the baseline as it was.
+    """Estimate the mean of a stopped trial from its ratio to the baseline so far.
 
     Parameters
     ----------
     values
-        Of the trial, on the first sequences.
+        The trial's values, on the first sequences.
     baseline
-        The baseline's, on all of them.
+        The baseline's values, on all of them.
     """
     seen = float(np.mean(baseline[: len(values)]))
     return float(np.mean(values)) * (float(np.mean(baseline)) / seen if seen > 0.0 else 1.0)

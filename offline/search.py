@@ -1,4 +1,4 @@
-"""Searches for parameter sets: one over all training sequences together, one for each, or both."""
+"""Searches for parameter sets: one over all training sequences, one for each, or both."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -6,48 +6,49 @@ from typing import NamedTuple
 import numpy as np
 
 from adaptune.archive import Summary
-from adaptune.space import ParameterSet
-from adaptune.study import OfflineConfig, Study
+from adaptune.space import ParameterSet, ParameterSpace
 from offline.budget import max_trials, spent
-from offline.objective import Verdict, choose_fixed, judge, told, weighted
+from offline.config import OfflineConfig
+from offline.objective import Verdict, choose_fixed, judge, sampler_results, weighted
 from offline.pruning import estimate, survivors
-from offline.samplers import Sampler, make_sampler
+from offline.samplers import make_sampler
+from offline.samplers.base import Sampler
 
 Finished = Mapping[str, Mapping[int, Summary]]
-"""The finished trials on every sequence, by number."""
+"""By sequence, the finished trials by their numbers."""
 
 
 class Search:
     """One search, batch by batch.
 
-    Several searches of a study number their trials in turn: trial 0, the baseline, is of all of
-    them, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers
-    depend on no budget.
+    Several searches of a study number their trials in turn: all of them share trial 0, the
+    baseline, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers
+    do not depend on a budget.
 
     Parameters
     ----------
     sampler
         Proposes the sets.
     sequences
-        On which they are run.
+        The sequences on which the sets are run.
     finished
         All trials of the study.
     place
-        j and n.
+        j and n, see above.
 
     Attributes
     ----------
     sequences : list of str
     verdicts : list of Verdict
-        Of all trials up to the last border of a batch.
+        Verdicts of the trials of all batches that are closed.
     best : int
-        Which of them is best.
+        Index of the best of them.
     numbers : list of int
-        Of the trials of the batch at hand.
+        Trial numbers of the present batch.
     order : list of str
-        The sequences as they are to be run one after the other.
+        The sequences in the order in which they are run.
     end : str, optional
-        Why the search is over.
+        Why the search has ended.
     """
 
     def __init__(
@@ -68,22 +69,22 @@ class Search:
         self._sets: dict[int, ParameterSet] = {}
 
     def number(self, i: int) -> int:
-        """Number in the study of a trial of this search."""
+        """Trial number in the study of trial `i` of this search."""
         j, n = self._place
         return 1 + (i - 1) * n + j if i else 0
 
     @property
     def done(self) -> dict[int, Verdict]:
-        """The verdicts by the trials' numbers in the study."""
+        """The verdicts by trial number."""
         return {self.number(i): verdict for i, verdict in enumerate(self.verdicts)}
 
     def begin(self, hours: float) -> bool:
-        """Begin the next batch, and tell whether there is one.
+        """Begin the next batch; False if the search has ended.
 
         Parameters
         ----------
         hours
-            What all batches before took.
+            Hours that all batches before took.
         """
         if self.end is None:
             best = self.number(self.best)
@@ -106,7 +107,7 @@ class Search:
         return True
 
     def missing(self, m: int) -> dict[str, list[int]]:
-        """On each of the first `m` sequences, trials of the batch that are still to be run."""
+        """Trials of the batch still to be run, for each of the first `m` sequences."""
         return {
             name: [n for n in self._alive if n not in self._finished[name]]
             for name in self.order[:m]
@@ -119,14 +120,14 @@ class Search:
         return self._sets[number]
 
     def prune(self, m: int) -> None:
-        """Give up trials that promise little after `m` sequences."""
+        """Stop trials that promise little after `m` sequences."""
         if m < len(self.order):
             before = self._values(self.done, self.order)
             batch = self._values(self._alive, self.order[:m])
             self._alive = survivors(self._config.pruning, m, batch, before)
 
     def close(self) -> None:
-        """End the batch, whose trials are all finished or given up."""
+        """Close the batch, whose trials have all finished or stopped."""
         first = len(self.verdicts)
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
@@ -137,13 +138,13 @@ class Search:
         self.numbers = []
 
     def total(self) -> int:
-        """How many runs it will take at most, or has taken up to the end of this batch."""
+        """The most runs that the search takes; without a limit, the runs up to this batch."""
         n_trials = len(self.verdicts) if self.end else self._limit
         n_trials = len(self.verdicts) + len(self.numbers) if n_trials is None else n_trials
         return n_trials * len(self.sequences)
 
     def _propose(self) -> None:
-        sets = self._sampler.propose(told(self.verdicts))
+        sets = self._sampler.propose(sampler_results(self.verdicts))
         self._sets = dict(zip(self.numbers, sets, strict=False))
 
     def _hardest_first(self) -> list[str]:
@@ -156,7 +157,7 @@ class Search:
         return sorted(means, key=lambda name: -means[name])
 
     def _values(self, numbers: Iterable[int], seen: Sequence[str]) -> dict[int, list[float]]:
-        """Of those that keep the limits, values on the sequences that they were run on."""
+        """Values of the trials that keep the limits, on the sequences on which they were run."""
         of_numbers = {
             n: [run for name in seen if (run := self._finished[name].get(n))] for n in numbers
         }
@@ -177,14 +178,14 @@ def assess(
     sequences: Sequence[str],
     finished: Finished,
 ) -> Verdict:
-    """What a trial came to on some sequences, or would have if it had been run on all of them.
+    """Judge a trial; estimate its values if it was not run on all sequences.
 
     Parameters
     ----------
     number
-        Of the trial.
+        The trial number.
     counted
-        Sequences that count, if it was run there.
+        The sequences that count, if the trial was run on them.
     config
         Objectives and limits.
     sequences
@@ -212,30 +213,35 @@ def _rank(verdict: Verdict) -> tuple[bool, float, float]:
 
 
 class Stage(NamedTuple):
-    """Searches that go on side by side.
+    """Searches that run side by side.
 
     Attributes
     ----------
     searches : list of Search
     alone : bool
-        Whether each is of one sequence.
+        Whether each search uses one sequence alone.
     """
 
     searches: list[Search]
     alone: bool
 
 
-def make_stages(study: Study, finished: Finished) -> list[Stage]:
-    """What a study searches for, in its order.
+def make_stages(
+    config: OfflineConfig, space: ParameterSpace, names: list[str], finished: Finished
+) -> list[Stage]:
+    """Make the searches of a study, in their order.
 
     Parameters
     ----------
-    study
-        The study.
+    config
+        Sampler, seed, budgets and kinds of searches.
+    space
+        The tuned parameters.
+    names
+        The training sequences.
     finished
-        Its trials, on every training sequence.
+        The finished trials on them.
     """
-    config, names = study.config.offline, study.training
     shared = [names] if config.sets != "own" else []
     own = [[name] for name in names] if config.sets != "shared" else []
     searches = []
@@ -243,21 +249,21 @@ def make_stages(study: Study, finished: Finished) -> list[Stage]:
         seed = config.seed
         if j >= len(shared):
             seed = int(np.random.SeedSequence((seed, j - len(shared))).generate_state(1)[0])
-        sampler = make_sampler(study.space, config.model_copy(update={"seed": seed}))
+        sampler = make_sampler(space, config.model_copy(update={"seed": seed}))
         searches.append(Search(sampler, sequences, finished, (j, len(shared) + len(own))))
     n = len(shared)
     return [Stage(s, alone) for s, alone in ((searches[:n], False), (searches[n:], True)) if s]
 
 
 def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
-    """The best sets of a stage's searches that keep the limits, by number.
+    """The best set of each search that keeps the limits, by trial number.
 
     Parameters
     ----------
     config
-        Of the study.
+        Objectives and limits.
     stage
-        Searches that are over.
+        Searches that have ended.
     """
     best = {}
     for search in stage.searches:
@@ -268,16 +274,16 @@ def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
 
 
 def owner(config: OfflineConfig, sequences: Sequence[str], number: int) -> str | None:
-    """The sequence that a trial's set was searched for on, if on one alone.
+    """The sequence whose own search proposed a trial's set; None for a shared search.
 
     Parameters
     ----------
     config
-        Of the study.
+        Kinds of searches.
     sequences
-        All that are trained on.
+        All training sequences.
     number
-        Of the trial.
+        The trial number.
     """
     n_shared = 0 if config.sets == "own" else 1
     if config.sets == "shared" or number == 0:

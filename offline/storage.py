@@ -1,7 +1,7 @@
-"""A study's trials in an Optuna storage, where Optuna's own tools find them.
+"""A study's trials in an Optuna storage, for Optuna's own tools.
 
-It is a mirror: the archive is the truth, and nothing is ever read back from it but what it has
-been told.
+The storage is a mirror: the archive is the truth. Only the numbers and parameters of mirrored
+trials are ever read back.
 """
 
 import logging
@@ -18,14 +18,14 @@ from optuna.storages.journal import JournalFileBackend
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import needing_room
-from adaptune.space import Categorical, Float, Integer, ParameterSet
-from adaptune.study import Study
+from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
+from offline.config import OfflineConfig
 
 JOURNAL = "optuna.log"
 """The default storage, in the study's folder."""
 
 _NUMBER = "adaptune trial"
-# Each trial is a line of the journal with this in it.
+# The line of a trial in the journal.
 _LINE = re.compile(rb'"adaptune trial":(\d+)[^\n]*\n')
 _LOGIN = re.compile(r"://(.*@)")
 
@@ -36,18 +36,18 @@ class StorageError(AdaptuneError):
     """A storage that cannot be used."""
 
 
-class Told(NamedTuple):
-    """What the storage is told of a trial.
+class MirrorRow(NamedTuple):
+    """A trial as the mirror receives it.
 
     Attributes
     ----------
     parameters : dict
     values : tuple of float
-        What is minimised, one for each objective.
+        The value of each objective.
     attributes : dict
-        What else there is to know, as plain data.
+        Further figures, as plain data.
     constraints : dict
-        For every limit by how much it is exceeded; negative if it is kept.
+        Excess over every limit; negative if the limit is kept.
     """
 
     parameters: ParameterSet
@@ -56,38 +56,57 @@ class Told(NamedTuple):
     constraints: Mapping[str, float] = {}
 
 
-def open_mirror(study: Study, finished: Mapping[int, ParameterSet]) -> "Mirror":
-    """Open the storage that the study names; a journal in its folder if it names none.
+def open_mirror(
+    folder: Path,
+    config: OfflineConfig,
+    space: ParameterSpace,
+    finished: Mapping[int, ParameterSet],
+) -> "Mirror":
+    """Open the storage that a study names, by default a journal in its folder.
 
     Parameters
     ----------
-    study
-        The study; no other process must be at work in its folder.
+    folder
+        The study's folder, in which no other process works. Its name is the name of the study.
+    config
+        Storage and objectives.
+    space
+        The tuned parameters.
     finished
-        Parameters of its finished trials, by number.
+        Parameters of the finished trials, by trial number.
 
     Raises
     ------
     StorageError
         If a database cannot be reached, or holds another study of this name.
     """
-    url = study.config.offline.storage
-    return JournalMirror(study) if url is None else DatabaseMirror(study, url, finished)
+    n_objectives = len(config.objective)
+    if config.storage is None:
+        return JournalMirror(folder / JOURNAL, n_objectives, space)
+    return DatabaseMirror(config.storage, folder.name, n_objectives, space, finished)
 
 
 class Mirror(ABC):
-    """An Optuna study that is told every trial once, in the order of their numbers."""
+    """An Optuna study that receives every trial once.
 
-    def __init__(self, study: Study):
-        self._name = study.name
-        self._directions = [optuna.study.StudyDirection.MINIMIZE] * len(
-            study.config.offline.objective
-        )
-        self._distributions = {n: distribution(p) for n, p in study.space.parameters.items()}
+    Parameters
+    ----------
+    name
+        Name of the study.
+    n_objectives
+        Number of objectives.
+    space
+        The tuned parameters.
+    """
+
+    def __init__(self, name: str, n_objectives: int, space: ParameterSpace):
+        self._name = name
+        self._directions = [optuna.study.StudyDirection.MINIMIZE] * n_objectives
+        self._distributions = {n: distribution(p) for n, p in space.parameters.items()}
 
     @abstractmethod
-    def tell(self, numbers: Collection[int], trial: Callable[[int], Told]) -> None:
-        """Tell of trials in this order; those that it knows are not asked for again."""
+    def report(self, numbers: Collection[int], row: Callable[[int], MirrorRow]) -> None:
+        """Report trials in this order; `row` is called for those that the mirror lacks."""
 
     def _create(self, storage: Any) -> optuna.Study:
         return optuna.create_study(
@@ -103,22 +122,22 @@ class Mirror(ABC):
         return {trial.user_attrs.get(_NUMBER, trial.number): trial.params for trial in trials}
 
     def _add(
-        self, mirror: optuna.Study, numbers: Collection[int], trial: Callable[[int], Told]
+        self, mirror: optuna.Study, numbers: Collection[int], row: Callable[[int], MirrorRow]
     ) -> None:
         known = self._known(mirror)
         for number in numbers:
             if number in known:
                 continue
-            told = trial(number)
-            finite = np.isfinite(told.values).all()
+            trial = row(number)
+            finite = np.isfinite(trial.values).all()
             mirror.add_trial(
                 optuna.trial.create_trial(
                     state=optuna.trial.TrialState.COMPLETE if finite else _FAIL,
-                    params=told.parameters,
+                    params=trial.parameters,
                     distributions=self._distributions,
-                    values=told.values if finite else None,
-                    user_attrs={_NUMBER: number} | dict(told.attributes),
-                    constraints=dict(told.constraints),
+                    values=trial.values if finite else None,
+                    user_attrs={_NUMBER: number} | dict(trial.attributes),
+                    constraints=dict(trial.constraints),
                 )
             )
 
@@ -127,25 +146,33 @@ _FAIL = optuna.trial.TrialState.FAIL
 
 
 class JournalMirror(Mirror):
-    """A journal file in the study's folder, made anew should it be damaged."""
+    """A journal file in the study's folder; a damaged one is written again.
 
-    def __init__(self, study: Study):
-        super().__init__(study)
-        self._path = study.folder / JOURNAL
+    Parameters
+    ----------
+    path
+        The file; its folder's name is the name of the study.
+    n_objectives, space
+        See `Mirror`.
+    """
+
+    def __init__(self, path: Path, n_objectives: int, space: ParameterSpace):
+        super().__init__(path.parent.name, n_objectives, space)
+        self._path = path
         self._mirror: optuna.Study | None = None
-        # A driver that was killed may have left its lock behind.
+        # A killed driver may have left its lock.
         self._path.with_name(JOURNAL + ".lock").unlink(missing_ok=True)
 
-    def tell(self, numbers: Collection[int], trial: Callable[[int], Told]) -> None:
+    def report(self, numbers: Collection[int], row: Callable[[int], MirrorRow]) -> None:
         """See `Mirror`."""
         if self._mirror is None:
-            # Optuna replays a journal when it is opened, which takes its time.
-            if _told(self._path).issuperset(numbers):
+            # Opening the journal takes long: Optuna reads all of it.
+            if _reported(self._path).issuperset(numbers):
                 return
             with needing_room(self._path):
                 self._mirror = self._open()
         with needing_room(self._path):
-            self._add(self._mirror, numbers, trial)
+            self._add(self._mirror, numbers, row)
 
     def _open(self) -> optuna.Study:
         if self._path.exists() and not self._path.read_bytes().endswith(b"\n"):
@@ -153,7 +180,7 @@ class JournalMirror(Mirror):
         try:
             return self._create(_journal(self._path))
         except (ValueError, KeyError, TypeError, AssertionError) as error:
-            _log.warning("%s: is damaged and made anew (%s)", self._path, error)
+            _log.warning("%s: is damaged; it is written again (%s)", self._path, error)
             self._path.unlink(missing_ok=True)
             return self._create(_journal(self._path))
 
@@ -162,8 +189,8 @@ def _journal(path: Path) -> optuna.storages.JournalStorage:
     return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
 
 
-def _told(path: Path) -> set[int]:
-    """Numbers of the trials in a journal."""
+def _reported(path: Path) -> set[int]:
+    """Trial numbers in a journal."""
     try:
         return {int(number) for number in _LINE.findall(path.read_bytes())}
     except FileNotFoundError:
@@ -171,23 +198,30 @@ def _told(path: Path) -> set[int]:
 
 
 class DatabaseMirror(Mirror):
-    """A database that SQLAlchemy and Optuna know, such as PostgreSQL.
+    """A database that SQLAlchemy and Optuna support, such as PostgreSQL.
 
     Parameters
     ----------
-    study
-        The study; its folder's name is the name of the study in the database.
     url
-        Of the database.
+        Address of the database.
+    name, n_objectives, space
+        See `Mirror`.
     finished
         See `open_mirror`.
     """
 
-    def __init__(self, study: Study, url: str, finished: Mapping[int, ParameterSet]):
-        super().__init__(study)
+    def __init__(
+        self,
+        url: str,
+        name: str,
+        n_objectives: int,
+        space: ParameterSpace,
+        finished: Mapping[int, ParameterSet],
+    ):
+        super().__init__(name, n_objectives, space)
         if url.startswith("postgresql://"):
             url = url.replace("://", "+pg8000://", 1)
-        # Passwords are not for logs.
+        # Messages must not show the password.
         self._where = f"offline.storage: {_LOGIN.sub('://', url)}"
         self._complained = False
         try:
@@ -211,23 +245,23 @@ class DatabaseMirror(Mirror):
 
     def _check(self, finished: Mapping[int, ParameterSet]) -> None:
         """Refuse a database that holds another study of this name."""
-        told = self._known(self._mirror)
-        common = told.keys() & finished.keys()
-        if told and (not common or any(told[n] != finished[n] for n in common)):
+        known = self._known(self._mirror)
+        common = known.keys() & finished.keys()
+        if known and (not common or any(known[n] != finished[n] for n in common)):
             raise StorageError(
-                f"{self._where}: holds {len(told)} trials of another study named {self._name}; "
+                f"{self._where}: holds {len(known)} trials of another study named {self._name}; "
                 f"give this study a folder of another name (--folder), or remove that one with "
                 f"`optuna delete-study`"
             )
 
-    def tell(self, numbers: Collection[int], trial: Callable[[int], Told]) -> None:
-        """See `Mirror`; a database that has gone is told with later ones, if it returns."""
+    def report(self, numbers: Collection[int], row: Callable[[int], MirrorRow]) -> None:
+        """See `Mirror`; a database that is away receives the trials when it returns."""
         try:
-            self._add(self._mirror, numbers, trial)
+            self._add(self._mirror, numbers, row)
         except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
             if not self._complained:
                 _log.warning(
-                    "%s: is not told of trials now, the archive keeps them (%s)",
+                    "%s: does not receive trials now, the archive keeps them (%s)",
                     self._where,
                     _first_line(error),
                 )
@@ -237,7 +271,7 @@ class DatabaseMirror(Mirror):
 
 
 def distribution(parameter: Float | Integer | Categorical) -> Any:
-    """What Optuna calls a parameter."""
+    """A parameter as Optuna describes it."""
     if isinstance(parameter, Categorical):
         return optuna.distributions.CategoricalDistribution(parameter.choices)
     if isinstance(parameter, Integer):

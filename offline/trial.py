@@ -2,11 +2,13 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune import sequence
 from adaptune.archive import Frames, Trial
 from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
@@ -14,59 +16,116 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.odometry.base import OdometryInstance, prepared_bytes
-from adaptune.odometry.health import unhealthy
-from adaptune.sequence import Scan
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck, unhealthy
 from adaptune.space import ParameterSet
-from adaptune.study import Study
+from adaptune.study.sequences import StudySequences
+from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
 
 MIN_POINTS = 20
-"""No odometry makes anything of a scan with fewer."""
+"""No odometry can use a scan with fewer points."""
 EPISODE = 4.0
-"""Sub-trajectories from the beginning of an episode to that of the next."""
+"""Sub-trajectories from the beginning of an episode to the beginning of the next."""
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """What a trial depends on beside odometry, sequence and parameter set.
+
+    Attributes
+    ----------
+    sub_trajectory : float
+        Metres over which errors are measured.
+    lost_track : float
+        Metres a second by which a step of an odometry that loses track departs from the reference.
+    health : HealthCheck
+    descriptors : tuple of str
+    runs, repeats
+        See `OfflineConfig`.
+    metrics : frozenset of str
+        The metrics by which trials are judged.
+    """
+
+    sub_trajectory: float = 25.0
+    lost_track: float = 3.0
+    health: HealthCheck = field(default_factory=HealthCheck)
+    descriptors: tuple[str, ...] = ("ndt",)
+    runs: Literal["restart", "whole", "episodes"] = "restart"
+    repeats: int = 1
+    metrics: frozenset[str] = frozenset({"rte"})
+
+    @classmethod
+    def of(cls, config: OfflineStudyConfig) -> Self:
+        """The settings of a study."""
+        return cls(
+            config.sub_trajectory,
+            config.lost_track,
+            config.health,
+            config.descriptor.names,
+            config.offline.runs,
+            config.offline.repeats,
+            frozenset(config.offline.metrics),
+        )
+
+    @property
+    def isolated(self) -> bool:
+        """Whether every odometry needs a process of its own, to measure its memory."""
+        return "memory" in self.metrics
 
 
 class PreparedSequence:
-    """A sequence read, prepared and described once, for all trials of a worker.
+    """A sequence that is read, prepared and described once, for all trials of a worker.
 
     Parameters
     ----------
-    study
-        The study.
     name
+        Name of the sequence.
+    scans
         The sequence.
+    odometry
+        Makes the odometry, which prepares the scans.
+    settings
+        Settings of the trials.
     memory
-        Bytes that prepared scans may take. What does not fit is read again on every pass.
+        Bytes that prepared scans may take. Scans beyond are read again on every pass.
 
     Attributes
     ----------
     name : str
     frames : Frames
     nbytes : int
-        What the prepared scans take.
+        Bytes that the prepared scans take.
 
     Raises
     ------
     AdaptuneError
-        If the sequence cannot be read, or holds nothing to learn from.
+        If the sequence cannot be read, or no error can be measured on it.
     """
 
-    def __init__(self, study: Study, name: str, memory: float):
+    def __init__(
+        self,
+        name: str,
+        scans: sequence.Sequence,
+        odometry: OdometryFactory,
+        settings: TrialSettings,
+        memory: float,
+    ):
         self.name = name
-        self._sequence = study.sequence(name)
-        self._box = _odometry(study)
+        self._scans = scans
+        self._odometry = odometry(isolated=settings.isolated)
         self._kept: list[Any] = []
         self.nbytes = 0
-        describe = Describer(study.config.descriptor.names)
+        describe = Describer(settings.descriptors)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
-        for scan in self._sequence:
+        for scan in scans:
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
             descriptors.append(_described(describe, scan, name))
             elevations.append(lowest_elevation(scan))
             if full:
                 continue
-            prepared = self._box.prepare(scan)
+            prepared = self._odometry.prepare(scan)
             full = self.nbytes + prepared_bytes(prepared) > memory
             if not full:
                 self._kept.append(prepared)
@@ -75,53 +134,55 @@ class PreparedSequence:
             raise AdaptuneError(
                 f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points"
             )
-        reference = self._sequence.reference()
-        if reference is None:
-            raise AdaptuneError(
-                f"sequences.{name}: training needs a reference trajectory; name its topic or file "
-                f"(reference: ...)"
-            )
         at = np.array(stamps, np.int64)
-        T_ref_sensor = reference.at(at)
-        check_reference(study, name, T_ref_sensor)
+        T_ref_sensor = _reference(name, scans, at, settings)
         described = np.array(descriptors)
-        # When a scan is to be described online, the pose of the one before is known.
+        # When a scan is described online, the pose of the scan before is known.
         motion = speed_and_turn_rate(at, T_ref_sensor)
         fill_in(described[1:], describe.blocks, motion[:-1])
-        self.frames = Frames(
-            at,
-            T_ref_sensor,
-            described,
-            describe.blocks,
-            np.array(elevations, np.float32),
-        )
+        elevation = np.array(elevations, np.float32)
+        self.frames = Frames(at, T_ref_sensor, described, describe.blocks, elevation)
 
     def __iter__(self) -> Iterator[Any]:
         yield from self._kept
         if len(self._kept) < len(self.frames.stamps):
-            for i, scan in enumerate(self._sequence):
+            for i, scan in enumerate(self._scans):
                 if i >= len(self._kept):
-                    yield self._box.prepare(scan)
+                    yield self._odometry.prepare(scan)
 
 
-def _described(describe: Describer, scan: Scan, name: str) -> NDArray[np.float32]:
+def _described(describe: Describer, scan: sequence.Scan, name: str) -> NDArray[np.float32]:
     try:
         return describe(scan)
     except DescriptorError as error:
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
-def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
-    """Refuse a sequence in which no sub-trajectory can be measured.
+def _reference(
+    name: str, scans: sequence.Sequence, stamps: NDArray[np.int64], settings: TrialSettings
+) -> Poses:
+    reference = scans.reference()
+    if reference is None:
+        raise AdaptuneError(
+            f"sequences.{name}: training needs a reference trajectory; name its topic or file "
+            f"(reference: ...)"
+        )
+    T_ref_sensor = reference.at(stamps)
+    check_reference(name, T_ref_sensor, settings)
+    return T_ref_sensor
+
+
+def check_reference(name: str, T_ref_sensor: Poses, settings: TrialSettings) -> None:
+    """Refuse a sequence on which no error can be measured.
 
     Parameters
     ----------
-    study
-        The study.
     name
-        The sequence.
+        Name of the sequence.
     T_ref_sensor
-        Reference poses at the scans' stamps, NaN where there is none.
+        Reference poses at the scans' stamps, NaN where they are not known.
+    settings
+        Settings of the trials.
 
     Raises
     ------
@@ -132,33 +193,24 @@ def check_reference(study: Study, name: str, T_ref_sensor: Poses) -> None:
             f"sequences.{name}: the reference does not overlap the scans in time; check that both "
             f"are of the same recording and clock"
         )
-    if not (window_ends(T_ref_sensor, study.config.sub_trajectory) >= 0).any():
+    length = settings.sub_trajectory
+    if not (window_ends(T_ref_sensor, length) >= 0).any():
         known = T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])]
         path = np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1).sum()
         raise AdaptuneError(
-            f"sequences.{name}: its path of {path:.1f} m holds no sub-trajectory of "
-            f"{study.config.sub_trajectory:g} m; make sub_trajectory shorter or the sequence longer"
+            f"sequences.{name}: its path of {path:.1f} m holds no sub-trajectory of {length:g} m; "
+            f"make sub_trajectory shorter or the sequence longer"
         )
     shortest = min(KITTI_LENGTHS)
-    judged = "kitti" in study.config.offline.metrics
-    if judged and not (window_ends(T_ref_sensor, shortest) >= 0).any():
+    if "kitti" in settings.metrics and not (window_ends(T_ref_sensor, shortest) >= 0).any():
         raise AdaptuneError(
-            f"sequences.{name}: its path holds no sub-trajectory of {shortest:g} m, the least of "
-            f"KITTI's error; judge by another metric (offline.objective, offline.limits)"
+            f"sequences.{name}: its path holds no sub-trajectory of {shortest:g} m, the shortest "
+            f"of KITTI's error; judge by another metric (offline.objective, offline.limits)"
         )
-
-
-def _odometry(
-    study: Study, parameters: ParameterSet | None = None, sequence: str | None = None
-) -> OdometryInstance:
-    """An odometry, in a process of its own where its memory is to be told apart."""
-    if "memory" in study.config.offline.metrics:
-        return study.odometry(parameters, sequence, isolated=True)
-    return study.odometry(parameters, sequence)
 
 
 class _Run:
-    """An odometry on its way along a piece of a sequence, from frame `begin` to before `end`."""
+    """A run of an odometry on a piece of a sequence, from frame `begin` to before `end`."""
 
     def __init__(
         self,
@@ -191,7 +243,7 @@ class _Run:
         T, self.registered[i] = self.odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
         finite = np.isfinite(T).all()
-        # An odometry without a pose has, as far as one can tell, not moved.
+        # An odometry without a pose counts as not moved.
         T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
         if self._lost(i, T_step if finite else None):
             self.lost_steps[i] = T_step
@@ -199,7 +251,7 @@ class _Run:
             self.odometry.start(prepared, T, self._T_ref_steps[i - 1])
             self.restarted[i] = True
         elif not finite:
-            # There is no reference to go on at.
+            # There is no reference at which to restart.
             T = self.T_odom_sensor[i - 1]
             self.odometry.start(prepared, T)
         self.T_odom_sensor[i] = T
@@ -215,14 +267,14 @@ class _Run:
 
 
 def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
-    """Pieces of a sequence that overlap, so that every sub-trajectory lies within one of them.
+    """Overlapping pieces of a sequence: every sub-trajectory lies within one of them.
 
     Parameters
     ----------
     T_ref_sensor
         Reference poses of shape (n, 4, 4).
     length
-        Metres of a sub-trajectory. A piece begins every `EPISODE` times that.
+        Metres of a sub-trajectory. Pieces begin `EPISODE` times that apart.
 
     Returns
     -------
@@ -240,56 +292,73 @@ def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
     return list(zip(begins, ends, strict=True))
 
 
+class Scans(Protocol):
+    """Prepared scans with their frames."""
+
+    name: str
+    frames: Frames
+
+    def __iter__(self) -> Iterator[Any]:
+        """Read the prepared scans."""
+        ...
+
+
 def run_trials(
-    study: Study, sequence: PreparedSequence, sets: Sequence[ParameterSet], whole: bool = False
+    settings: TrialSettings,
+    odometry: OdometryFactory,
+    scans: Scans,
+    sets: Sequence[ParameterSet],
+    whole: bool = False,
 ) -> list[Trial]:
     """Run an odometry with several parameter sets on one pass over a sequence.
 
-    With ``offline.runs: restart``, where the odometry loses track, it is started anew at the
-    reference with that scan, and the sub-trajectories across that frame are labelled as failures:
-    what comes after is judged for itself. See `OfflineConfig` for the other ways.
+    With ``runs: restart``, an odometry that loses track restarts at the reference with that scan.
+    The sub-trajectories across that frame count as failures; later ones are judged on their own.
+    `OfflineConfig` describes the other kinds of runs.
 
     Parameters
     ----------
-    study
-        The study.
-    sequence
+    settings
+        Settings of the trials.
+    odometry
+        Makes instances of the odometry.
+    scans
         The sequence.
     sets
         The parameter sets.
     whole
-        From end to end, whatever the study says.
+        Run from end to end once, whatever the settings say.
     """
-    frames, config = sequence.frames, study.config
-    kind, repeats = ("whole", 1) if whole else (config.offline.runs, config.offline.repeats)
+    frames = scans.frames
+    kind, repeats = ("whole", 1) if whole else (settings.runs, settings.repeats)
     pieces = [(0, len(frames.stamps))]
     if kind == "episodes":
-        pieces = episodes(frames.T_ref_sensor, config.sub_trajectory)
-    lost_track = config.lost_track if kind == "restart" else None
-    # Of every set every repeat, and of that every piece.
+        pieces = episodes(frames.T_ref_sensor, settings.sub_trajectory)
+    lost_track = settings.lost_track if kind == "restart" else None
+
+    def make(parameters: ParameterSet) -> OdometryInstance:
+        return odometry(parameters, scans.name, isolated=settings.isolated)
+
+    # For every set every repeat, and for every repeat every piece.
     runs = [
-        [
-            [
-                _Run(_odometry(study, s, sequence.name), frames, lost_track, *piece)
-                for piece in pieces
-            ]
-            for _ in range(repeats)
-        ]
+        [[_Run(make(s), frames, lost_track, *piece) for piece in pieces] for _ in range(repeats)]
         for s in sets
     ]
     each = [run for of_set in runs for repeat in of_set for run in repeat]
-    for i, prepared in enumerate(sequence):
+    for i, prepared in enumerate(scans):
         for run in each:
             if run.begin <= i < run.end:
                 run.step(i, prepared)
     return [
-        _mean(s, [_trial(study, s, frames, repeat) for repeat in of_set])
+        _mean(s, [_trial(settings, s, frames, repeat) for repeat in of_set])
         for s, of_set in zip(sets, runs, strict=True)
     ]
 
 
-def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Sequence[_Run]) -> Trial:
-    """Make one trial of pieces: what is told of a frame is of the last that began before it."""
+def _trial(
+    settings: TrialSettings, parameters: ParameterSet, frames: Frames, pieces: Sequence[_Run]
+) -> Trial:
+    """Make one trial of pieces: each frame belongs to the last piece that begins before it."""
     n = len(frames.stamps)
     T_odom_sensor = np.empty((n, 4, 4))
     errors, seconds = np.empty(n), np.empty(n)
@@ -303,7 +372,7 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         errors[own] = sub_trajectory_rte(
             frames.T_ref_sensor[piece],
             run.T_odom_sensor[piece],
-            study.config.sub_trajectory,
+            settings.sub_trajectory,
             run.restarted[piece],
         )[: own.stop - own.start]
         restarted[own], registered[own] = run.restarted[own], run.registered[own]
@@ -316,11 +385,6 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
     T_steps = steps(T_odom_sensor)
     for i, T_step in lost_steps.items():
         T_steps[i - 1] = T_step
-    duration = (frames.stamps[-1] - frames.stamps[0]) * 1e-9
-    usage = {"cpu": 100.0 * cpu / duration}
-    memory = [run.odometry.usage.memory for run in pieces]
-    if known := [megabytes for megabytes in memory if megabytes is not None]:
-        usage["memory"] = max(known)
     return Trial(
         parameters,
         T_odom_sensor,
@@ -330,9 +394,18 @@ def _trial(study: Study, parameters: ParameterSet, frames: Frames, pieces: Seque
         seconds,
         tuple(fault for run in pieces for fault in run.odometry.faults),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
-        usage,
-        unhealthy=unhealthy(study.config.health, T_steps, frames.stamps, registered),
+        _usage(cpu, (frames.stamps[-1] - frames.stamps[0]) * 1e-9, pieces),
+        unhealthy=unhealthy(settings.health, T_steps, frames.stamps, registered),
     )
+
+
+def _usage(cpu: float, duration: float, pieces: Sequence[_Run]) -> dict[str, float]:
+    """Percent of a core, and megabytes where the odometry has a process of its own."""
+    usage = {"cpu": 100.0 * cpu / duration}
+    memory = [run.odometry.usage.memory for run in pieces]
+    if known := [megabytes for megabytes in memory if megabytes is not None]:
+        usage["memory"] = max(known)
+    return usage
 
 
 def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
@@ -352,3 +425,28 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
         repeats[0].unhealthy,
     )
+
+
+@dataclass(frozen=True)
+class TrialSetup:
+    """Everything that a process needs to run trials.
+
+    Attributes
+    ----------
+    settings : TrialSettings
+    odometry : OdometryFactory
+    sequences : StudySequences
+    """
+
+    settings: TrialSettings
+    odometry: OdometryFactory
+    sequences: StudySequences
+
+    def prepare(self, name: str, memory: float) -> PreparedSequence:
+        """Read and prepare a sequence, see `PreparedSequence`."""
+        scans = self.sequences.open(name)
+        return PreparedSequence(name, scans, self.odometry, self.settings, memory)
+
+    def run(self, scans: Scans, sets: Sequence[ParameterSet], whole: bool = False) -> list[Trial]:
+        """Run trials, see `run_trials`."""
+        return run_trials(self.settings, self.odometry, scans, sets, whole)

@@ -1,4 +1,4 @@
-"""Processes that run trials, each keeping the sequences it has prepared."""
+"""Processes that run trials, and keep the sequences that they have prepared."""
 
 import contextlib
 import multiprocessing as mp
@@ -8,21 +8,20 @@ import traceback
 from collections.abc import Collection, Hashable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from typing import NamedTuple, Protocol, Self, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.space import ParameterSet
-from adaptune.study import Study
-from offline.trial import PreparedSequence, run_trials
+from offline.trial import PreparedSequence, TrialSetup
 
 MOST_DEATHS = 3
-"""Of workers at the same task."""
+"""A task fails after so many workers have died at it."""
 
 
 class WorkerError(AdaptuneError):
-    """A worker that could not do its task."""
+    """A worker that cannot do its task."""
 
 
 class Task(NamedTuple):
@@ -32,13 +31,13 @@ class Task(NamedTuple):
     ----------
     sequence : str
     numbers : tuple of int
-        Of the trials.
+        Trial numbers.
     sets : tuple of dict
-        Their parameter sets.
+        The parameter sets of the trials.
     whole : bool
-        Run them without new starts at the reference.
+        Run them from end to end, without restarts at the reference.
     frames : bool
-        Tell what all trials on the sequence share, too.
+        Return the frames, which all trials on the sequence share, too.
     """
 
     sequence: str
@@ -51,14 +50,14 @@ class Task(NamedTuple):
         return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"
 
 
-class Result(NamedTuple):
-    """What came of a task.
+class TaskResult(NamedTuple):
+    """The result of a task.
 
     Attributes
     ----------
     trials : list of Trial
     frames : Frames, optional
-        If they were asked for.
+        If the task asks for them.
     """
 
     trials: list[Trial]
@@ -66,23 +65,23 @@ class Result(NamedTuple):
 
 
 class Death(NamedTuple):
-    """Of a worker at its task, with what is known of it."""
+    """The death of a worker at its task, and its cause."""
 
     cause: str
 
 
-Outcome = Result | AdaptuneError | Death
+Outcome = TaskResult | AdaptuneError | Death
 
 
 W = TypeVar("W", bound=Hashable)
-"""What tells the workers of a pool apart."""
+"""Identifies a worker of a pool."""
 
 
 class Pool(Protocol[W]):
-    """Workers that do one task at a time, wherever they are."""
+    """Workers that do one task at a time, here or elsewhere."""
 
     def workers(self) -> Collection[W]:
-        """Those that are there, or come when they are given a task."""
+        """The workers, also those that start with their first task."""
         ...
 
     def start(self, worker: W, task: Task) -> None:
@@ -90,15 +89,15 @@ class Pool(Protocol[W]):
         ...
 
     def wait(self) -> list[tuple[W, Outcome]]:
-        """Wait for some of the tasks, and tell what came of them; at times of none."""
+        """Wait for some of the tasks, and return their outcomes; the list may be empty."""
         ...
 
 
-def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result, int]]:
-    """Run tasks, and yield each as it comes, with its result and the number of trials running.
+def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, TaskResult, int]]:
+    """Run tasks, and yield each as it is done, with its result and the number of trials running.
 
-    Tasks go to workers that have their sequence prepared, where there are such. What a worker
-    died at is run again by another.
+    A task goes to a worker that has prepared its sequence, if there is one. If a worker dies,
+    another one runs its task again.
 
     Raises
     ------
@@ -107,47 +106,70 @@ def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, Result, in
     WorkerError
         If several workers died at the same task.
     """
-    waiting = list(tasks)
-    running: dict[W, Task] = {}
-    finished: list[tuple[Task, Result]] = []
-    failure: AdaptuneError | None = None
-    deaths: dict[int, int] = {}
-    near: dict[W, set[str]] = {}
-    # What the last task raises is still to be told when nothing runs.
-    while waiting or running or finished or failure is not None:
-        for worker in pool.workers() if waiting and failure is None else ():
-            if waiting and worker not in running:
-                task = _pick(waiting, near, worker)
-                waiting.remove(task)
-                near.setdefault(worker, set()).add(task.sequence)
-                running[worker] = task
-                pool.start(worker, task)
-        # The workers are at work again while what they gave is written.
-        n_running = sum(len(task.numbers) for task in running.values())
+    queue = _Queue(pool, tasks)
+    while queue.open:
+        queue.start()
+        finished, queue.finished = queue.finished, []
+        # The workers work while their results are written.
+        n_running = sum(len(task.numbers) for task in queue.running.values())
         for task, result in finished:
             yield task, result, n_running
-        finished = []
-        if failure is not None:
-            raise failure
-        for worker, outcome in pool.wait() if waiting or running else ():
-            task = running.pop(worker)
-            if isinstance(outcome, Result):
-                finished.append((task, outcome))
+        if queue.failure is not None:
+            raise queue.failure
+        queue.wait()
+
+
+class _Queue(Generic[W]):
+    """Tasks that wait, run, and are finished."""
+
+    def __init__(self, pool: Pool[W], tasks: Sequence[Task]):
+        self.waiting = list(tasks)
+        self.running: dict[W, Task] = {}
+        self.finished: list[tuple[Task, TaskResult]] = []
+        self.failure: AdaptuneError | None = None
+        self._pool = pool
+        self._deaths: dict[int, int] = {}
+        self._near: dict[W, set[str]] = {}
+
+    @property
+    def open(self) -> bool:
+        # A failure is raised even if nothing runs any more.
+        return bool(self.waiting or self.running or self.finished or self.failure)
+
+    def start(self) -> None:
+        """Give waiting tasks to idle workers."""
+        for worker in self._pool.workers() if self.waiting and self.failure is None else ():
+            if self.waiting and worker not in self.running:
+                task = _pick(self.waiting, self._near, worker)
+                self.waiting.remove(task)
+                self._near.setdefault(worker, set()).add(task.sequence)
+                self.running[worker] = task
+                self._pool.start(worker, task)
+
+    def wait(self) -> None:
+        """Wait for some of the tasks."""
+        for worker, outcome in self._pool.wait() if self.waiting or self.running else ():
+            task = self.running.pop(worker)
+            if isinstance(outcome, TaskResult):
+                self.finished.append((task, outcome))
             elif isinstance(outcome, AdaptuneError):
-                failure = outcome
+                self.failure = outcome
             else:
-                near.pop(worker, None)
-                waiting.insert(0, task)
-                deaths[id(task)] = deaths.get(id(task), 0) + 1
-                if deaths[id(task)] == MOST_DEATHS:
-                    failure = WorkerError(
-                        f"{MOST_DEATHS} workers died ({outcome.cause}) on {task}; if they were "
-                        f"out of memory, lower offline.memory or offline.workers"
-                    )
+                self._near.pop(worker, None)
+                self._again(task, outcome)
+
+    def _again(self, task: Task, death: Death) -> None:
+        self.waiting.insert(0, task)
+        self._deaths[id(task)] = self._deaths.get(id(task), 0) + 1
+        if self._deaths[id(task)] == MOST_DEATHS:
+            self.failure = WorkerError(
+                f"{MOST_DEATHS} workers died ({death.cause}) on {task}; if they were out of "
+                f"memory, lower offline.memory or offline.workers"
+            )
 
 
 def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
-    """A task on a sequence that is ready here, else on one that is ready nowhere."""
+    """Prefer a task whose sequence this worker has prepared, then one that nobody has."""
     here = near.get(worker, set())
     elsewhere = set().union(*near.values()) - here
     return min(waiting, key=lambda t: (t.sequence not in here, t.sequence in elsewhere))
@@ -158,37 +180,37 @@ class Sequences:
 
     Parameters
     ----------
-    study
-        The study.
+    setup
+        What trials need.
     memory
         Bytes that prepared scans may take.
     """
 
-    def __init__(self, study: Study, memory: float):
-        self._study = study
+    def __init__(self, setup: TrialSetup, memory: float):
+        self._setup = setup
         self._memory = memory
         self._ready: dict[str, PreparedSequence] = {}
 
-    def run(self, task: Task) -> Result:
+    def run(self, task: Task) -> TaskResult:
         """Do a task."""
         sequence = self._prepared(task.sequence)
-        trials = run_trials(self._study, sequence, task.sets, task.whole)
-        return Result(trials, sequence.frames if task.frames else None)
+        trials = self._setup.run(sequence, task.sets, task.whole)
+        return TaskResult(trials, sequence.frames if task.frames else None)
 
     def _prepared(self, name: str) -> PreparedSequence:
         sequence = self._ready.pop(name, None)
         if sequence is None:
-            # Make room for the newcomer by letting go of those not used for longest.
+            # Make room: drop the sequences that were not used for longest.
             while self._ready and sum(s.nbytes for s in self._ready.values()) > self._memory / 2:
                 del self._ready[next(iter(self._ready))]
             free = self._memory - sum(s.nbytes for s in self._ready.values())
-            sequence = PreparedSequence(self._study, name, free)
+            sequence = self._setup.prepare(name, free)
         self._ready[name] = sequence
         return sequence
 
 
-def attempt(sequences: Sequences, task: Task) -> Result | AdaptuneError:
-    """Do a task, and return what it raises."""
+def attempt(sequences: Sequences, task: Task) -> TaskResult | AdaptuneError:
+    """Do a task; return an exception instead of raising it."""
     try:
         return sequences.run(task)
     except AdaptuneError as error:
@@ -209,17 +231,20 @@ class Workers:
 
     Parameters
     ----------
-    study
-        The study; each process gets its share of its memory.
+    setup
+        What trials need.
     n
         Number of processes.
+    memory
+        Bytes that prepared scans may take, in all processes together.
     """
 
-    def __init__(self, study: Study, n: int):
-        self.study = study
+    def __init__(self, setup: TrialSetup, n: int, memory: float):
+        self.setup = setup
         self.n = n
-        # A process forked from one with threads may deadlock; one forked from a small server that
-        # has imported what workers need starts in milliseconds.
+        self.memory = memory
+        # A process forked from one with threads may deadlock. A small server that has imported
+        # what workers need forks them in milliseconds.
         self._context = mp.get_context("forkserver")
         self._context.set_forkserver_preload(["offline.trial"])
         self._workers: dict[int, _Worker] = {}
@@ -244,7 +269,7 @@ class Workers:
         if worker not in self._workers or not self._workers[worker].process.is_alive():
             self._workers[worker] = self._spawn(worker)
         self._busy.add(worker)
-        with contextlib.suppress(BrokenPipeError):  # reading from it will tell
+        with contextlib.suppress(BrokenPipeError):  # `wait` notices it
             self._workers[worker].connection.send(task)
 
     def wait(self) -> list[tuple[int, Outcome]]:
@@ -264,20 +289,18 @@ class Workers:
 
     def _spawn(self, w: int) -> _Worker:
         here, there = self._context.Pipe()
-        memory = self.study.config.offline.memory * 1e9 / self.n
-        process = self._context.Process(
-            target=_serve, args=(there, self.study, os.getpid() + w, memory), daemon=True
-        )
+        given = (there, self.setup, os.getpid() + w, self.memory / self.n)
+        process = self._context.Process(target=_serve, args=given, daemon=True)
         process.start()
         there.close()
         return _Worker(process, here)
 
 
-def _serve(connection: Connection, study: Study, core: int, memory: float) -> None:
-    # Ctrl-C reaches the whole group; the driver decides what it means.
+def _serve(connection: Connection, setup: TrialSetup, core: int, memory: float) -> None:
+    # Ctrl-C reaches all processes; the driver decides what happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pin(core)
-    sequences = Sequences(study, memory)
+    sequences = Sequences(setup, memory)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
             connection.send(attempt(sequences, connection.recv()))

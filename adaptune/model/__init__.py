@@ -1,32 +1,32 @@
-"""The error model: from what a scan looks like to the parameter set with the least error."""
+"""The error model: from the descriptor of a scan to the parameter set with the least error."""
 
-from collections.abc import Callable
-
-from adaptune.model.base import Rule, Selection, TrainingData
-from adaptune.model.file import ErrorModel, ModelError
-from adaptune.model.fusion import PairedFusion
+from adaptune.model.bank_weights import BankRule, BankSettings
+from adaptune.model.base import Rule, TrainingData
+from adaptune.model.error_model import ErrorModel
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
-from adaptune.model.paired import PairedExpectedRatio, Settings
+from adaptune.model.model_file import ModelError
+from adaptune.model.paired import PairedExpectedRatio, PairedSettings
 
-RULES: dict[str, Callable[[Settings, float], Rule]] = {
-    "paired": PairedExpectedRatio,
-    "paper": lambda *_: NearestNeighbours(),
-}
-"""By name, how to make a selection rule of the settings it may heed and of the price of a switch.
+RULES = ("paired", "paper")
+"""Names of the selection rules; the first is the default."""
 
-The first is the default.
-"""
+
+def make_rule(name: str, settings: PairedSettings, switch_cost: float = 0.0) -> Rule:
+    """Make a selection rule for a single odometry; `paper` has neither settings nor switch cost."""
+    return NearestNeighbours() if name == "paper" else PairedExpectedRatio(settings, switch_cost)
+
 
 __all__ = [
     "RULES",
+    "BankRule",
+    "BankSettings",
     "ErrorModel",
     "ModelError",
     "NearestNeighbours",
     "PairedExpectedRatio",
-    "PairedFusion",
+    "PairedSettings",
     "ProductKNeighborsRegressor",
     "Rule",
-    "Selection",
-    "Settings",
     "TrainingData",
+    "make_rule",
 ]

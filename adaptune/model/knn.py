@@ -9,7 +9,8 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
 from adaptune.metrics import FAILURE
-from adaptune.model.base import Rule, Selection, TrainingData
+from adaptune.model.base import Rule, TrainingData
+from adaptune.selection import Selection
 
 
 class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
@@ -159,7 +160,7 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
     def _predict(
         self, x: NDArray[np.float64], near_squared: NDArray[Any], near_sets: NDArray[np.intp]
     ) -> NDArray[np.float64]:
-        squared, members, group = _nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
+        squared, members, group = nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
         frames = self._members[members]
         # Of equally near frames the earlier one first, whatever group it is of.
         order = np.lexsort((frames, squared))
@@ -194,8 +195,9 @@ class NearestNeighbours(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        scale = float(data.sets.std(axis=0).mean()) or 1.0
-        self.regressor_ = ProductKNeighborsRegressor(data.sets / scale, self.k).fit(
+        unit = data.sets.unit
+        scale = float(unit.std(axis=0).mean()) or 1.0
+        self.regressor_ = ProductKNeighborsRegressor(unit / scale, self.k).fit(
             data.features, np.minimum(data.errors, np.float32(FAILURE))
         )
         return self
@@ -206,7 +208,8 @@ class NearestNeighbours(Rule):
         if self.data_.candidates is None:
             return predicted
         some = np.full_like(predicted, np.inf)
-        some[self.data_.candidates] = predicted[self.data_.candidates]
+        columns = self.data_.sets.columns(self.data_.candidates)
+        some[columns] = predicted[columns]
         return some
 
     def select(
@@ -215,13 +218,19 @@ class NearestNeighbours(Rule):
         current: int | None = None,  # noqa: ARG002
     ) -> Selection:
         """See `Rule.select`."""
+        sets = self.data_.sets
         predicted = self.predict(feature)
-        index = int(np.argmin(predicted))
-        return Selection(index, float(predicted[index]), float(predicted[self.data_.fixed]))
+        best = int(np.argmin(predicted))
+        return Selection(
+            sets.trials[best],
+            sets.parameters[best],
+            predicted_error=float(predicted[best]),
+            predicted_fixed=float(predicted[sets.column(self.data_.fixed)]),
+        )
 
 
 @numba.njit(cache=True)
-def _nearest_of_groups(
+def nearest_of_groups(
     X: NDArray[np.float64], bounds: NDArray[np.intp], x: NDArray[np.float64], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
     """The `k` rows of every group that are nearest to `x`: their squared distances, and groups.

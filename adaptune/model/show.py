@@ -1,4 +1,4 @@
-"""An error model explained to people."""
+"""Descriptions of error models, for people."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from rich.markup import escape
 from adaptune import report
 from adaptune.metrics import cap
 from adaptune.model.base import mean_errors
-from adaptune.model.file import ErrorModel
+from adaptune.model.error_model import ErrorModel
 from adaptune.space import Value, describe
 
 N_BEST = 5
@@ -18,7 +18,7 @@ N_BEST = 5
 
 
 def render(model: ErrorModel, path: Path) -> RenderableType:
-    """What a model is of, what it learnt from, and what is known of its worth.
+    """Describe a model: its odometry, its training, and what validation found.
 
     Parameters
     ----------
@@ -50,10 +50,10 @@ def _bank(model: ErrorModel) -> list[str]:
     if not model.bank:
         return []
     sets = ", ".join(map(str, model.bank))
-    kept = model.fusion.hedge
-    if kept == 1.0:
-        return [f"Bank: sets {sets}; it was not shown to pay, and is not driven."]
-    return [f"Bank: sets {sets}; the first has {100 * kept:.0f} % of the weight at least."]
+    if not model.bank_adapts:
+        return [f"Bank: trials {sets}; it was not shown to pay, and is not used."]
+    share = model.bank_settings.min_fixed_share
+    return [f"Bank: trials {sets}; the first has {100 * share:.0f} % of the weight at least."]
 
 
 def _pairs(title: str, data: Any) -> list[str]:
@@ -64,18 +64,18 @@ def _pairs(title: str, data: Any) -> list[str]:
 
 def _validation(model: ErrorModel) -> list[str]:
     if not model.validation:
-        return ["Not validated yet: `adaptune validate` tells whether adapting pays."]
+        return ["Not validated yet: `adaptune validate` shows whether adapting pays."]
     lines = []
     for rule, found in model.validation.items():
-        told = found
-        if isinstance(found, dict):
-            told = {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in found.items()}
-        lines += _pairs(f"Validation, {rule}", told) or [f"Validation, {rule}: {told}"]
+        pairs = found.items() if isinstance(found, dict) else ()
+        short = {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in pairs}
+        lines += _pairs(f"Validation, {rule}", short) or [f"Validation, {rule}: {found}"]
     return lines
 
 
 def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
     rows = []
+    fixed = model.sets.column(model.fixed)
     for s, name in enumerate(model.sequences):
         errors = model.errors[model.sequence == s]
         run = ~np.isnan(errors).all(axis=0) if len(errors) else np.zeros(len(model.sets), bool)
@@ -85,10 +85,10 @@ def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
             means = np.full(len(run), np.inf)
             means[run] = np.nanmean(cap(errors[:, run]), axis=0)
             best = int(np.argmin(means))
-            row |= {"best [%]": float(means[best]), "best set": best}
-        if run.any() and run[model.fixed]:
-            row["fixed [%]"] = float(means[model.fixed])
-            row["lost, fixed [%]"] = float(100.0 * np.isinf(errors[:, model.fixed]).mean())
+            row |= {"best [%]": float(means[best]), "best set": model.sets.trials[best]}
+        if run.any() and run[fixed]:
+            row["fixed [%]"] = float(means[fixed])
+            row["lost, fixed [%]"] = float(100.0 * np.isinf(errors[:, fixed]).mean())
         rows.append(row)
     return rows
 
@@ -102,17 +102,18 @@ def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
             "baseline": _short(parameter.baseline),
             "fixed": _short(fixed[name]),
         }
-        for name, parameter in model.space.parameters.items()
+        for name, parameter in model.sets.space.parameters.items()
     ]
 
 
 def _sets(model: ErrorModel) -> list[dict[str, Any]]:
     means = mean_errors(model.errors, model.sequence)
-    best = np.argsort(means, kind="stable")[:N_BEST].tolist()
+    best = [model.sets.trials[c] for c in np.argsort(means, kind="stable")[:N_BEST]]
     if model.fixed not in best:
         best.insert(0, model.fixed)
     return [
-        {"set": f"{n}, fixed" if n == model.fixed else str(n), "mean [%]": float(means[n])}
+        {"set": f"{n}, fixed" if n == model.fixed else str(n)}
+        | {"mean [%]": float(means[model.sets.column(n)])}
         | {name: _short(value) for name, value in model.sets[n].items()}
         for n in best
     ]

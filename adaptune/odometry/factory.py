@@ -38,6 +38,7 @@ class OdometryFactory:
     ----------
     name : str
     space : ParameterSpace
+    program_input : callable, optional
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class OdometryFactory:
         self.space = space
         self._given = settings
         self._limits = limits
-        self._program_input = program_input
+        self.program_input = program_input
         self._strict_sequences = strict_sequences
 
     def __getstate__(self) -> dict[str, Any]:
@@ -108,8 +109,8 @@ class OdometryFactory:
             # A failure with the baseline's parameters means that something is missing.
             strict = sequence in self._strict_sequences and given == self.space.baseline
             read = None
-            if sequence is not None and self._program_input is not None:
-                read = partial(self._program_input, sequence)
+            if sequence is not None and self.program_input is not None:
+                read = partial(self.program_input, sequence)
             return cls(given, self.settings, self._limits, read, strict)
         if issubclass(cls, Process):
             return cls(given, self.settings, self._limits)

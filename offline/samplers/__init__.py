@@ -1,29 +1,30 @@
-"""Where the next parameter sets come from."""
+"""Samplers: what proposes the next parameter sets."""
+
+from typing import TYPE_CHECKING
 
 from adaptune.space import ParameterSpace
-from adaptune.study import OfflineConfig
-from offline.samplers.annealing import AnnealingSampler
-from offline.samplers.asked import AskedSampler
-from offline.samplers.base import Sampler
-from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
 
-__all__ = ["AnnealingSampler", "Sampler", "make_sampler"]
-
-OURS: dict[str, type[Sampler]] = {
-    "grid": GridSampler,
-    "random": RandomSampler,
-    "sobol": SobolSampler,
-}
+if TYPE_CHECKING:
+    from offline.config import OfflineConfig
+    from offline.samplers.base import Sampler
 
 
-def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
+def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
     """Make the sampler that a configuration names.
 
     Parameters
     ----------
     space
-        The parameters.
+        The tuned parameters.
     config
         Sampler, seed, and sizes.
     """
-    return OURS.get(config.sampler, AskedSampler)(space, config)
+    from offline.samplers.asked import AskedSampler
+    from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
+
+    own: dict[str, type[Sampler]] = {
+        "grid": GridSampler,
+        "random": RandomSampler,
+        "sobol": SobolSampler,
+    }
+    return own.get(config.sampler, AskedSampler)(space, config)

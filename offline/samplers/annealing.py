@@ -1,10 +1,9 @@
-"""Simulated annealing, as a sampler that any Optuna study can use.
+"""Simulated annealing, as a sampler for any Optuna study.
 
 After F. C. Tavares, *Automated Parameter Tuning for Evaluation of SLAM Methods*, University of
 Coimbra, 2026 (RUSTLE), and Kirkpatrick, Gelatt and Vecchi, *Optimization by Simulated Annealing*,
-Science, 1983. It differs in that steps beyond a bound are reflected instead of cut off, in that
-errors are divided by `energy_scale`, and in that log scales, categories and several chains are
-known.
+Science, 1983. It differs from RUSTLE: steps beyond a bound are reflected instead of cut off, errors
+are divided by `energy_scale`, and there are log scales, categories and several chains.
 """
 
 import contextlib
@@ -25,8 +24,8 @@ from optuna.search_space import IntersectionSearchSpace
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from adaptune.sampling import AnnealingSettings, Step
 from adaptune.space import nearest
+from offline.samplers.settings import AnnealingSettings, Step
 
 SIGMA = 0.05
 """Standard deviation of a step, as a share of the range."""
@@ -41,22 +40,22 @@ _Trial = tuple[int, Mapping[str, Any], float]
 
 
 class Chain:
-    """One chain's walk so far.
+    """One chain of annealing.
 
     Parameters
     ----------
     settings
-        Temperatures, and when to return to the first.
+        Temperatures, and when to return to the first one.
 
     Attributes
     ----------
     params : dict or None
-        Where it stands; none before its first trial.
+        The set that it steps from; None before its first trial.
     energy, best : float
-        Error there, and the least it has seen.
+        Error of that set, and the least error so far.
     temperature : float
     unaccepted, no_best : int
-        Steps since one was accepted, and since the best one.
+        Steps since the last acceptance, and since the best trial.
     """
 
     def __init__(self, settings: AnnealingSettings):
@@ -65,22 +64,22 @@ class Chain:
         self.energy = self.best = math.inf
         self.temperature = settings.initial_temperature
         self.unaccepted = self.no_best = 0
-        # Since the chain was last heated; in the order of the three triggers.
+        # Steps since the chain was last heated, for each of the three triggers.
         self._fixed = self._unaccepted = self._no_best = 0
 
     def start(self, params: Mapping[str, Any], energy: float) -> None:
-        """Begin at a trial."""
+        """Begin with a trial."""
         self.params, self.energy, self.best = dict(params), energy, energy
 
     def step(self, params: Mapping[str, Any], energy: float, scale: float, u: float) -> None:
-        """Accept a trial or not, and cool down or heat up.
+        """Accept or reject a trial, and cool down or heat up.
 
         Parameters
         ----------
         params, energy
             The trial.
         scale
-            What differences of energy are divided by.
+            Differences of energy are divided by it.
         u
             Drawn uniformly from [0, 1).
         """
@@ -112,7 +111,7 @@ class Chain:
 
     @property
     def stalled(self) -> bool:
-        """Whether it has gone long enough without an acceptance or a new best."""
+        """Whether it has made enough steps without an acceptance or a new best."""
         return _reached(self.unaccepted, self.settings.stall_accepted) or _reached(
             self.no_best, self.settings.stall_best
         )
@@ -125,12 +124,11 @@ def _reached(count: int, limit: int | None) -> bool:
 class AnnealingSampler(BaseSampler):
     """Sampler using simulated annealing.
 
-    A trial is a step from where its chain stands; it is accepted if its error is no larger, or
-    else with probability exp(-dE / energy_scale / T). The first `n_startup_trials` are random
-    unless enqueued; the chains begin at the best of them. All is found again from the finished
-    trials, and every trial has random numbers of its own: a study that is loaded goes on exactly as
-    if it had never stopped. Trials that run at the same time step from where their chain stands
-    when they begin.
+    A trial is a step from its chain's set. The chain accepts it if its error is no larger, or else
+    with probability exp(-dE / energy_scale / T). The first `n_startup_trials` are random unless
+    enqueued; the chains begin with the best of them. The state follows from the finished trials,
+    and every trial has random numbers of its own: a loaded study continues exactly as if it had
+    never stopped. Trials that run at the same time step from their chain's set at their beginning.
 
     Parameters
     ----------
@@ -139,7 +137,7 @@ class AnnealingSampler(BaseSampler):
     n_startup_trials
         Trials before the chains begin.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
 
     Examples
     --------
@@ -161,7 +159,7 @@ class AnnealingSampler(BaseSampler):
         self.n_startup_trials = n_startup_trials
         self.seed = seed
         self._space = IntersectionSearchSpace()
-        # Name of a study, the finished trials that were walked through, and where they led.
+        # Name of the study, its finished trials, and the chains after them.
         self._walked: tuple[str, list[int], list[Chain]] | None = None
 
     def infer_relative_search_space(
@@ -169,14 +167,14 @@ class AnnealingSampler(BaseSampler):
         study: Study,
         trial: FrozenTrial,  # noqa: ARG002
     ) -> dict[str, BaseDistribution]:
-        """Parameters that all finished trials have."""
+        """Return the parameters that all finished trials have."""
         space: dict[str, BaseDistribution] = self._space.calculate(study)
         return space
 
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Step from where the trial's chain stands."""
+        """Step from the set of the trial's chain."""
         self._raise_error_if_multi_objective(study)
         if not search_space or trial.number < self.n_startup_trials:
             return {}
@@ -189,9 +187,9 @@ class AnnealingSampler(BaseSampler):
         if chain.params is None:
             return {}
         rng = self._rng(trial.number)
-        rng.random()  # is kept for the acceptance
+        rng.random()  # the acceptance uses it
         return {
-            name: _stepped(
+            name: step_from(
                 chain.params[name],
                 distribution,
                 self.settings.steps.get(name, Step()),
@@ -224,14 +222,14 @@ class AnnealingSampler(BaseSampler):
         stalls = (self.settings.stall_accepted, self.settings.stall_best)
         if stalls == (None, None) or state != TrialState.COMPLETE or values is None:
             return
-        # As far as the study knows, the trial is not finished yet.
+        # For the study, the trial is not finished yet.
         finished = [*self._finished(study), (trial.number, trial.params, values[0])]
         if all(chain.stalled for chain in self._walk(study, finished)):
-            with contextlib.suppress(RuntimeError):  # asked and told: there is no loop to leave
+            with contextlib.suppress(RuntimeError):  # with ask and tell, there is no loop to leave
                 study.stop()
 
     def chains(self, study: Study) -> list[Chain]:
-        """Where the chains stand after the study's finished trials.
+        """The chains after the study's finished trials.
 
         Parameters
         ----------
@@ -241,7 +239,7 @@ class AnnealingSampler(BaseSampler):
         return self._walk(study, self._finished(study))
 
     def stalled(self, study: Study) -> bool:
-        """Whether all chains have gone long enough without an acceptance or a new best."""
+        """Whether all chains have stalled."""
         return all(chain.stalled for chain in self.chains(study))
 
     @staticmethod
@@ -256,7 +254,7 @@ class AnnealingSampler(BaseSampler):
             walked is None
             or walked[0] != study.study_name
             or not _extends(numbers, walked[1])
-            or len(walked[1]) < self.n_startup_trials  # and the chains begin at the best of them
+            or len(walked[1]) < self.n_startup_trials  # the chains begin with the best of them
         ):
             walked = study.study_name, [n for n in numbers if n < self.n_startup_trials], []
             walked[2].extend(self._started(study, trials[: len(walked[1])]))
@@ -290,18 +288,32 @@ def _sign(study: Study) -> float:
 
 
 def _extends(numbers: list[int], before: list[int]) -> bool:
-    """Whether all trials that are new come after those that were there before."""
+    """Whether all new trials come after those before."""
     return numbers[: len(before)] == before
 
 
-def _stepped(
+def step_from(
     value: Any,
     distribution: BaseDistribution,
     step: Step,
     temperature: float,
     rng: np.random.Generator,
 ) -> Any:
-    """A neighbour of `value`."""
+    """Draw a neighbour of a value.
+
+    Parameters
+    ----------
+    value
+        A parameter's value.
+    distribution
+        Its range.
+    step
+        Length of the step.
+    temperature
+        Of the chain.
+    rng
+        Draws the step.
+    """
     if isinstance(distribution, CategoricalDistribution):
         others = [c for c in distribution.choices if type(c) is not type(value) or c != value]
         if not others or rng.random() >= (CHANGE if step.change is None else step.change):
@@ -317,7 +329,7 @@ def _stepped(
         delta_max = math.ceil(DELTA_MAX * n) if step.delta_max is None else step.delta_max
         longest = math.ceil(temperature * delta_max)
         i = round((value - low) / distribution.step) + int(rng.integers(-longest, longest + 1))
-        made = low + _reflected(i, n) * distribution.step
+        made = low + reflected(i, n) * distribution.step
         return int(made) if isinstance(distribution, IntDistribution) else min(made, high)
     if distribution.log:
         low, high, x = math.log(low), math.log(high), math.log(value)
@@ -325,7 +337,7 @@ def _stepped(
         x = value
     sigma = SIGMA * (high - low) if step.sigma is None else step.sigma
     x += rng.normal(step.mu or 0.0, sigma)
-    x = low + _reflected(x - low, high - low)
+    x = low + reflected(x - low, high - low)
     made = math.exp(x) if distribution.log else x
     if isinstance(distribution, IntDistribution):
         made = round(made)
@@ -336,7 +348,7 @@ def _stepped(
     return min(max(made, distribution.low), distribution.high)
 
 
-def _reflected(x: Any, length: Any) -> Any:
-    """Bring `x` into [0, length] as a billiard ball comes back from the cushions."""
+def reflected(x: Any, length: Any) -> Any:
+    """Reflect `x` at 0 and `length` until it lies between them."""
     x %= 2 * length
     return 2 * length - x if x > length else x

@@ -1,4 +1,4 @@
-"""Samplers of Optuna's kind, asked for sets and told what they are worth."""
+"""Optuna's samplers, through its ask-and-tell interface."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import optuna
 
-from adaptune.sampling import AnnealingSettings, SamplerError, optuna_sampler
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
-from adaptune.study import OfflineConfig
-from offline.objective import Result
+from offline.config import OfflineConfig
+from offline.objective import SamplerResult
 from offline.samplers.annealing import AnnealingSampler
 from offline.samplers.base import Sampler, Tried, key
 from offline.samplers.points import sobol_points
+from offline.samplers.settings import AnnealingSettings, SamplerError, optuna_sampler
 from offline.storage import distribution
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -23,22 +23,22 @@ CONSTRAINED = (
     optuna.samplers.NSGAIISampler,
     optuna.samplers.NSGAIIISampler,
 )
-"""These know of constraints."""
+"""Samplers that take constraints."""
 FORGETFUL = ("tpe", "gp")
-"""To these, a trial that they are told of is as good as one that they were asked for."""
+"""Samplers that keep no notes: they continue from any list of trials."""
 _ATTEMPTS = 32
 
 
 class AskedSampler(Sampler):
-    """Begins with points of a Sobol sequence, and then asks a sampler of Optuna's kind.
+    """Begins with points of a Sobol sequence, and then asks an Optuna sampler.
 
-    Many of them keep notes on the trials that they were asked for: a generation, a population, the
-    state of their random numbers. Therefore a search that is resumed asks anew for what was
-    proposed before, and answers from the history. Those that keep none are told the history
-    instead, and begin every batch with a seed of its own. Nothing is kept on disk.
+    Many Optuna samplers keep notes on the trials that they proposed: a generation, a population,
+    the state of their random numbers. A resumed search therefore asks again for the earlier
+    proposals, and answers from the history. Samplers without notes receive the history instead,
+    and begin every batch with a seed of its own. Nothing is kept on disk.
 
-    A set that was tried before is answered at once with the value that is known, and the sampler
-    is asked again; in the end a random one is taken.
+    If the sampler proposes a set that was tried before, it receives the known value at once and is
+    asked again. After many attempts, a random set is taken.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class AskedSampler(Sampler):
         self._begin(0, ())
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
-    def _begin(self, seed: int, history: Sequence[Result]) -> None:
+    def _begin(self, seed: int, history: Sequence[SamplerResult]) -> None:
         self._study = optuna.create_study(
             sampler=self._sampler(seed), directions=["minimize"] * len(self.config.objective)
         )
@@ -81,14 +81,14 @@ class AskedSampler(Sampler):
             "gp": {"n_startup_trials": 1, "warn_independent_sampling": False},
             "nsga2": {"population_size": max(config.batch, 2)},
             "qmc": {"scramble": True, "warn_independent_sampling": False},
-            # The initial points are the start-up: it needs no random ones of its own.
+            # The initial points are the start-up; TPE needs no random points of its own.
             "tpe": {"n_startup_trials": 1},
         }
         usual = all_usual.get(config.sampler, {})
         seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
         return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
 
-    def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]:
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         if self.config.sampler in FORGETFUL:
             self._begin(numbers.start // self.config.batch, history)
             return self._ask(numbers)
@@ -102,7 +102,7 @@ class AskedSampler(Sampler):
         return self._ask(numbers)
 
     def _ask(self, numbers: range) -> list[ParameterSet]:
-        """Sets of the next batch, the same ones until they are answered."""
+        """Sets of the next batch; the same sets until they are answered."""
         if not self._waiting and not self._stalled():
             tried = Tried(result.parameters for result in self._history)
             n_initial = self._n_initial(numbers)
@@ -149,7 +149,7 @@ class AskedSampler(Sampler):
                 return True
         raise AssertionError
 
-    def _answer(self, results: Sequence[Result]) -> None:
+    def _answer(self, results: Sequence[SamplerResult]) -> None:
         asked = [parameters for parameters, _ in self._waiting.values()]
         if asked != [result.parameters for result in results]:
             raise SamplerError(
@@ -165,12 +165,12 @@ class AskedSampler(Sampler):
         self._history += results
         self._waiting = {}
 
-    def _tell(self, trial: optuna.Trial, result: Result) -> None:
+    def _tell(self, trial: optuna.Trial, result: SamplerResult) -> None:
         for name, by in _named(result.constraints).items():
             trial.set_constraint(name, by)
         self._study.tell(trial, result.value)
 
-    # Optuna takes choices for equal that Python does (1 and True), and so it is given their index.
+    # For Optuna, as for Python, the choices 1 and True are equal: it receives their index.
 
     def _encode(self, parameters: ParameterSet) -> dict[str, Any]:
         return {

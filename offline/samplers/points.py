@@ -1,4 +1,4 @@
-"""Samplers that learn nothing on the way: the number of a trial is enough."""
+"""Samplers that do not learn: they need only the number of a trial."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
@@ -8,19 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from adaptune.sampling import Grid, GridSettings, RandomSettings, make_grid
 from adaptune.space import ParameterSet, ParameterSpace
-from adaptune.study import OfflineConfig
-from offline.objective import Result
+from offline.config import OfflineConfig
+from offline.objective import SamplerResult
 from offline.samplers.base import Sampler, Tried
+from offline.samplers.grid import Grid, make_grid
+from offline.samplers.settings import GridSettings, RandomSettings
 
 _SHUFFLED = 1 << 20
 
 
 class PointSampler(Sampler):
-    """Proposes a given set for every number of a trial, or another one if it was tried before."""
+    """Proposes one set for every trial number, or another one if that set was tried before."""
 
-    def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]:
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         tried = Tried(result.parameters for result in history)
         sets: list[ParameterSet] = []
         points = [self.space.baseline] if numbers.start == 0 else []
@@ -54,7 +55,7 @@ def sobol_points(space: ParameterSpace, seed: int, numbers: range) -> list[Param
     sobol = qmc.Sobol(len(space), rng=np.random.default_rng((seed, 0)))
     if numbers.start:
         sobol.fast_forward(numbers.start)
-    # Drawn one by one: scipy warns of numbers of points that are not a power of two.
+    # One by one: scipy warns if the number of points is not a power of two.
     return space.from_unit(np.concatenate([sobol.random(1) for _ in numbers]))
 
 
@@ -66,7 +67,7 @@ class RandomSampler(PointSampler):
         axes = RandomSettings.model_validate(config.sampler_settings).grid
         self._grid = None if axes is None else make_grid(space, axes)
 
-    def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]:
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         if self._grid is None:
             return super()._propose(numbers, history)
         order = _shuffled(self._grid.size, self.config.seed, numbers.stop)
@@ -86,7 +87,7 @@ class GridSampler(Sampler):
         axes = GridSettings.model_validate(config.sampler_settings).grid
         self._grid = make_grid(space, axes)
 
-    def _propose(self, numbers: range, history: Sequence[Result]) -> list[ParameterSet]:  # noqa: ARG002
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:  # noqa: ARG002
         order = iter(range(min(numbers.stop, self._grid.size)))
         return _walk(self._grid, order, self.space.baseline, numbers)
 
@@ -94,14 +95,14 @@ class GridSampler(Sampler):
 def _walk(
     grid: Grid, order: Iterator[int], baseline: ParameterSet, numbers: range
 ) -> list[ParameterSet]:
-    """Sets `numbers` of the baseline and, after it, the other points of a grid in their order."""
+    """Sets `numbers` of a list: the baseline, then the other points of a grid in their order."""
     known = grid.index(baseline)
     rest = islice((i for i in order if i != known), max(numbers.start - 1, 0), numbers.stop - 1)
     return [baseline] * (numbers.start == 0) + [grid[i] for i in rest]
 
 
 def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
-    """Numbers below `size` in random order, at least `n` or all; `n` does not change the order."""
+    """Numbers below `size` in random order, at least `n` of them; `n` does not change the order."""
     rng = np.random.default_rng((seed, 0))
     if size <= _SHUFFLED:
         yield from rng.permutation(size).tolist()

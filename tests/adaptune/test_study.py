@@ -2,7 +2,8 @@ import json
 
 import pytest
 
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
 
 
 def failure(file, *overrides):
@@ -22,13 +23,13 @@ def test_switching_that_the_odometry_has_not(study_file):
 def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for cores, own, mechanism in ((1, "live", "hand_over"), (2, "bank", "bank")):
-        monkeypatch.setattr("adaptune.study.available", lambda cores=cores: cores)
+        monkeypatch.setattr("adaptune.study.study.available", lambda cores=cores: cores)
         assert load_study(study_file).mechanism == own
         assert load_study(study_file, stiff).mechanism == mechanism
 
 
 def test_a_bank_has_a_budget(study_file, monkeypatch):
-    monkeypatch.setattr("adaptune.study.available", lambda: 4)
+    monkeypatch.setattr("adaptune.study.study.available", lambda: 4)
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for given, mechanism in (
         ("online.switching.memory=16", "bank"),
@@ -42,18 +43,18 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
 
 def test_the_price_of_switching_is_kept_with_the_study(study_file, tmp_path):
     study = load_study(study_file, folder=tmp_path)
-    assert study.price() == 0.0
-    found = {"of": study.switching_about(), "price": 0.07}
+    assert study.switch_cost() == 0.0
+    found = {"of": study.switching_identity(), "switch_cost": 0.07}
     (tmp_path / "switching.json").write_text(json.dumps(found))
-    assert study.price() == 0.07
+    assert study.switch_cost() == 0.07
     # Another mechanism has another price.
     other = load_study(study_file, ["online.switching.mechanism=hand_over"], tmp_path)
-    assert other.price() == 0.0
-    (tmp_path / "switching.json").write_text(json.dumps(found | {"price": -0.02}))
-    assert study.price() == 0.0
+    assert other.switch_cost() == 0.0
+    (tmp_path / "switching.json").write_text(json.dumps(found | {"switch_cost": -0.02}))
+    assert study.switch_cost() == 0.0
     (tmp_path / "switching.json").write_text("{")
     with pytest.raises(ConfigurationError, match=r"switching\.json: is damaged"):
-        study.price()
+        study.switch_cost()
 
 
 def test_an_odometry_that_needs_an_imu(study_file):
@@ -68,8 +69,8 @@ def test_reads_a_study(study_file, tmp_path):
     assert study.folder == tmp_path / "small"
     assert study.config.offline.trials == 7
     assert study.config.sequences["one"].bag == str(study_file.parent / "one.bag")
-    assert study.space.names == ("max_correspondence_distance", "keyframe_interval")
-    assert study.space.parameters["keyframe_interval"].low == 0.5
+    assert study.odometry.space.names == ("max_correspondence_distance", "keyframe_interval")
+    assert study.odometry.space.parameters["keyframe_interval"].low == 0.5
     assert study.odometry().settings.downsampling == 0.5
     assert study.odometry({"keyframe_interval": 2.0}).parameters == {
         "max_correspondence_distance": 2.0,
@@ -130,7 +131,7 @@ def test_reads_a_study(study_file, tmp_path):
         ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
         (
             "online.switching.catch_up_scans=1",
-            ["online.switching.catch_up_scans", "never catch up"],
+            ["catch_up_scans", "never catches up"],
         ),
         ("online.switching.sets=[0]", ["online.switching.sets"]),
         (
@@ -185,7 +186,7 @@ GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
         (
             ANNEALING + "steps: {keyframe_interval: {\n delta_max: 3}}}}",
             15,
-            "delta_max: steps of a log float are told by mu and sigma",
+            "delta_max: steps of a log float are set by mu and sigma",
         ),
         (ANNEALING + "\n alfa: 0.9}}", 15, "alfa: unknown key; did you mean 'alpha'?"),
         (ANNEALING + "\n alpha: 1.1}}", 15, "not 1.1"),
@@ -239,7 +240,7 @@ def test_a_large_grid_may_be_walked_with_a_budget(study_file):
 
 
 def test_tells_what_to_install(study_file, monkeypatch):
-    monkeypatch.setattr("adaptune.sampling.find_spec", lambda _: None)
+    monkeypatch.setattr("offline.samplers.settings.find_spec", lambda _: None)
     for name, package in (("gp", "torch"), ("cmaes", "cmaes")):
         text = failure(study_file, f"offline.sampler={name}")
         assert f"{name} needs the package {package}: pip install 'adaptune[{name}]'" in text

@@ -9,9 +9,9 @@ import pytest
 
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.report import csv_text
-from adaptune.study import Metric
 from adaptune.trajectory import read_tum
 from adaptune.trials import TrialsError, export, rows, select
+from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000
 

@@ -4,10 +4,11 @@ import re
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.study import OfflineConfig, load_study
 from offline.budget import Clock, max_trials, spent
-from offline.campaign import train
+from offline.train import train
+from offline.config import OfflineConfig
 from offline.objective import Verdict
+from offline.offline_study import load_study
 
 
 def verdicts(*values):

@@ -14,8 +14,9 @@ from adaptune.archive import Archive
 from adaptune.descriptor import averaged
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
-from offline.campaign import train
+from adaptune.study.mistakes import ConfigurationError
+from offline.train import train
+from offline.offline_study import load_study
 from offline.workers import WorkerError, Workers
 
 
@@ -27,7 +28,7 @@ def files(folder):
             contents[path.relative_to(folder)] = {
                 key: data[key].tobytes() for key in data if key not in ("seconds", "usage")
             }
-    contents[Path("model.npz")] = (folder / "model.npz").read_bytes()
+    contents[Path("model.safetensors")] = (folder / "model.safetensors").read_bytes()
     return contents
 
 
@@ -44,7 +45,7 @@ def test_every_trial_is_in_the_archive(trained):
         trial = archive.read(name, number)
         assert trial.parameters == training.model.sets[number]
         assert training.means[name][number] == pytest.approx(trial.mean_error, rel=1e-6)
-    assert training.model.sets[0] == study.space.baseline
+    assert training.model.sets[0] == study.odometry.space.baseline
 
 
 def test_the_table_of_trials(trained):
@@ -67,7 +68,7 @@ def test_the_fixed_set_has_the_least_mean_of_means(trained):
 
 def test_the_model_is_that_of_the_trials(trained):
     study, training = trained
-    model = ErrorModel.load(study.folder / "model.npz")
+    model = ErrorModel.load(study.folder / "model.safetensors")
     assert model.sets == training.model.sets
     assert model.sequences == ["one", "two"]
     assert model.errors.shape == (58, 10)

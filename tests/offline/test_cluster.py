@@ -11,10 +11,10 @@ import optuna
 import postgres
 import pytest
 
-from adaptune.study import load_study
 from offline import cluster
-from offline.campaign import train
+from offline.train import train
 from offline.cluster import Cluster, ClusterError
+from offline.offline_study import load_study
 
 distributed = pytest.importorskip("distributed")
 

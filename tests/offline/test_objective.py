@@ -14,8 +14,10 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import steps
 from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.study import ConfigurationError, OfflineConfig, Study, load_study
-from offline.campaign import train
+from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.study import Study
+from offline.train import train
+from offline.config import OfflineConfig
 from offline.objective import (
     SEVERITY,
     Result,
@@ -29,6 +31,7 @@ from offline.objective import (
     told,
     trajectory_metrics,
 )
+from offline.offline_study import load_study
 from offline.trial import PreparedSequence, run_trials
 
 
@@ -168,7 +171,7 @@ def test_a_lost_track_is_in_the_metrics_of_the_trajectory(study_file, tmp_path, 
     monkeypatch.setattr(Study, "odometry", lambda self, p=None, _=None: Sideways(p, self.settings))
     study = load_study(study_file, [], tmp_path / "study")
     sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [study.space.baseline])
+    (trial,) = run_trials(study, sequence, [study.odometry.space.baseline])
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     assert trial.metrics["rpe"] == pytest.approx(5.0 / np.sqrt(39), rel=0.02)
     assert trial.metrics["ape"] > 1.0

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from offline.validate import validate
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
-from offline.campaign import train
+from adaptune.study.mistakes import ConfigurationError
+from offline.train import train
+from offline.offline_study import load_study
 from offline.pruning import estimate, rungs, survivors
-from offline.validation import validate
 
 
 @given(st.sampled_from(["halving", "hyperband", "wilcoxon"]), st.integers(1, 50), st.integers(1, 9))
@@ -92,7 +93,7 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
     n_seen = np.sum(seen, axis=1)
     assert (n_seen[:3] == 4).all()
     assert n_seen.min() == 3
-    model = ErrorModel.load(study.folder / "model.npz")
+    model = ErrorModel.load(study.folder / "model.safetensors")
     for s, (row, means) in enumerate(zip(np.transpose(seen), training.means.values(), strict=True)):
         errors = model.errors[model.sequence == s]
         assert (np.isnan(errors).all(axis=0) == ~row).all()
@@ -101,7 +102,7 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
     assert n_seen[training.fixed] == 4
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
     assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
-    before = (study.folder / "model.npz").read_bytes()
+    before = (study.folder / "model.safetensors").read_bytes()
     validation = validate(study).validation
     assert len(validation.left_out) == 4
 
@@ -110,7 +111,7 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
         for name in study.training[:2]:
             archive.trial_path(name, number).unlink(missing_ok=True)
     train(dataclasses.replace(study))
-    assert (study.folder / "model.npz").read_bytes() == before
+    assert (study.folder / "model.safetensors").read_bytes() == before
     again = Archive(study.folder / "trials")
     assert [[n in again.finished(name) for name in study.training] for n in range(9)] == seen
 

@@ -7,8 +7,9 @@ import drives
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.study import ConfigurationError, load_study
-from offline.campaign import train
+from adaptune.study.mistakes import ConfigurationError
+from offline.train import train
+from offline.offline_study import load_study
 
 
 @pytest.fixture
@@ -63,7 +64,7 @@ def test_a_recording_of_empty_clouds_is_refused(tmp_path):
 def test_two_cannot_work_in_one_folder(study):
     study.open()
     other = (
-        "from pathlib import Path; from adaptune.study import load_study;"
+        "from pathlib import Path; from offline.offline_study import load_study;"
         f"load_study(Path({str(study.folder.parent / 'small.yaml')!r}), [],"
         f" Path({str(study.folder)!r})).open()"
     )

@@ -6,16 +6,18 @@ import itertools
 import drawn
 import numpy as np
 import pytest
+from offline.validation import labelled_sequences, leave_one_out
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.model import ErrorModel
-from adaptune.study import ConfigurationError, load_study
-from offline.campaign import run_batches, train
+from adaptune.study.mistakes import ConfigurationError
+from offline.campaign import run_batches
+from offline.train import train
 from offline.objective import choose_fixed
+from offline.offline_study import load_study
 from offline.search import make_stages, owner
-from offline.validation import labelled_sequences, leave_one_out
 
 NAMES = ["one", "two", "three"]
 
@@ -203,7 +205,7 @@ def test_from_end_to_end(study_file, tmp_path):
     for command in ("offline", "trials", "validate", "online", "compare"):
         done = CliRunner().invoke(app, [command, str(study_file), *given])
         assert done.exit_code == 0, done.output
-    model = ErrorModel.load(folder / "model.npz")
+    model = ErrorModel.load(folder / "model.safetensors")
     rows = list(csv.DictReader((folder / "trials.csv").open()))
     assert len(rows) == len(model.sets) == 1 + 2 * 4
     run_everywhere = [row for row in rows if row["mean"]]
@@ -213,9 +215,9 @@ def test_from_end_to_end(study_file, tmp_path):
         missing = np.isnan(model.errors[model.sequence == s])
         assert (missing.all(axis=0) == missing.any(axis=0)).all()
         assert missing.all(axis=0).tolist() == [row[name] == "" for row in rows]
-    before = (folder / "model.npz").read_bytes()
+    before = (folder / "model.safetensors").read_bytes()
     train(load_study(study_file, given[3::2], folder))
-    assert ErrorModel.load(folder / "model.npz").errors.tobytes() == model.errors.tobytes()
+    assert ErrorModel.load(folder / "model.safetensors").errors.tobytes() == model.errors.tobytes()
     assert len(before) > 1000
 
 

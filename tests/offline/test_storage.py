@@ -8,7 +8,8 @@ import postgres
 import pytest
 from optuna.storages.journal import JournalFileBackend
 
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
 from offline.storage import JOURNAL, StorageError, Told, open_mirror
 
 

@@ -10,7 +10,8 @@ from adaptune.geometry import invert
 from adaptune.metrics import sub_trajectory_rte, window_ends
 from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.study import Study, load_study
+from adaptune.study.study import Study
+from offline.offline_study import load_study
 from offline.trial import PreparedSequence, episodes, run_trials
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}

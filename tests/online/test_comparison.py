@@ -8,9 +8,10 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, Selection, Settings
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
-from offline.campaign import train
+from offline.train import train
+from offline.offline_study import load_study
 from online.comparison import (
     ComparisonError,
     _warn_of_scant_evidence,
@@ -31,7 +32,7 @@ def trained(study_file, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def replayed(trained):
-    run_replays(trained, trained.folder / "model.npz")
+    run_replays(trained, trained.folder / "model.safetensors")
     return trained
 
 
@@ -53,7 +54,7 @@ def test_rows_and_files(replayed):
 
 
 def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(replayed):
-    model = ErrorModel.load(replayed.folder / "model.npz")
+    model = ErrorModel.load(replayed.folder / "model.safetensors")
     folder = replayed.folder / "replays/three"
     about = {m: json.loads((folder / m / "replay.json").read_text())["about"] for m in MODES}
     assert about["baseline"]["parameters"] == replayed.space.baseline
@@ -68,7 +69,7 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
 
 
 def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
-    model = ErrorModel.load(trained.folder / "model.npz")
+    model = ErrorModel.load(trained.folder / "model.safetensors")
     lit = np.zeros((len(model.descriptors), 29), np.float32)
     model = replace(
         model,
@@ -82,10 +83,10 @@ def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
 
 @pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
 def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism):
-    model = ErrorModel.load(trained.folder / "model.npz")
+    model = ErrorModel.load(trained.folder / "model.safetensors")
     given = [f"online.switching.mechanism={mechanism}", "online.switching.warm_up=0.5"]
     study = load_study(study_file, [*given, "online.period=0.5"], trained.folder)
-    assert run_replays(study, trained.folder / "model.npz") == 4
+    assert run_replays(study, trained.folder / "model.safetensors") == 4
     row = next(row for row in compare(study) if row["mode"] == "paired")
     assert row["RTE [%]"] < 3.0
     folder = study.folder / "replays/three/paired"
@@ -102,12 +103,12 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
         assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
         # Two training sequences do not show that a bank pays.
         assert row["weights"] == ""
-    run_replays(trained, trained.folder / "model.npz")
+    run_replays(trained, trained.folder / "model.safetensors")
 
 
 def test_a_bank_that_pays_is_weighed(trained, study_file):
     """And what is replayed does not end in failure."""
-    model = ErrorModel.load(trained.folder / "model.npz")
+    model = ErrorModel.load(trained.folder / "model.safetensors")
     assert len(model.bank) == 4
     assert model.fusion.hedge == 1.0
     paying = replace(model, fusion=Settings(hedge=0.5))
@@ -133,11 +134,11 @@ def test_a_bank_that_pays_is_weighed(trained, study_file):
         bank_sets(more, replace(model, bank=model.bank[:3]))
     with pytest.raises(ComparisonError, match=r"switching\.sets: the model was fitted for another"):
         bank_sets(more, replace(model, bank=model.bank[::-1]))
-    run_replays(trained, trained.folder / "model.npz")
+    run_replays(trained, trained.folder / "model.safetensors")
 
 
 def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file):
-    model = ErrorModel.load(trained.folder / "model.npz")
+    model = ErrorModel.load(trained.folder / "model.safetensors")
     bank = "online.switching.mechanism=bank"
     named = load_study(study_file, [bank, "online.switching.sets=[3, 0]"], trained.folder)
     of_two = replace(model, bank=[3, 0])
@@ -158,7 +159,7 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
     assert bank_sets(by_number, some) == ([1, 0], [model.sets[3], model.sets[2]])
     twice = load_study(study_file, [bank, "online.switching.sets=[3, 3]"], trained.folder)
     with pytest.raises(ComparisonError, match=r"switching\.sets\.1: is in the bank already"):
-        run_replays(twice, trained.folder / "model.npz")
+        run_replays(twice, trained.folder / "model.safetensors")
     with pytest.raises(ComparisonError, match=r"switching\.sets: the model was fitted for another"):
         bank_sets(named, replace(model, bank=[0, 1, 2]))
     errors = model.errors.copy()
@@ -172,7 +173,7 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
 
 
 def test_replays_are_made_once(replayed, study_file):
-    model = replayed.folder / "model.npz"
+    model = replayed.folder / "model.safetensors"
     assert run_replays(replayed, model) == 0
     assert run_replays(replayed, model, again=True) == 4
     cut = load_study(study_file, ["online.period=2"], replayed.folder)
@@ -183,11 +184,11 @@ def test_replays_are_made_once(replayed, study_file):
 
 def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_file):
     study = load_study(study_file, ["sequences.three.reference="], trained.folder)
-    run_replays(study, trained.folder / "model.npz")
+    run_replays(study, trained.folder / "model.safetensors")
     rows = compare(study)
     assert [row["RTE [%]"] for row in rows] == [None] * 4
     assert not (study.folder / "replays/three/reference.tum").exists()
-    run_replays(trained, trained.folder / "model.npz")
+    run_replays(trained, trained.folder / "model.safetensors")
     assert compare(trained)[0]["RTE [%]"] is not None
 
 
@@ -206,7 +207,7 @@ def test_rows_over_several_sequences(replayed, study_file):
         ],
         replayed.folder,
     )
-    run_replays(study, replayed.folder / "model.npz")
+    run_replays(study, replayed.folder / "model.safetensors")
     rows = compare(study)
     assert [row["sequence"] for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all 2"] * 4
     a, b, all_ = rows[3], rows[7], rows[11]
@@ -225,7 +226,7 @@ def test_rows_over_several_sequences(replayed, study_file):
 def test_refuses_a_model_of_something_else(trained, study_file, override, words):
     study = load_study(study_file, [override], trained.folder)
     with pytest.raises(AdaptuneError, match=words):
-        run_replays(study, trained.folder / "model.npz")
+        run_replays(study, trained.folder / "model.safetensors")
 
 
 def test_names_a_missing_replay(study_file, tmp_path):
@@ -243,7 +244,7 @@ def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
 
 
 def read_tum_of(study, study_file):
-    return load_study(study_file, [], study.folder).sequence("three").reference()
+    return load_study(study_file, [], study.folder).sequences.open("three").reference()
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from adaptune.archive import Frames, Trial
-from offline.workers import Result
+from offline.workers import TaskResult
 
 N_FRAMES = 40
 
@@ -33,7 +33,7 @@ class Drawn:
             np.zeros(N_FRAMES, np.float32),
         )
         trials = [self._trial(task.sequence, parameters) for parameters in task.sets]
-        return [(0, Result(trials, frames if task.frames else None))]
+        return [(0, TaskResult(trials, frames if task.frames else None))]
 
     def _trial(self, sequence, parameters):
         nothing = np.zeros(N_FRAMES, bool)

@@ -26,7 +26,7 @@ def contents(folder: Path) -> dict[Path, object]:
             found[path.relative_to(folder)] = {
                 key: data[key].tobytes() for key in data if key not in ("seconds", "usage")
             }
-    for name in ("model.npz", "fixed.yaml"):
+    for name in ("model.safetensors", "fixed.yaml"):
         found[Path(name)] = (folder / name).read_bytes()
     return found
 

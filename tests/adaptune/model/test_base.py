@@ -1,10 +1,13 @@
 import numpy as np
+from tables import table
 
-from adaptune.model.base import complementary
+from adaptune.model.base import TrainingData, complementary
 
 
 def chosen(errors, sequence, size):
-    return complementary(np.array(errors, np.float32), np.array(sequence), 0, size)
+    errors, sequence = np.array(errors, np.float32), np.array(sequence)
+    sets = table(np.zeros((errors.shape[1], 1)))
+    return complementary(TrainingData(np.zeros((len(errors), 1)), sequence, errors, sets, 0), size)
 
 
 def test_the_next_set_is_good_where_those_before_are_not():

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.utils.estimator_checks import parametrize_with_checks
+from tables import table
 
 from adaptune.model import NearestNeighbours, TrainingData
 from adaptune.model.base import mean_errors
-from adaptune.model.knn import ProductKNeighborsRegressor, _nearest_of_groups
+from adaptune.model.knn import ProductKNeighborsRegressor, nearest_of_groups
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -25,7 +26,7 @@ def random_data(seed, n_frames, n_sets, n_features=4, n_parameters=2):
         rng.normal(size=(n_frames, n_features)),
         rng.integers(0, 3, n_frames),
         errors,
-        rng.random((n_sets, n_parameters)),
+        table(rng.random((n_sets, n_parameters))),
         int(rng.integers(n_sets)),
     )
 
@@ -33,15 +34,15 @@ def random_data(seed, n_frames, n_sets, n_features=4, n_parameters=2):
 def regressor(data, k):
     """The same on rows for all pairs of a frame and a set; returns its prediction."""
     n_frames, n_sets = data.errors.shape
-    scale = data.sets.std(axis=0).mean()
+    scale = data.sets.unit.std(axis=0).mean()
     rows = np.hstack(
-        [np.repeat(data.features, n_sets, axis=0), np.tile(data.sets / scale, (n_frames, 1))]
+        [np.repeat(data.features, n_sets, axis=0), np.tile(data.sets.unit / scale, (n_frames, 1))]
     )
     targets = np.minimum(data.errors.astype(float), 30.0).ravel()
     fitted = KNeighborsRegressor(k, algorithm="brute").fit(rows, targets)
 
     def predict(feature):
-        return fitted.predict(np.hstack([np.tile(feature, (n_sets, 1)), data.sets / scale]))
+        return fitted.predict(np.hstack([np.tile(feature, (n_sets, 1)), data.sets.unit / scale]))
 
     return predict
 
@@ -73,19 +74,21 @@ def test_the_least_prediction_is_chosen(seed):
     feature = np.random.default_rng(seed).normal(size=4)
     predicted = rule.predict(feature)
     selection = rule.select(feature)
-    assert selection[:3] == (predicted.argmin(), predicted.min(), predicted[data.fixed])
-    assert isinstance(selection.set_index, int)
+    assert selection.trial == predicted.argmin()
+    assert selection.predicted_error == predicted.min()
+    assert selection.predicted_fixed == predicted[data.fixed]
+    assert isinstance(selection.trial, int)
 
 
 def test_it_chooses_among_those_named_on_the_evidence_of_all():
     data = random_data(2, 25, 9)
-    named = [data.fixed, (data.fixed + 4) % 9]
+    named = (data.fixed, (data.fixed + 4) % 9)
     of_all = NearestNeighbours().fit(data).predict(np.zeros(4))
     rule = NearestNeighbours().fit(dataclasses.replace(data, candidates=named))
     predicted = rule.predict(np.zeros(4))
-    np.testing.assert_array_equal(predicted[named], of_all[named])
-    assert np.isinf(np.delete(predicted, named)).all()
-    assert rule.select(np.zeros(4)).set_index == min(named, key=lambda j: of_all[j])
+    np.testing.assert_array_equal(predicted[[*named]], of_all[[*named]])
+    assert np.isinf(np.delete(predicted, [*named])).all()
+    assert rule.select(np.zeros(4)).trial == min(named, key=lambda j: of_all[j])
 
 
 def test_a_lost_track_counts_as_30():
@@ -93,7 +96,7 @@ def test_a_lost_track_counts_as_30():
         np.zeros((2, 1)),
         np.zeros(2, int),
         np.array([[np.inf, 50.0], [1.0, 2.0]], np.float32),
-        np.array([[0.0], [1.0]]),
+        table([[0.0], [1.0]]),
         0,
     )
     # Two pairs of the set itself, at the same place.
@@ -113,10 +116,11 @@ def test_a_single_set_and_frame():
         np.zeros((1, 3)),
         np.zeros(1, int),
         np.full((1, 1), 2.5, np.float32),
-        np.full((1, 2), 0.4),
+        table(np.full((1, 2), 0.4)),
         0,
     )
-    assert NearestNeighbours().fit(data).select(np.ones(3))[:3] == (0, 2.5, 2.5)
+    selection = NearestNeighbours().fit(data).select(np.ones(3))
+    assert (selection.trial, selection.predicted_error) == (0, 2.5)
 
 
 @modest
@@ -127,7 +131,7 @@ def test_nearest_frames(seed, n_frames, k):
     features = rng.integers(0, 3, (n_frames, 2)).astype(float)
     feature = rng.integers(0, 3, 2).astype(float)
     want = sorted((float(((f - feature) ** 2).sum()), i) for i, f in enumerate(features))[:k]
-    squared, frames, _ = _nearest_of_groups(features, np.array([0, len(features)]), feature, k)
+    squared, frames, _ = nearest_of_groups(features, np.array([0, len(features)]), feature, k)
     assert list(zip(squared.tolist(), frames.tolist(), strict=True)) == want
 
 

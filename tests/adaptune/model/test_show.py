@@ -6,7 +6,8 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.cli import app
-from adaptune.model import ErrorModel, Settings
+from adaptune.model import BankSettings, ErrorModel
+from adaptune.parameter_sets import ParameterSets
 from adaptune.space import Categorical, Float, ParameterSpace
 
 
@@ -21,11 +22,14 @@ def model():
     errors = np.array([[4, 1, 3], [4, 1, np.inf], [2, 5, 8], [2, np.nan, 6]], np.float32)
     return ErrorModel(
         odometry={"name": "gicp", "settings": {"downsampling": 0.5}},
-        space=space,
-        sets=[
-            {"distance": d, "kernel": k}
-            for d, k in ((4.0, "none"), (2.0, "[huber]"), (9.0, "none"))
-        ],
+        sets=ParameterSets(
+            space,
+            (0, 1, 2),
+            tuple(
+                {"distance": d, "kernel": k}
+                for d, k in ((4.0, "none"), (2.0, "[huber]"), (9.0, "none"))
+            ),
+        ),
         fixed=0,
         length=25.0,
         sequences=["cave", "street"],
@@ -39,8 +43,8 @@ def model():
 
 
 def shown(model, folder):
-    model.save(folder / "model.npz")
-    result = CliRunner().invoke(app, ["model", "show", str(folder / "model.npz")])
+    model.save(folder / "model.safetensors")
+    result = CliRunner().invoke(app, ["model", "show", str(folder / "model.safetensors")])
     assert result.exit_code == 0, result.output
     return re.sub(r"\s+", " ", result.output)
 
@@ -61,13 +65,13 @@ def test_a_model_is_explained(model, tmp_path):
         assert said in text, (said, text)
 
 
-def test_what_validation_found_is_told(model, tmp_path):
+def test_what_validation_found_is_shown(model, tmp_path):
     found = {"paired": {"geometric": 0.61, "verdict": "Adapt by `paired`."}}
     text = shown(dataclasses.replace(model, validation=found), tmp_path)
     assert "Validation, paired: geometric 0.61, verdict Adapt by `paired`." in text
 
 
-def test_sets_that_a_sequence_lacks_are_told(model, tmp_path):
+def test_sets_that_a_sequence_lacks_are_shown(model, tmp_path):
     model.errors[2:, 0] = np.nan
     text = shown(model, tmp_path)
     assert "street 2 2 - 5.000 1 -" in text
@@ -75,22 +79,20 @@ def test_sets_that_a_sequence_lacks_are_told(model, tmp_path):
 
 
 def test_a_file_that_is_no_model_is_refused_in_a_sentence(tmp_path):
-    (tmp_path / "model.npz").write_bytes(b"no")
-    result = CliRunner().invoke(app, ["model", "show", str(tmp_path / "model.npz")])
+    (tmp_path / "model.safetensors").write_bytes(b"no")
+    result = CliRunner().invoke(app, ["model", "show", str(tmp_path / "model.safetensors")])
     assert result.exit_code == 2
     assert "Traceback" not in result.output
 
 
-def test_a_bank_is_told(model, tmp_path):
+def test_a_bank_is_shown(model, tmp_path):
     assert "Bank" not in shown(model, tmp_path)
     vectors = np.zeros((4, 2, 3), np.float32)
-    for hedge, told in (
-        (1.0, "it was not shown to pay, and is not driven."),
-        (0.25, "has 25 % of the weight at least"),
+    for settings, said in (
+        (BankSettings(adapt=False), "it was not shown to pay, and is not used."),
+        (BankSettings(min_fixed_share=0.25), "has 25 % of the weight at least"),
     ):
-        of_two = dataclasses.replace(
-            model, bank=[0, 2], vectors=vectors, fusion=Settings(hedge=hedge)
-        )
+        of_two = dataclasses.replace(model, bank=[0, 2], vectors=vectors, bank_settings=settings)
         text = shown(of_two, tmp_path)
-        assert "Bank: sets 0, 2;" in text
-        assert told in text
+        assert "Bank: trials 0, 2;" in text
+        assert said in text

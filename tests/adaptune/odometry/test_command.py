@@ -13,8 +13,9 @@ from needs import lacking
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
-from adaptune.study import ConfigurationError, load_study
-from offline.campaign import train
+from adaptune.study.mistakes import ConfigurationError
+from offline.train import train
+from offline.offline_study import load_study
 from offline.trial import PreparedSequence, run_trials
 from online.comparison import compare, run_replays
 
@@ -202,7 +203,7 @@ def test_faults_are_told_with_the_last_lines(make, fault):
 def test_with_the_baseline_s_parameters_something_else_than_these_is_wrong(make):
     study = make("exit")
     with pytest.raises(OdometryError, match=r"with .*voxel.: 0\.5.*code 1: .*no planes here"):
-        run(study, study.space.baseline)
+        run(study, study.odometry.space.baseline)
 
 
 def test_half_a_trajectory_counts_as_far_as_it_goes(make):
@@ -273,7 +274,7 @@ def test_the_whole_way(make):
     study = make("pretend", "offline.trials=2")
     training = train(study)
     assert training.model.space.names == ("registration.voxel", "distance")
-    assert run_replays(study, study.folder / "model.npz") == 2
+    assert run_replays(study, study.folder / "model.safetensors") == 2
     assert {row["mode"] for row in compare(study)} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")

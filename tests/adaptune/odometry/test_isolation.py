@@ -19,7 +19,7 @@ from adaptune.odometry.isolation import Isolated, Limits, fork_server
 from adaptune.selection import Selection
 from adaptune.sequence import Imu, Scan
 from adaptune.sequence.imu import ImuNoise
-from adaptune.study import load_study
+from offline.offline_study import load_study
 from offline.trial import PreparedSequence, run_trials
 from offline.workers import Task, Workers, run
 from online.replay import replay

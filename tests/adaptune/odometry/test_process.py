@@ -16,7 +16,8 @@ from adaptune.odometry.process import Process, Settings
 from adaptune.odometry.serving import listen
 from adaptune.selection import Selection
 from adaptune.sequence import Scan
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
 
 LIMITS = Limits(seconds=20.0)
 
@@ -179,8 +180,8 @@ def test_a_study_takes_its_space(study_file, tmp_path):
         "odometry.parameters={speed: {high: 2.0}}",
     ]
     study = load_study(study_file, overrides, tmp_path / "study")
-    assert study.space.parameters["speed"].high == 2.0
-    assert study.described.live
+    assert study.odometry.space.parameters["speed"].high == 2.0
+    assert study.odometry.description.live
     odometry = study.odometry({"speed": 1.5})
     odometry.start(scan(0), np.eye(4))
     assert odometry.register(scan(1)).T_odom_sensor[0, 3] == 1.5

@@ -9,8 +9,9 @@ from pydantic import ValidationError
 from adaptune import yaml
 from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
 from adaptune.sequence.config import check_sequence, to_pose
-from adaptune.study import ConfigurationError, load_study
+from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
+from offline.offline_study import load_study
 
 
 def test_paths_are_of_the_studys_folder_and_know_variables(

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from scipy import stats
 
-from adaptune.sampling import AnnealingSettings, Step
-from offline.samplers import AnnealingSampler
-from offline.samplers.annealing import Chain, _reflected, _stepped
+from offline.samplers.annealing import AnnealingSampler, Chain, reflected, step_from
+from offline.samplers.settings import AnnealingSettings, Step
 
 SPACE = {
     "x": FloatDistribution(-5.0, 5.0),
@@ -200,7 +199,7 @@ def test_visits_as_boltzmann_says():
     places = IntDistribution(0, 4)
     visits = np.zeros(5)
     for _ in range(20_000):
-        n = _stepped(chain.params["n"], places, Step(delta_max=1), 0.7, rng)
+        n = step_from(chain.params["n"], places, Step(delta_max=1), 0.7, rng)
         chain.step({"n": n}, energies[n], 1.0, rng.random())
         visits[chain.params["n"]] += 1
     # A step beyond a bound is reflected, so that from an end its neighbour is twice as likely:
@@ -227,7 +226,7 @@ def test_energies_are_divided_by_that_of_the_first_trial():
 
 def steps_from(value, distribution, step, temperature=1.0, n=4000):
     rng = np.random.default_rng(0)
-    return [_stepped(value, distribution, step, temperature, rng) for _ in range(n)]
+    return [step_from(value, distribution, step, temperature, rng) for _ in range(n)]
 
 
 @pytest.mark.parametrize(("mu", "sigma"), [(0.0, 0.5), (0.3, 0.2), (-0.5, 0.4)])
@@ -275,7 +274,7 @@ def test_steps_stay_in_range(name, seed, mu, sigma, temperature):
         optuna.create_study(), None, name, distribution
     )
     step = Step() if seed % 2 else Step(mu=mu, sigma=sigma, delta_max=int(sigma), change=0.5)
-    made = _stepped(value, distribution, step, temperature, rng)
+    made = step_from(value, distribution, step, temperature, rng)
     assert type(made) is type(value)
     assert distribution._contains(distribution.to_internal_repr(made))
 
@@ -284,14 +283,14 @@ def test_steps_stay_in_range(name, seed, mu, sigma, temperature):
     ("x", "inside"), [(3.0, 3.0), (11.0, 9.0), (-2.0, 2.0), (25.0, 5.0), (-13.0, 7.0), (20, 0)]
 )
 def test_reflects_at_both_bounds(x, inside):
-    assert _reflected(x, 10) == inside
+    assert reflected(x, 10) == inside
 
 
 def test_mean_of_many_steps_is_that_of_the_middle():
     """Reflection keeps a walk without errors uniform: no bound attracts it."""
     x, xs, rng = 0.3, [], np.random.default_rng(5)
     for _ in range(20_000):
-        x = _stepped(x, FloatDistribution(0.0, 1.0), Step(sigma=0.4), 1.0, rng)
+        x = step_from(x, FloatDistribution(0.0, 1.0), Step(sigma=0.4), 1.0, rng)
         xs.append(x)
     counts, _ = np.histogram(xs, bins=5, range=(0, 1))
     np.testing.assert_allclose(counts / len(xs), 0.2, atol=0.02)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from adaptune.study import OfflineConfig
+from offline.config import OfflineConfig
 from offline.samplers import make_sampler
 
 SPACE = ParameterSpace(

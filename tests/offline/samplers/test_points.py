@@ -4,10 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.sampling import Grid, Span, make_grid
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from adaptune.study import OfflineConfig
+from offline.config import OfflineConfig
 from offline.samplers import make_sampler
+from offline.samplers.grid import Grid, make_grid
+from offline.samplers.settings import Span
 
 SPACE = ParameterSpace(
     {

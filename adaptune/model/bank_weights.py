@@ -1,0 +1,328 @@
+"""Weights of the members of a bank, whose motions are averaged."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from scipy.optimize import nnls
+
+from adaptune.metrics import FAILURE
+from adaptune.model.base import Rule, TrainingData, mean_errors
+from adaptune.model.evidence import NOVEL, Evidence, NearestFrames
+from adaptune.model.paired import ERROR_FLOOR
+from adaptune.parameter_sets import ParameterSets
+from adaptune.selection import Selection
+
+RIDGE = 0.05
+"""Added to mean squares, as a share of the fixed set's, so that like members share the weight."""
+SMOOTHING = 5
+"""Selections whose weights are averaged: errors cancel each other while weights stay the same."""
+POOL = 64
+"""A bank's members are searched for among this many of the best sets."""
+
+
+class BankSettings(BaseModel):
+    """Settings of a bank's weights.
+
+    Attributes
+    ----------
+    adapt : bool
+        If not, the bank was not shown to pay, and is not used.
+    sharpness : float
+        How fast a sequence's weight falls with the distance of its nearest frames.
+    n_frames : int
+        Nearest frames of each sequence.
+    min_fixed_share : float
+        Minimum share of the weight that the fixed set keeps.
+    clip : float
+        Errors are clipped at this many times the fixed set's root mean square in the sequence: a
+        member that has lost track is left out of the mean, and does not cost what it would alone.
+    """
+
+    # A file of a later version may hold more.
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    adapt: bool = True
+    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
+    n_frames: PositiveInt = 300
+    min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
+
+
+class NearProducts(NamedTuple):
+    """Products of errors on the training frames nearest to some scans.
+
+    Attributes
+    ----------
+    evidence : Evidence
+    products : ndarray of shape (n_scans, n_sequences, n_members, n_members)
+        Mean products of the members' errors, percent squared.
+    fixed : ndarray of shape (n_scans, n_sequences)
+        Mean squared error of the fixed set.
+    """
+
+    evidence: Evidence
+    products: NDArray[np.float64]
+    fixed: NDArray[np.float64]
+
+
+class BankRule(Rule):
+    """Weigh the members of a bank so that the mean of their motions has the least expected error.
+
+    While errors are small, the error of a weighted mean of motions is the weighted mean of the
+    errors. With weights w its mean square is w'Sw, where S_jk is the mean product of the errors of
+    members j and k, which are vectors: two members that err in different directions are worth more
+    together than the better one alone (as with forecasts: Bates and Granger, Operational Research
+    Quarterly 1969).
+
+    For each training sequence S is taken over the frames nearest to the scan and divided by the
+    fixed set's mean square there. Sequences weigh as in `PairedExpectedRatio`, and no weight is
+    negative.
+
+    The weights of a single scan are noise in part, and members' errors of some seconds cancel only
+    while the weights stay the same. So a bank applies the mean over a few selections, see
+    `smooth_weights`.
+
+    Parameters
+    ----------
+    settings
+        `offline.tuning` chooses them on the training sequences.
+    """
+
+    gated = True
+
+    def __init__(self, settings: BankSettings | None = None):
+        self.settings = settings or BankSettings()
+
+    def fit(self, data: TrainingData) -> Self:
+        """See `Rule.fit`.
+
+        Raises
+        ------
+        ValueError
+            If the data name no members, the fixed set first, or hold no error vectors of them.
+        """
+        members = data.candidates
+        if members is None or data.vectors is None or members[0] != data.fixed:
+            raise ValueError("a bank needs members, the fixed set first, and their error vectors")
+        self.data_ = data
+        self.members_ = members
+        self.products_ = np.empty((len(data.features), len(members), len(members)), np.float32)
+        for s in np.unique(data.sequence):
+            frames = data.sequence == s
+            vectors, lost = clip_errors(data.vectors[frames], 0, self.settings.clip)
+            self.products_[frames] = np.einsum("ijx,ikx->ijk", vectors, vectors)
+            self.products_[frames] += lost[:, :, None] ** 2 * np.eye(len(members))
+        self.nearest_ = NearestFrames(self.settings.n_frames).fit(data.features, data.sequence)
+        return self
+
+    def near(self, features: NDArray[np.float64]) -> NearProducts:
+        """Find the products of errors on the training frames nearest to scans.
+
+        Parameters
+        ----------
+        features
+            Of shape (n_scans, n_features).
+        """
+        evidence = self.nearest_.about(features)
+        fixed = evidence.means(self.products_[:, 0, 0].astype(np.float64))
+        return NearProducts(evidence, evidence.means(self.products_), fixed)
+
+    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Rule.predict`; the error of each member alone."""
+        near = self.near(feature[None])
+        weights = near.evidence.weights(self.settings.sharpness)
+        predicted = np.full(len(self.data_.sets), np.inf)
+        squares = np.einsum("qs,qsjj->qj", weights, near.products)
+        predicted[self.data_.sets.columns(self.members_)] = np.sqrt(squares[0])
+        return predicted
+
+    def select(
+        self,
+        feature: NDArray[np.float64],
+        current: int | None = None,  # noqa: ARG002 - nothing is switched
+    ) -> Selection:
+        """See `Rule.select`."""
+        near = self.near(feature[None])
+        (weights,), (ratio,) = bank_weights(near, self.settings)
+        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
+        fixed = float(np.sqrt(of_sequences @ near.fixed[0]))
+        return weighted_selection(
+            self.data_.sets,
+            dict(zip(self.members_, weights.tolist(), strict=True)),
+            predicted_error=float(ratio) * fixed,
+            predicted_fixed=fixed,
+            familiarity=float(near.evidence.familiarity[0]),
+            n_sequences=float(1.0 / (of_sequences @ of_sequences)),
+        )
+
+
+def weighted_selection(
+    sets: ParameterSets, weights: Mapping[int, float], **predicted: float
+) -> Selection:
+    """A selection of a bank's weights; its set is that of the heaviest member."""
+    heaviest = max(weights, key=weights.__getitem__)
+    return Selection(heaviest, sets[heaviest], weights, **predicted)
+
+
+def bank_weights(
+    near: NearProducts, settings: BankSettings
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights of the members, and the root mean square that is expected of their mean.
+
+    Returns
+    -------
+    weights : ndarray of shape (n_scans, n_members)
+    ratio : ndarray of shape (n_scans,)
+        To the fixed set's.
+    """
+    relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
+    of_sequences = near.evidence.weights(settings.sharpness)
+    squares = np.einsum("qs,qsjk->qjk", of_sequences, relative)
+    weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
+    trust = near.evidence.trust * (1.0 - settings.min_fixed_share)
+    weights *= trust[:, None]
+    weights[:, 0] += 1.0 - trust
+    mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)
+    # Where the fixed set has no error, there is none to be gained on.
+    of_fixed = np.maximum(squares[:, 0, 0], 1e-12)
+    return weights, np.sqrt(mean_square / of_fixed)
+
+
+def smooth_weights(
+    weights: NDArray[np.float64], familiarity: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
+
+    Doubt does not wait: where a scan is unlike all training, the fixed set gets the weight that
+    this asks for at once.
+
+    Parameters
+    ----------
+    weights
+        Of shape (n_selections, n_members), the fixed set first.
+    familiarity
+        Of each scan, of shape (n_selections,).
+
+    Returns
+    -------
+    ndarray of shape (n_selections, n_members)
+    """
+    total = weights.copy()
+    for k in range(1, SMOOTHING):
+        total[k:] += weights[:-k]
+    mean = total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHING)[:, None]
+    trust = np.minimum(1.0, familiarity / NOVEL)
+    others = np.maximum(mean[:, 1:].sum(axis=1), 1e-12)
+    mean[:, 1:] *= np.minimum(1.0, trust / others)[:, None]
+    mean[:, 0] = np.maximum(0.0, 1.0 - mean[:, 1:].sum(axis=1))
+    return np.asarray(mean)
+
+
+def clip_errors(
+    vectors: NDArray[np.float32], fixed_at: int, clip: float = BankSettings().clip
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Clip the errors on the frames of a sequence.
+
+    Parameters
+    ----------
+    vectors
+        Percent, of shape (n_frames, n_sets, 3); not finite where the track was lost.
+    fixed_at
+        Column of the fixed set.
+    clip
+        See `BankSettings`.
+
+    Returns
+    -------
+    vectors : ndarray of shape (n_frames, n_sets, 3)
+        Zero where the track was lost.
+    lost : ndarray of shape (n_frames, n_sets)
+        What counts there instead, in no direction; zero elsewhere.
+    """
+    lengths = np.linalg.norm(vectors, axis=-1)
+    lost = ~(lengths <= FAILURE)
+    of_fixed = np.where(lost[:, fixed_at], FAILURE, lengths[:, fixed_at])
+    most = clip * np.sqrt((of_fixed**2).mean() + ERROR_FLOOR**2)
+    share = np.minimum(1.0, most / np.maximum(lengths, 1e-9))
+    kept = np.where(lost[..., None], 0.0, vectors) * np.where(lost, 0.0, share)[..., None]
+    return kept.astype(np.float32), np.where(lost, most, 0.0).astype(np.float32)
+
+
+def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights w, none negative and adding up to 1, for which w'Sw is least.
+
+    Parameters
+    ----------
+    squares
+        S, of shape (n, n), the fixed set first.
+
+    Returns
+    -------
+    ndarray of shape (n,)
+    """
+    n = len(squares)
+    squares = squares + np.eye(n) * (RIDGE * squares[0, 0] + 1e-12)
+    # Up to a factor they are those for which w'Sw - 2 sum w is least.
+    root = np.linalg.cholesky(squares)
+    weights, _ = nnls(root.T, np.linalg.solve(root, np.ones(n)))
+    return np.asarray(weights / weights.sum())
+
+
+def choose_members(
+    vectors: Sequence[NDArray[np.float32]],
+    errors: Sequence[NDArray[np.floating]],
+    sets: ParameterSets,
+    fixed: int,
+    size: int,
+) -> list[int]:
+    """Choose sets whose errors cancel each other.
+
+    The search is greedy and begins with the fixed set. Each next member is the one that most
+    lowers the mean over the sequences of the root mean square of a weighted mean, if the best
+    weights in every sequence were known.
+
+    Parameters
+    ----------
+    vectors
+        Of every sequence, of shape (n_frames, n_sets, 3), see `clip_errors`.
+    errors
+        Of every sequence, percent, of shape (n_frames, n_sets); NaN where a set was not run. A set
+        that was not run on every sequence is not chosen.
+    sets
+        The columns.
+    fixed
+        Trial number of the fixed set.
+    size
+        How many to choose, if there are as many.
+
+    Returns
+    -------
+    list of int
+        Trial numbers, the fixed set's first.
+    """
+    number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
+    means = mean_errors(np.concatenate(errors), number)
+    fixed_at = sets.column(fixed)
+    pool = [int(j) for j in np.argsort(means, kind="stable")[:POOL] if np.isfinite(means[j])]
+    pool = [fixed_at, *(j for j in pool if j != fixed_at)]
+    squares = []
+    for of_sequence in vectors:
+        few, lost = clip_errors(of_sequence[:, pool], 0)
+        rows = few.transpose(0, 2, 1).reshape(-1, len(pool)).astype(np.float64)
+        products = (rows.T @ rows + np.diag((lost.astype(np.float64) ** 2).sum(axis=0))) / len(few)
+        squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
+    chosen = [0]
+    while len(chosen) < min(size, len(pool)):
+        rest = [j for j in range(len(pool)) if j not in chosen]
+        chosen.append(min(rest, key=lambda j: _root_mean_square(squares, [*chosen, j])))
+    return [sets.trials[pool[j]] for j in chosen]
+
+
+def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:
+    of_members = [s[np.ix_(members, members)] for s in squares]
+    return float(
+        np.mean([np.sqrt(w @ s @ w) for s in of_members for w in [minimum_variance_weights(s)]])
+    )

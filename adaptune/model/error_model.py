@@ -1,0 +1,330 @@
+"""The error model: what passes from training to the robot."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+
+from adaptune.archive import compact
+from adaptune.descriptor.pca import ScaledPCA
+from adaptune.model.bank_weights import BankSettings
+from adaptune.model.base import TrainingData
+from adaptune.model.model_file import (
+    DAMAGED,
+    ModelError,
+    digest,
+    read_model_file,
+    write_model_file,
+)
+from adaptune.model.paired import PairedSettings
+from adaptune.parameter_sets import ParameterSets
+from adaptune.sequence.views import places
+from adaptune.space import ParameterSet, ParameterSpace, SpaceError
+
+SAME_SENSOR = 3.0
+"""Degrees by which the lowest points of one sensor's scans may differ between drives."""
+
+_TYPES = {
+    "descriptors": ("<u2", "<f4"),
+    "sequence": ("<u4",),
+    "errors": ("<f4",),
+    "vectors": ("<f4",),
+}
+"""The arrays in a file, and the types that they may have."""
+
+
+class _Header(BaseModel):
+    """The text in a file. Later versions may say more in the same format."""
+
+    model_config = ConfigDict(strict=True)
+
+    odometry: dict[str, Any]
+    space: dict[str, Any]
+    trials: list[int]
+    sets: list[dict[str, Any]]
+    fixed: int
+    length: float = Field(gt=0, allow_inf_nan=False)
+    sequences: list[str]
+    blocks: dict[str, PositiveInt]
+    window: PositiveInt
+    elevations: list[float]
+    paired: PairedSettings
+    bank: list[int]
+    bank_settings: BankSettings
+    provenance: dict[str, Any]
+    validation: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """Everything that selection needs to know about a study.
+
+    Attributes
+    ----------
+    odometry : dict
+        Name and settings of the odometry.
+    sets : ParameterSets
+        The parameter sets, by the numbers of their trials.
+    fixed : int
+        Trial number of the set that is best over all training sequences.
+    length : float
+        Metres of a sub-trajectory.
+    sequences : list of str
+        Names of the training sequences.
+    blocks : dict
+        By name, in order, the number of features of each descriptor.
+    window : int
+        Number of descriptors that are averaged: a selection's and those of the selections before.
+    descriptors : ndarray of shape (n_frames, n_features)
+        float32, averaged.
+    sequence : ndarray of shape (n_frames,)
+        Number of each frame's sequence.
+    errors : ndarray of shape (n_frames, n_sets)
+        float32 percent, infinite where the track was lost, NaN where the set was not run.
+    provenance : dict
+        Where the model comes from, for people.
+    bank : list of int, optional
+        Trial numbers of the sets whose errors cancel each other best, the fixed one first, see
+        `adaptune.model.bank_weights.choose_members`; empty if there is no bank.
+    vectors : ndarray of shape (n_frames, len(bank), 3), optional
+        float32, their errors as vectors; see `TrainingData`.
+    elevations : list of float, optional
+        For each training sequence, degrees at which its scans' lowest points lie, see
+        `adaptune.descriptor.base.lowest_elevation`; empty if unknown.
+    paired : PairedSettings
+        Of the paired rule, chosen on the training sequences.
+    bank_settings : BankSettings
+        Of the bank's weights, chosen on the training sequences.
+    validation : dict
+        By selection rule what `adaptune validate` found, for people; empty before.
+    """
+
+    odometry: dict[str, Any]
+    sets: ParameterSets
+    fixed: int
+    length: float
+    sequences: list[str]
+    blocks: dict[str, int]
+    window: int
+    descriptors: NDArray[np.float32]
+    sequence: NDArray[np.intp]
+    errors: NDArray[np.float32]
+    provenance: dict[str, Any]
+    bank: list[int] = field(default_factory=list)
+    vectors: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
+    elevations: list[float] = field(default_factory=list)
+    paired: PairedSettings = field(default_factory=PairedSettings)
+    bank_settings: BankSettings = field(default_factory=BankSettings)
+    validation: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def bank_adapts(self) -> bool:
+        """Whether there is a bank, and it was shown to pay."""
+        return bool(self.bank) and self.bank_settings.adapt
+
+    def pca(self) -> ScaledPCA:
+        """Principal components of the training frames' descriptors."""
+        return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
+
+    def training_data(self, pca: ScaledPCA, members: Sequence[int] | None = None) -> TrainingData:
+        """What selection rules are fitted to.
+
+        Parameters
+        ----------
+        pca
+            What `pca` returned.
+        members
+            Trial numbers of some of the bank's members, to be the only candidates; the first counts
+            as the fixed one. All sets are candidates when left out.
+        """
+        data = TrainingData(
+            pca.transform(self.descriptors),
+            places(self.sequences)[self.sequence],
+            self.errors,
+            self.sets,
+            self.fixed,
+        )
+        if members is None:
+            return data
+        vectors = self.vectors[:, [self.bank.index(trial) for trial in members]]
+        return replace(data, fixed=members[0], candidates=tuple(members), vectors=vectors)
+
+    def thinned(self, max_frames: int | None) -> Self:
+        """Keep fewer frames, so that a selection costs less.
+
+        Each sequence keeps its share, at least one frame, evenly in time: so mean errors stay what
+        they are. (Frames that cover what all of them look like would be rare ones.) The paired rule
+        and the bank then use as much fewer near frames.
+
+        Parameters
+        ----------
+        max_frames
+            Number of frames over all sequences, but one of each at least; all if None.
+        """
+        n_frames = len(self.sequence)
+        if max_frames is None or n_frames <= max_frames:
+            return self
+        kept = []
+        for s in np.unique(self.sequence):
+            members = np.flatnonzero(self.sequence == s)
+            share = max(1, max_frames * len(members) // n_frames)
+            kept.append(members[(2 * np.arange(share) + 1) * len(members) // (2 * share)])
+        frames = np.sort(np.concatenate(kept))
+        share_kept = len(frames) / n_frames
+
+        def fewer(n_near: int) -> dict[str, int]:
+            return {"n_frames": max(1, round(n_near * share_kept))}
+
+        return replace(
+            self,
+            paired=self.paired.model_copy(update=fewer(self.paired.n_frames)),
+            bank_settings=self.bank_settings.model_copy(update=fewer(self.bank_settings.n_frames)),
+            descriptors=self.descriptors[frames],
+            sequence=self.sequence[frames],
+            errors=self.errors[frames],
+            vectors=self.vectors[frames] if self.bank else self.vectors,
+        )
+
+    def trial(self, named: int | ParameterSet) -> int | None:
+        """Trial number of a set that is named by it, or by its values that are not the baseline's.
+
+        None if the model does not know the set.
+        """
+        if isinstance(named, int):
+            return named if named in self.sets else None
+        return self.sets.find(named)
+
+    def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
+        """Refuse a model of another odometry or of other parameters.
+
+        Parameters
+        ----------
+        odometry
+            Its name and settings.
+        space
+            The parameters.
+        path
+            Where the model is from.
+
+        Raises
+        ------
+        ModelError
+        """
+        if self.odometry != odometry:
+            raise ModelError(
+                f"{path}: is a model of {json.dumps(self.odometry)}, the study's odometry is "
+                f"{json.dumps(odometry)}; run `adaptune offline` for this study"
+            )
+        if self.sets.space != space:
+            raise ModelError(
+                f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
+                f"offline` for this study"
+            )
+
+    def is_foreign(self, elevation: float) -> bool:
+        """Whether scans whose lowest points lie there come from no sensor of the training's.
+
+        Parameters
+        ----------
+        elevation
+            Degrees, the median of some scans' `adaptune.descriptor.lowest_elevation`.
+        """
+        apart = [abs(elevation - known) for known in self.elevations]
+        return bool(apart) and min(apart) > SAME_SENSOR
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {
+            "descriptors": np.ascontiguousarray(compact(self.descriptors)),
+            "sequence": self.sequence.astype(np.uint32),
+            "errors": np.ascontiguousarray(self.errors, np.float32),
+            "vectors": np.ascontiguousarray(self.vectors, np.float32),
+        }
+
+    def _header(self) -> dict[str, Any]:
+        return {
+            "odometry": self.odometry,
+            "space": self.sets.space.dump(),
+            "trials": self.sets.trials,
+            "sets": self.sets.parameters,
+            "fixed": self.fixed,
+            "length": self.length,
+            "sequences": self.sequences,
+            "blocks": self.blocks,
+            "window": self.window,
+            "elevations": self.elevations,
+            "paired": self.paired.model_dump(),
+            "bank": self.bank,
+            "bank_settings": self.bank_settings.model_dump(),
+        }
+
+    @property
+    def digest(self) -> str:
+        """Digest of everything that selections depend on."""
+        return digest(self._header(), self._arrays())
+
+    def save(self, path: Path | str) -> None:
+        """Write the model to one file, in the safetensors format. Numbers keep all their bits."""
+        about = {"provenance": self.provenance, "validation": self.validation}
+        write_model_file(Path(path), self._header() | about, self._arrays())
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a model.
+
+        Raises
+        ------
+        ModelError
+            If there is none, or it is damaged, or of a newer or older adaptune.
+        """
+        path = Path(path)
+        try:
+            content, arrays = read_model_file(path, _TYPES)
+            header = dict(_Header.model_validate(content))
+            space = ParameterSpace.load(header.pop("space"))
+            sets = ParameterSets(space, tuple(header.pop("trials")), tuple(header.pop("sets")))
+            arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
+            arrays["sequence"] = arrays["sequence"].astype(np.intp)
+            model = cls(sets=sets, **header, **arrays)
+            model.check()
+        except FileNotFoundError as error:
+            raise ModelError(f"{path}: there is no such model; run `adaptune offline`") from error
+        except (OSError, SpaceError, *DAMAGED) as error:
+            lines = " ".join(str(error).split())
+            raise ModelError(
+                f"{path}: is not an error model, or damaged ({lines}); run `adaptune offline` again"
+            ) from error
+        return model
+
+    def check(self) -> None:
+        """Refuse a model whose parts do not go together.
+
+        Raises
+        ------
+        ValueError
+        SpaceError
+        """
+        n_frames, n_sets = self.errors.shape
+        if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
+            raise ValueError("the errors are not of as many frames as the descriptors")
+        if self.sequence.shape != (n_frames,):
+            raise ValueError("the errors are not of as many frames as the sequence numbers")
+        if not n_frames or len(self.sets) != n_sets or self.fixed not in self.sets:
+            raise ValueError("errors and parameter sets do not go together")
+        if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):
+            raise ValueError("the error vectors do not go together with the errors and the bank")
+        if set(self.bank) - set(self.sets) or len(set(self.bank)) != len(self.bank):
+            raise ValueError("the bank holds unknown sets, or one twice")
+        if not 0 <= self.sequence.min() <= self.sequence.max() < len(self.sequences):
+            raise ValueError("a frame is of no sequence")
+        # Not a number is neither; both are true of most files, and make no copy of the errors.
+        if not np.isfinite(self.descriptors).all() or np.nanmin(self.errors, initial=0.0) < 0.0:
+            raise ValueError("there are descriptors or errors that cannot be")
+        if np.isnan(self.errors).all(axis=1).any():
+            raise ValueError("a frame has no error at all")
+        for parameters in self.sets.parameters:
+            self.sets.space.check(parameters)

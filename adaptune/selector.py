@@ -1,0 +1,195 @@
+"""Selection while the robot drives: from scans to the parameter set, or the weights, to apply."""
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.descriptor.base import Describer, DescriptorError, lowest_elevation
+from adaptune.descriptor.motion import MOTION, SECOND, fill_in, speed_and_turn_rate
+from adaptune.geometry import Poses
+from adaptune.model import RULES, BankRule, ErrorModel, make_rule
+from adaptune.model.bank_weights import SMOOTHING, smooth_weights, weighted_selection
+from adaptune.odometry.base import Motions
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
+
+SCANS_TO_KNOW = 10
+"""The sensor is recognised by the median over this many scans that selections are made from."""
+
+_log = logging.getLogger(__name__)
+
+
+class Selector:
+    """Chooses parameters for an odometry, or weights for a bank, by an error model.
+
+    Show it every scan with `observe`; ask it to `select` whenever a selection is due, usually once
+    a second. It reads no clock and no file.
+
+    With the paired rule and a bank that was shown to pay, the selections are weights of the bank's
+    members, smoothed over the last selections. Scans of a sensor or mount that was not trained with
+    (`ErrorModel.is_foreign`) get the fixed set.
+
+    Parameters
+    ----------
+    model
+        Fitted offline.
+    rule
+        One of `adaptune.model.RULES`.
+    members
+        Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
+        weighs them, others choose among them. None takes the model's bank for the paired rule if
+        the bank was shown to pay; an empty one is for a single odometry.
+    switch_cost
+        What a switch must promise, as a share of the fixed set's error.
+
+    Attributes
+    ----------
+    fixed : int
+        Trial number of the set to begin with.
+    members : tuple of int
+        Trial numbers of the bank's members; empty for a single odometry.
+
+    Raises
+    ------
+    DescriptorError
+        If a descriptor has changed since the model was fitted.
+    """
+
+    def __init__(
+        self,
+        model: ErrorModel,
+        rule: str = RULES[0],
+        members: Sequence[int] | None = None,
+        switch_cost: float = 0.0,
+    ):
+        if members is None:
+            members = model.bank if rule == "paired" and model.bank_adapts else ()
+        self.members = tuple(members)
+        self.fixed = self.members[0] if self.members else model.fixed
+        self._model = model
+        self._pca = model.pca()
+        weighs = bool(self.members) and rule == "paired"
+        fitted = (
+            BankRule(model.bank_settings) if weighs else make_rule(rule, model.paired, switch_cost)
+        )
+        self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
+        self._describe = Describer(model.blocks)
+        if self._describe.blocks != model.blocks:
+            raise DescriptorError(
+                f"the model was fitted to descriptors of {model.blocks} numbers, these have "
+                f"{self._describe.blocks}; run `adaptune offline` again"
+            )
+        # The first selection loads compiled code; the robot should not wait for that.
+        self.reset()
+        self.observe(0, Scan(0, np.zeros((0, 3), np.float32)), Motions(np.eye(4), {}))
+        self.select()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all scans and selections, as before a new drive."""
+        self._scan: Scan | None = None
+        self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
+        self._found: deque[Selection] = deque(maxlen=SMOOTHING)
+        self._current: int | None = None
+        self._stamp = 0
+        self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
+        self._elevations: list[float] = []
+        self._warned = False
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan, before it is registered.
+
+        Parameters
+        ----------
+        stamp
+            Nanoseconds.
+        scan
+            The scan.
+        motions
+            What the odometry, or the bank and its members, moved over the scan before; see
+            `adaptune.odometry.base.OdometryInstance`.
+        """
+        if self._scan is not None and np.isfinite(motions.T_previous_current).all():
+            T_odom_before = self._recent[-1][1] if self._recent else np.eye(4)
+            self._recent.append((self._stamp, T_odom_before @ motions.T_previous_current))
+            while len(self._recent) > 1 and self._recent[1][0] <= self._stamp - SECOND:
+                self._recent.popleft()
+        self._scan, self._stamp = scan, stamp
+
+    def select(self) -> Selection:
+        """Choose what to apply before the newest scan is registered.
+
+        Raises
+        ------
+        ValueError
+            If no scan was observed.
+        DescriptorError
+            If the scan cannot be described.
+        """
+        if self._scan is None:
+            raise ValueError("observe a scan before you select")
+        descriptor = self._describe(self._scan)
+        if MOTION in self._describe.blocks:
+            fill_in(descriptor, self._describe.blocks, self._motion())
+        self._descriptors.append(descriptor)
+        mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
+        feature = self._pca.transform(mean.astype(np.float32))[0]
+        selection = self._rule.select(feature, self._current)
+        if selection.weights is not None:
+            selection = self._smoothed(selection)
+        if self._rule.gated and self._is_foreign(self._scan):
+            selection = self._keep_fixed(selection)
+        self._current = selection.trial
+        return selection
+
+    def _motion(self) -> NDArray[np.float64]:
+        """Speed and turn rate over the last second of registered scans, of shape (2,)."""
+        if not self._recent:
+            return np.zeros(2)
+        stamps, poses = zip(*self._recent, strict=True)
+        return np.asarray(speed_and_turn_rate(np.array(stamps, np.int64), np.array(poses))[-1])
+
+    def _smoothed(self, selection: Selection) -> Selection:
+        """Replace the weights by the smoothed ones; what is predicted stays as it is."""
+        self._found.append(selection)
+        weights = np.array([list((s.weights or {}).values()) for s in self._found])
+        familiarity = np.array([s.familiarity for s in self._found])
+        smooth = smooth_weights(weights, familiarity)[-1].tolist()
+        weighted = weighted_selection(
+            self._model.sets, dict(zip(self.members, smooth, strict=True))
+        )
+        return selection._replace(
+            trial=weighted.trial, parameters=weighted.parameters, weights=weighted.weights
+        )
+
+    def _keep_fixed(self, selection: Selection) -> Selection:
+        weights = None
+        if selection.weights is not None:
+            weights = {trial: float(trial == self.fixed) for trial in self.members}
+        fixed = selection.predicted_fixed
+        return Selection(
+            self.fixed, self._model.sets[self.fixed], weights, fixed, fixed, familiarity=0.0
+        )
+
+    def _is_foreign(self, scan: Scan) -> bool:
+        """Whether the scans seen so far come from a sensor that was not trained with."""
+        if len(scan) and len(self._elevations) < SCANS_TO_KNOW:
+            self._elevations.append(lowest_elevation(scan))
+        if not self._elevations:
+            return False
+        lowest = float(np.median(self._elevations))
+        if not self._model.is_foreign(lowest):
+            return False
+        if not self._warned:
+            known = sorted({f"{elevation:.0f}" for elevation in self._model.elevations})
+            _log.warning(
+                "the scans' lowest points lie at %.0f degrees, those of training at %s: this is "
+                "another sensor or mount; the fixed set is kept",
+                lowest,
+                ", ".join(known),
+            )
+        self._warned = True
+        return True

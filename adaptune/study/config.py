@@ -1,0 +1,214 @@
+"""The configuration of a study: the settings that both stages share."""
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.isolation import Limits
+from adaptune.sequence.config import SequenceConfig, ViewConfig
+from adaptune.simulation.course import Course
+from adaptune.space import ParameterSpace, Value
+
+if TYPE_CHECKING:
+    from adaptune.study.mistakes import Mistake
+
+Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
+"""Becomes the name of a file."""
+
+RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
+"""Keys of earlier versions and what they are called now."""
+
+
+class StudySection(BaseModel):
+    """A section of a study's YAML."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class OdometryConfig(StudySection):
+    """The odometry, its settings, and the ranges of the parameters that are tuned.
+
+    Without `parameters`, all parameters are tuned in their usual ranges. Otherwise those that it
+    does not name keep their baseline. A `command` defines its parameters here, with their `type`.
+    """
+
+    name: str
+    settings: dict[str, Any] = {}
+    parameters: Annotated[dict[str, dict[str, Any]], Field(min_length=1)] | None = None
+
+
+def _known_descriptor(name: str) -> str:
+    from adaptune.descriptor import DescriptorError, descriptor
+
+    try:
+        descriptor(name)
+    except DescriptorError as error:
+        raise ValueError(str(error)) from error
+    return name
+
+
+class DescriptorConfig(StudySection):
+    """How scans are described.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of descriptors, see `adaptune.descriptor`.
+    window : float
+        Seconds over which the descriptors of selections are averaged; with 0, only the newest scan
+        counts.
+    """
+
+    names: Annotated[
+        tuple[Annotated[str, AfterValidator(_known_descriptor)], ...], Field(min_length=1)
+    ] = ("ndt",)
+    window: float = Field(3.0, ge=0, allow_inf_nan=False)
+
+    @field_validator("names")
+    @classmethod
+    def _once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("a descriptor is named twice")
+        return names
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_alone(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            return {"names": (data,)}
+        return {"names": data} if isinstance(data, list) else data
+
+
+def _catches_up(scans: int) -> int:
+    if scans == 1:
+        raise ValueError("with 1 a new instance never catches up; give 0, or 2 or more")
+    return scans
+
+
+class SwitchingConfig(StudySection):
+    """How the odometry changes its parameters during a replay.
+
+    Attributes
+    ----------
+    mechanism : str
+        `live`: the odometry changes them between scans. `hand_over`: a new instance takes over.
+        `bank`: several instances run side by side, and their motions are averaged. `auto`: the
+        first of bank (given more than one core, and enough memory), live and hand_over that is
+        possible.
+    warm_up : float, optional
+        Seconds of scans that a new instance sees before it takes over. The odometry has its own
+        defaults for this and the next two.
+    full_rate : float, optional
+        The new instance sees every scan of the most recent seconds.
+    stride : int, optional
+        Of the scans before, it sees every n-th.
+    catch_up_scans : int
+        Scans of the past that a new instance sees with every new scan, while the old instance
+        still gives the poses. With 0, it sees all of them at once.
+    size : int
+        Number of members of the bank.
+    sets : list of int or dict, optional
+        Parameter sets of the bank, or their trial numbers; the first one is the fixed one. By
+        default the fixed set, and the sets whose errors cancel each other best.
+    cores, memory : int, float, optional
+        What `auto` may spend on a bank: cores (default: all), and gigabytes, of which each member
+        may take `isolation.memory`.
+    """
+
+    mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"
+    warm_up: float | None = Field(None, gt=0, allow_inf_nan=False)
+    full_rate: float | None = Field(None, ge=0, allow_inf_nan=False)
+    stride: int | None = Field(None, ge=1)
+    catch_up_scans: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
+    size: int = Field(4, ge=2, le=6)
+    sets: Annotated[
+        tuple[Annotated[int, Field(ge=0)] | dict[str, Value], ...] | None,
+        Field(min_length=2, max_length=6),
+    ] = None
+    cores: int | None = Field(None, ge=1)
+    memory: float = Field(16.0, gt=0, allow_inf_nan=False)
+
+
+class OnlineConfig(StudySection):
+    """How to replay.
+
+    Attributes
+    ----------
+    period : float
+        Seconds between selections.
+    rules : list of str
+        Selection rules: `paired`, `paper`.
+    switching : SwitchingConfig
+    """
+
+    period: float = Field(1.0, gt=0, allow_inf_nan=False)
+    rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
+    switching: SwitchingConfig = SwitchingConfig()
+
+
+class StudyConfig(StudySection):
+    """The YAML of a study without the settings that only one stage uses.
+
+    Attributes
+    ----------
+    sequences : dict
+        Recordings by name.
+    courses : dict
+        Simulated sequences by name; `adaptune simulate` records them.
+    training, test : list of str
+        Names of sequences and courses.
+    sub_trajectory : float
+        Length in metres over which errors are measured.
+    lost_track : float
+        Metres a second. A trial counts a step that departs from the reference by more as a
+        failure, and restarts the odometry at the reference.
+    health : HealthCheck
+        Bounds on the platform's motion. A replay restarts an odometry that exceeds them, from its
+        last healthy motion.
+    isolation : Limits
+        Limits of an odometry that runs in a process of its own.
+    """
+
+    odometry: OdometryConfig
+    sequences: dict[Name, SequenceConfig] = {}
+    courses: dict[Name, Course] = {}
+    training: tuple[str, ...] = Field(min_length=1)
+    test: tuple[str, ...] = ()
+    sub_trajectory: float = Field(25.0, gt=0, allow_inf_nan=False)
+    lost_track: float = Field(3.0, gt=0, allow_inf_nan=False)
+    health: HealthCheck = HealthCheck()
+    isolation: Limits = Limits()
+    descriptor: DescriptorConfig = DescriptorConfig()
+    online: OnlineConfig = OnlineConfig()
+
+    # What a stage that adds settings of its own overrides.
+
+    @property
+    def views(self) -> Mapping[str, ViewConfig]:
+        """Views of every training sequence that are trained on, too, by unique names."""
+        return {}
+
+    def mistakes(self, space: ParameterSpace | None) -> "Iterable[Mistake]":  # noqa: ARG002
+        """Find what does not fit the tuned parameters; None where these have mistakes."""
+        return ()
+
+    def resolved(self) -> dict[str, Any]:
+        """The configuration as plain data, with nothing left to defaults."""
+        return self.model_dump(mode="json")
+
+    @classmethod
+    def lasting(cls, resolved: Mapping[str, Any]) -> dict[str, Any]:
+        """The part of a resolved configuration that may not change when a study is resumed.
+
+        Trials depend on it. Recordings may be added, and test sequences may change.
+        """
+        lasting = {key: resolved.get(key) for key in ("odometry", "sub_trajectory", "lost_track")}
+        lasting |= {key: resolved[key] for key in ("training", "recordings")}
+        for name in resolved["training"]:
+            for kind in ("sequences", "courses"):
+                entry = dict(resolved.get(kind, {}).get(name) or {})
+                entry.pop("cache", None)  # changes nothing but the time it takes
+                lasting[f"{kind}.{name}"] = entry
+        return lasting

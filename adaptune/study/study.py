@@ -1,0 +1,177 @@
+"""A study: a checked configuration, and what is made of it."""
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, Literal
+
+from typing_extensions import TypeVar
+
+from adaptune.cores import available
+from adaptune.odometry.base import WarmUp
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.sequence.views import OF_VIEW
+from adaptune.study.config import StudyConfig
+from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.run_folder import check_folder, open_folder
+from adaptune.study.sequences import StudySequences
+from adaptune.study.tuned import describe_odometry, odometry_settings, tuned_space
+
+C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
+
+Mechanism = Literal["live", "hand_over", "bank"]
+
+
+@dataclass(frozen=True)
+class Study(Generic[C_co]):
+    """A checked configuration and its folder.
+
+    Attributes
+    ----------
+    config : StudyConfig
+    folder : Path
+        Keeps trials, model, replays and comparison.
+    """
+
+    config: C_co
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the study: its folder's."""
+        return self.folder.name
+
+    @property
+    def model_path(self) -> Path:
+        """File of the error model."""
+        return self.folder / "model.safetensors"
+
+    @cached_property
+    def sequences(self) -> StudySequences:
+        """The sequences by name."""
+        config, described = self.config, describe_odometry(self.config.odometry)
+        layout: Any = odometry_settings(config.odometry).input if described.whole else "bag"
+        of_study = (config.sequences, config.courses, config.views, self.folder)
+        return StudySequences(*of_study, described.needs_imu, layout)
+
+    @cached_property
+    def odometry(self) -> OdometryFactory:
+        """Makes instances of the odometry."""
+        config = self.config.odometry
+        described = describe_odometry(config)
+        return OdometryFactory(
+            config.name,
+            odometry_settings(config),
+            tuned_space(config, described),
+            self.config.isolation,
+            self.sequences.program_input if described.whole else None,
+            self.config.training,
+        )
+
+    @property
+    def training(self) -> list[str]:
+        """Names of the training sequences, each followed by its views."""
+        suffixes = ("", *(f"{OF_VIEW}{view}" for view in self.config.views))
+        return [name + suffix for name in self.config.training for suffix in suffixes]
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """Selection rules; none where the odometry runs whole recordings."""
+        return () if self.odometry.description.whole else self.config.online.rules
+
+    @property
+    def window(self) -> int:
+        """Number of selections over which descriptors are averaged."""
+        return max(1, math.ceil(self.config.descriptor.window / self.config.online.period))
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """How the odometry changes its parameters during a replay."""
+        switching = self.config.online.switching
+        if switching.mechanism != "auto":
+            return switching.mechanism
+        instances = switching.size if switching.sets is None else len(switching.sets)
+        cores = available() if switching.cores is None else switching.cores
+        enough = instances * self.config.isolation.memory <= switching.memory
+        if cores > 1 and enough:
+            return "bank"
+        return "live" if self.odometry.description.live else "hand_over"
+
+    @cached_property
+    def warm_up(self) -> WarmUp:
+        """Which scans a new instance sees before it takes over."""
+        switching = self.config.online.switching
+        usual = self.odometry.description.warm_up
+        return WarmUp(
+            usual.seconds if switching.warm_up is None else switching.warm_up,
+            usual.full_rate if switching.full_rate is None else switching.full_rate,
+            usual.stride if switching.stride is None else switching.stride,
+        )
+
+    def switch_cost(self) -> float:
+        """Share by which a switch raises the RTE, as `adaptune switching` measured it.
+
+        Returns
+        -------
+        float
+            0.0 if it was not measured, or with another odometry or warm-up.
+        """
+        path = self.folder / "switching.json"
+        try:
+            measured = json.loads(path.read_text(encoding="utf-8"))
+            if measured["of"] != self.switching_identity():
+                return 0.0
+            return max(0.0, float(measured["switch_cost"]))
+        except FileNotFoundError:
+            return 0.0
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigurationError(
+                f"{path}: is damaged ({error}); remove it, or run `adaptune switching` again"
+            ) from error
+
+    def switching_identity(self) -> dict[str, Any]:
+        """Everything that the switch cost depends on, as plain data."""
+        return {
+            "odometry": self.odometry.name,
+            "settings": self.odometry.settings.model_dump(mode="json"),
+            "mechanism": self.mechanism,
+            "warm_up": self.warm_up._asdict(),
+        }
+
+    def check(self) -> None:
+        """Refuse a folder that was begun with another study.
+
+        The budget, the number of workers, the test sequences and the replays may change.
+
+        Raises
+        ------
+        ConfigurationError
+            It names the keys that differ.
+        """
+        check_folder(self.folder, self._resolved(), self.config.lasting)
+
+    def open(self) -> None:
+        """Make and lock the folder, and write the resolved configuration to it.
+
+        Raises
+        ------
+        ConfigurationError
+            If the folder cannot be made, another process works in it, or it was begun with another
+            study.
+        """
+        self.check()
+        open_folder(self.folder, self._resolved())
+
+    def _resolved(self) -> dict[str, Any]:
+        """The configuration with nothing left to defaults, and the sizes of its recordings."""
+        resolved, settings = self.config.resolved(), self.odometry.settings
+        resolved["odometry"]["settings"] = settings.model_dump(mode="json")
+        resolved["odometry"]["parameters"] = self.odometry.space.dump()
+        if template := getattr(settings, "template", None):
+            text = Path(template).read_bytes()
+            resolved["odometry"]["template"] = hashlib.sha256(text).hexdigest()[:16]
+        sizes = {name: self.sequences.recording_size(name) for name in self.config.training}
+        return resolved | {"recordings": sizes}

@@ -1,0 +1,225 @@
+"""The configuration of a study with the settings of the offline stage."""
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import AfterValidator, BeforeValidator, Field, field_serializer, model_validator
+
+from adaptune.sequence.config import ViewConfig, expand
+from adaptune.space import ParameterSpace, nearest
+from adaptune.study.config import StudyConfig, StudySection
+from adaptune.study.mistakes import Mistake, validated
+from offline.samplers.check import check_sampler
+from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError, optuna_class
+
+Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
+"""What a trial can be judged by; `offline.objective` explains each."""
+TIMED = ("ms_per_scan", "cpu", "memory")
+"""Metrics that differ from run to run and from machine to machine."""
+_Weighted = Annotated[
+    dict[Metric, Annotated[float, Field(gt=0, allow_inf_nan=False)]], Field(min_length=1)
+]
+
+
+def _weighted(given: Any) -> Any:
+    """Write every objective, a metric or a weighted sum of metrics, as a weighted sum."""
+    objectives = given if isinstance(given, list | tuple) else [given]
+    weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
+    metrics = get_args(Metric)
+    for weights in weighted:
+        for metric in weights if isinstance(weights, dict) else ():
+            if metric not in metrics:
+                raise ValueError(f"there is no metric {metric!r}: {nearest(str(metric), metrics)}")
+    if any(weights in weighted[:i] for i, weights in enumerate(weighted)):
+        raise ValueError("names an objective twice")
+    return weighted
+
+
+class Limit(StudySection):
+    """What a metric may not exceed, on any training sequence."""
+
+    max: float = Field(gt=0, allow_inf_nan=False)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {"sampler": "tpe", "trials": 256, "sets": "own", "runs": "whole"}
+}
+"""The values that a preset of the offline stage sets. The study's own values replace them."""
+
+
+class OfflineConfig(StudySection):
+    """How to search for parameter sets.
+
+    Attributes
+    ----------
+    sampler : str
+        One of `offline.samplers.settings.NAMES`, or an Optuna sampler as ``package.module:Class``.
+    sampler_settings : dict
+        Settings of the sampler.
+    sets : str
+        `shared`: one search, which runs each set on every training sequence. `own`: a search for
+        every sequence, which runs its sets on that sequence alone. `both`: first one, then the
+        others.
+    trials : int, optional
+        Number of trials of a search; the first one is the baseline.
+    hours, stagnation, target : optional
+        Other budgets: hours that batches may take; trials in a row without a new best; a value of
+        the first objective that is good enough. The search stops after the batch in which the
+        first budget is used up.
+    initial : int
+        Samplers that learn begin with so many points of a Sobol sequence.
+    batch : int
+        Trials of a batch. The sampler proposes them from the results of the batches before.
+    workers : int, optional
+        Number of processes; by default one for each core.
+    memory : float
+        Gigabytes that prepared scans may take, in all workers together.
+    max_frames : int, optional
+        Frames that the error model keeps, over all sequences; by default all.
+    storage : str, optional
+        URL of a database that mirrors the trials; by default a journal file in the study's folder.
+    objective : tuple of dict
+        What to minimise: a metric, or a weighted sum of metrics. Several objectives give a Pareto
+        front, and the first one chooses the fixed set.
+    limits : dict
+        Limits of metrics.
+    runs : str
+        `restart`: an odometry that loses track restarts at the reference. `whole`: every run goes
+        from end to end. `episodes`: runs are made of overlapping pieces, for odometries that cannot
+        restart where they lose track.
+    repeats : int
+        Runs of every trial, for odometries that differ from run to run.
+    augment : list of ViewConfig
+        Each view adds a changed copy of every training sequence.
+    pruning : str
+        How to stop trials that promise little, see `offline.pruning`.
+    preset : str, optional
+        `paper`: as Koide et al. (IROS 2021), see `PRESETS`.
+    """
+
+    sampler: str = "tpe"
+    sampler_settings: dict[str, Any] = Field(default_factory=dict)
+    sets: Literal["shared", "own", "both"] = "shared"
+    trials: int | None = Field(None, ge=1)
+    hours: float | None = Field(None, gt=0, allow_inf_nan=False)
+    stagnation: int | None = Field(None, ge=1)
+    target: float | None = Field(None, gt=0, allow_inf_nan=False)
+    initial: int = Field(32, ge=1)
+    batch: int = Field(16, ge=1)
+    seed: int = Field(0, ge=0)
+    workers: int | None = Field(None, ge=1)
+    memory: float = Field(4.0, gt=0, allow_inf_nan=False)
+    max_frames: int | None = Field(None, ge=1)
+    storage: Annotated[str, Field(pattern="://"), AfterValidator(expand)] | None = None
+    objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
+        {"rte": 1.0},
+    )
+    limits: dict[Metric, Limit] = Field(default_factory=dict)
+    runs: Literal["restart", "whole", "episodes"] = "restart"
+    repeats: int = Field(1, ge=1)
+    augment: tuple[ViewConfig, ...] = ()
+    pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
+    preset: Literal["paper"] | None = None
+
+    @model_validator(mode="after")
+    def _check_pruning(self) -> Self:
+        if self.pruning != "none" and len(self.objective) > 1:
+            raise ValueError("pruning goes by one objective; give one, or set pruning: none")
+        if self.pruning != "none" and self.sets == "own":
+            raise ValueError(
+                "pruning spares trials further sequences, and with sets: own each runs on one; "
+                "set pruning: none, or sets: shared or both"
+            )
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        preset = PRESETS.get(str(given.get("preset")), {}) if isinstance(given, dict) else {}
+        return preset | given if preset else given
+
+    @field_serializer("storage")
+    def _hide_password(self, storage: str | None) -> str | None:
+        return storage and re.sub(r"(://[^:/@]*):[^@]*@", r"\1@", storage)
+
+    @property
+    def metrics(self) -> set[str]:
+        """All metrics that a trial is judged by."""
+        return {*self.limits, *(metric for weights in self.objective for metric in weights)}
+
+    @property
+    def budgeted(self) -> bool:
+        """Whether the study sets a budget."""
+        return any((self.trials, self.hours, self.stagnation, self.target))
+
+    def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
+        """Find mistakes in the sampler and its settings.
+
+        Parameters
+        ----------
+        space
+            The tuned parameters; None where they have mistakes.
+        """
+        key = ("sampler_settings",)
+        if len(self.objective) > 1 and self.sampler in SINGLE:
+            others = ", ".join(sorted(set(NAMES) - set(SINGLE)))
+            message = f"{self.sampler} minimises one objective only; choose one of {others}"
+            yield Mistake(("sampler",), message)
+        if self.sampler in SETTINGS:
+            found: list[Mistake] = []
+            validated(SETTINGS[self.sampler], self.sampler_settings, key, found)
+            if found:
+                yield from found
+                return
+        else:
+            try:
+                optuna_class(self.sampler)
+            except SamplerError as error:
+                yield Mistake(("sampler",), str(error))
+                return
+        if space is not None:
+            below = check_sampler(self.sampler, self.sampler_settings, space, self.budgeted)
+            yield from (mistake.below(key) for mistake in below)
+
+
+_LASTING = (
+    *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
+    *("objective", "limits", "runs", "repeats", "augment", "pruning"),
+)
+"""Settings that may not change when a study is resumed."""
+
+
+class OfflineStudyConfig(StudyConfig):
+    """The whole YAML of a study."""
+
+    offline: OfflineConfig = OfflineConfig()
+
+    @property
+    def views(self) -> Mapping[str, ViewConfig]:
+        """See `StudyConfig.views`."""
+        views: dict[str, ViewConfig] = {}
+        for view in self.offline.augment:
+            same = sum(other.name == view.name for other in views.values())
+            views[f"{view.name}{same + 1}" if same else view.name] = view
+        return views
+
+    def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
+        """See `StudyConfig.mistakes`."""
+        return (mistake.below(("offline",)) for mistake in self.offline.mistakes(space))
+
+    def resolved(self) -> dict[str, Any]:
+        """See `StudyConfig.resolved`."""
+        resolved, offline = super().resolved(), self.offline
+        if settings := SETTINGS.get(offline.sampler):
+            given = settings.model_validate(offline.sampler_settings)
+            whole = given.model_dump(mode="json", exclude_none=True)
+            resolved["offline"]["sampler_settings"] = whole
+        return resolved
+
+    @classmethod
+    def lasting(cls, resolved: Mapping[str, Any]) -> dict[str, Any]:
+        """See `StudyConfig.lasting`."""
+        offline = resolved.get("offline", {})
+        kept = {key: value for key in _LASTING if (value := offline.get(key))}
+        return super().lasting(resolved) | {"offline": kept}

@@ -1,0 +1,98 @@
+"""Fit the error model to the labelled data set."""
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adaptune.model import ErrorModel
+from adaptune.study.config import SwitchingConfig
+from offline.labelled import LabelledData
+from offline.tuning import choose_bank, tune, tune_bank
+
+_log = logging.getLogger(__name__)
+
+
+def fit(
+    data: LabelledData,
+    fixed: int,
+    odometry: dict[str, Any],
+    length: float,
+    window: int,
+    provenance: dict[str, Any],
+) -> ErrorModel:
+    """Make the error model, which does not adapt yet.
+
+    Sets have no errors (NaN) on the sequences that they were not run on.
+
+    Parameters
+    ----------
+    data
+        Of all trials that keep the limits.
+    fixed
+        Trial number of the fixed set.
+    odometry
+        Its name and settings.
+    length
+        Metres of a sub-trajectory.
+    window
+        Number of descriptors that are averaged.
+    provenance
+        Where the model comes from, for people.
+    """
+    sequences = data.sequences
+    return ErrorModel(
+        odometry=odometry,
+        sets=data.sets,
+        fixed=fixed,
+        length=length,
+        sequences=[s.name for s in sequences],
+        blocks=dict(sequences[0].blocks or {}),
+        window=window,
+        descriptors=np.concatenate([s.descriptors for s in sequences]),
+        sequence=np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences]),
+        errors=np.concatenate([s.errors for s in sequences]),
+        elevations=[s.elevation for s in sequences],
+        provenance=provenance,
+    )
+
+
+def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
+    """Choose the bank, and the settings of the rule and of the bank's weights.
+
+    Parameters
+    ----------
+    model
+        Fitted to `data`.
+    data
+        The labelled data set.
+    switching
+        Size of the bank, or its members.
+    """
+    complete = data.complete()
+    members = named_members(model, switching, complete)
+    if not members:
+        members = choose_bank(complete, model.fixed, switching.size)
+    return replace(
+        model,
+        paired=tune(complete),
+        bank=members,
+        vectors=complete.vectors(members),
+        bank_settings=tune_bank(complete, members, model.fixed),
+    )
+
+
+def named_members(
+    model: ErrorModel, switching: SwitchingConfig, complete: LabelledData
+) -> list[int]:
+    """Trial numbers of the members that the study names; empty if it names none, or in vain."""
+    named = [model.trial(n) for n in switching.sets or ()]
+    members = [trial for trial in named if trial is not None and trial in complete.sets]
+    if len(set(members)) == len(named):
+        return members
+    _log.warning(
+        "online.switching.sets: one of them was not run on every training sequence, or is named "
+        "twice; the bank is chosen without them (trials.csv lists the sets)"
+    )
+    return []

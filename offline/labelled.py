@@ -1,0 +1,300 @@
+"""The labelled data set: what the archive holds about every training sequence, read once."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.archive import Archive, Frames, Summary
+from adaptune.descriptor import averaged
+from adaptune.descriptor.pca import ScaledPCA
+from adaptune.metrics import span
+from adaptune.model import ModelError, TrainingData
+from adaptune.model.bank_weights import POOL
+from adaptune.model.base import mean_errors
+from adaptune.parameter_sets import ParameterSets
+from adaptune.sequence.views import origin, places
+from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
+from offline.config import Metric, OfflineStudyConfig
+from offline.objective import margin, repeated, weighted
+from offline.search import owner
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledSequence:
+    """The frames of a sequence that have a sub-trajectory, and the errors of sets there.
+
+    Attributes
+    ----------
+    name : str
+    period : ndarray of shape (n,)
+        Whole periods since the first scan: in each, one selection holds.
+    descriptors : ndarray of shape (n, n_features)
+    errors : ndarray of shape (n, n_sets)
+        Percent, infinite where the track was lost, NaN where a set was not run.
+    blocks : dict, optional
+        By name, in order, the lengths of the descriptors; one descriptor when left out.
+    baseline : ndarray of shape (n,), optional
+        Errors of the baseline, which may exceed limits; those of the first set when left out.
+    values : ndarray of shape (n_sets,), optional
+        The objective that chooses the fixed set; the mean capped error when left out.
+    repeats : ndarray of shape (n_sets, n_repeats), optional
+        Where trials are repeated, the objective of every run.
+    own : ndarray of shape (n_sets,), optional
+        Sets that were searched for on this very place, or a view of it, and on no other: they are
+        unknown to whoever has not been there.
+    block : int
+        Frames of a sub-trajectory.
+    elevation : float
+        Degrees, see `adaptune.descriptor.base.lowest_elevation`.
+    vectors : ndarray of shape (n, n_sets, 3), optional
+        The errors as vectors, NaN where nobody asks; see `adaptune.model.TrainingData`.
+    simulation : BankSimulation, optional
+        With all frames; without it and `vectors` there is no bank.
+    """
+
+    name: str
+    period: NDArray[np.int64]
+    descriptors: NDArray[np.float32]
+    errors: NDArray[np.float32]
+    blocks: Mapping[str, int] | None = None
+    baseline: NDArray[np.float64] | None = None
+    values: NDArray[np.float64] | None = None
+    repeats: NDArray[np.float64] | None = None
+    own: NDArray[np.bool_] | None = None
+    block: int = 1
+    elevation: float = np.nan
+    vectors: NDArray[np.float32] | None = None
+    simulation: BankSimulation | None = None
+
+    def subset(self, columns: NDArray[np.intp]) -> "LabelledSequence":
+        """The same with some of the sets."""
+        return replace(
+            self,
+            errors=self.errors[:, columns],
+            values=None if self.values is None else self.values[columns],
+            repeats=None if self.repeats is None else self.repeats[columns],
+            own=None if self.own is None else self.own[columns],
+            vectors=None if self.vectors is None else self.vectors[:, columns],
+        )
+
+
+class LabelledData(NamedTuple):
+    """Labelled sequences, all with errors of the same sets.
+
+    Attributes
+    ----------
+    sequences : sequence of LabelledSequence
+    sets : ParameterSets
+        The columns of their errors.
+    """
+
+    sequences: Sequence[LabelledSequence]
+    sets: ParameterSets
+
+    def subset(self, trials: Sequence[int]) -> "LabelledData":
+        """The same with some of the sets."""
+        columns = self.sets.columns(trials)
+        return LabelledData([s.subset(columns) for s in self.sequences], self.sets.subset(trials))
+
+    def complete(self) -> "LabelledData":
+        """The same with the sets that were run on all sequences, on every frame."""
+        missing = np.array([np.isnan(s.errors).any(axis=0) for s in self.sequences])
+        everywhere = np.flatnonzero(~missing.any(axis=0))
+        return self.subset([self.sets.trials[column] for column in everywhere])
+
+    def folds(self) -> list[tuple[LabelledSequence, "LabelledData"]]:
+        """Leave each sequence out, with all views of it.
+
+        Views themselves are not left out: they add nothing about the place that they show.
+        """
+        return [
+            (
+                one,
+                self._replace(sequences=[s for s in self.sequences if origin(s.name) != one.name]),
+            )
+            for one in self.sequences
+            if origin(one.name) == one.name
+        ]
+
+    def _without(self, name: str) -> "LabelledData":
+        return self._replace(sequences=[s for s in self.sequences if origin(s.name) != name])
+
+    def fixed(self) -> int:
+        """Trial number of the fixed set: the one that `offline.objective.choose_fixed` chooses."""
+        values = [
+            mean_errors(s.errors, np.zeros(len(s.errors), np.intp))
+            if s.values is None
+            else s.values
+            for s in self.sequences
+        ]
+        repeats = [s.repeats for s in self.sequences if s.repeats is not None]
+        bounds = np.mean(values, axis=0)
+        if len(repeats) == len(values):
+            bounds = bounds + np.nan_to_num(margin(np.array(repeats)))
+        return self.sets.trials[int(np.argmin(bounds))]
+
+    def training_data(self) -> tuple[TrainingData, ScaledPCA]:
+        """What selection rules are fitted to, and the transformation of descriptors for them."""
+        descriptors = np.concatenate([s.descriptors for s in self.sequences])
+        number = places([s.name for s in self.sequences])
+        blocks = self.sequences[0].blocks
+        pca = ScaledPCA(blocks=None if blocks is None else tuple(blocks.values()))
+        data = TrainingData(
+            pca.fit(descriptors).transform(descriptors),
+            np.repeat(number, [len(s.errors) for s in self.sequences]),
+            np.concatenate([s.errors for s in self.sequences]),
+            self.sets,
+            self.fixed(),
+        )
+        return data, pca
+
+    def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
+        """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
+        columns = self.sets.columns(members)
+        return np.concatenate(
+            [s.vectors[:, columns] for s in self.sequences if s.vectors is not None]
+        )
+
+
+def comparable(
+    sequence: LabelledSequence, others: LabelledData
+) -> tuple[LabelledSequence, LabelledData]:
+    """Restrict both to the sets that were run on the sequence left out, but not found there alone.
+
+    Other sets have no error to be looked up there, or are unknown to whoever has not been there.
+    """
+    run = np.asarray(~np.isnan(sequence.errors).any(axis=0))
+    if sequence.own is not None:
+        run &= ~sequence.own
+    if run.all():
+        return sequence, others
+    few = others.subset([t for t, its in zip(others.sets, run, strict=True) if its])
+    left = [s for s in few.sequences if not np.isnan(s.errors).all()]
+    return sequence.subset(np.flatnonzero(run)), few._replace(sequences=left)
+
+
+def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First frame of every period, and number of every frame's period among them.
+
+    Parameters
+    ----------
+    period
+        Whole periods since the first scan, of shape (n_frames,).
+    """
+    _, first, number = np.unique(period, return_index=True, return_inverse=True)
+    return first, number
+
+
+def labelled_data(
+    archive: Archive,
+    run: Mapping[str, Sequence[int]],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+    window: int,
+) -> LabelledData:
+    """Read the labelled data set of a study.
+
+    Parameters
+    ----------
+    archive
+        The trials.
+    run
+        For each training sequence, the trials that count there.
+    sets
+        The sets to read about.
+    config
+        Of the study.
+    window
+        Number of descriptors that are averaged.
+
+    Raises
+    ------
+    ModelError
+        If a trial is missing.
+    """
+    for name, counted in run.items():
+        if missing := set(counted) - set(archive.finished(name)):
+            raise ModelError(
+                f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
+                f"fitted to; run `adaptune offline` again"
+            )
+    read = [_labelled(archive, name, set(run[name]), sets, config, window) for name in run]
+    number = np.repeat(np.arange(len(read)), [len(s.errors) for s, _, _ in read])
+    means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
+    # With a sequence left out, others than now may be among the best. To read the poses of
+    # thousands of trials would take long.
+    order = np.argsort(means, kind="stable")[: 2 * POOL]
+    eligible = {sets.trials[c] for c in order if np.isfinite(means[c])}
+    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
+    eligible |= {trial for trial in named if trial is not None}
+    owners = [owner(config.offline, list(run), trial) for trial in sets]
+    labelled = []
+    for sequence, frames, known in read:
+        vectors = np.full((*sequence.errors.shape, 3), np.nan, np.float32)
+        for trial in eligible.intersection(sets).intersection(run[sequence.name]):
+            of_trial = archive.read(sequence.name, trial)
+            of_frames = error_vectors(frames, of_trial, config.sub_trajectory)
+            vectors[:, sets.column(trial)] = of_frames[known]
+        own = [one is not None and origin(one) == origin(sequence.name) for one in owners]
+        labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
+    return LabelledData(labelled, sets)
+
+
+def _labelled(
+    archive: Archive,
+    name: str,
+    run: Collection[int],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+    window: int,
+) -> tuple[LabelledSequence, Frames, NDArray[np.bool_]]:
+    """A labelled sequence without error vectors, its frames, and which of them are labelled."""
+    frames = archive.read_frames(name)
+    errors = archive.read_errors(name, list(sets))
+    # Trials that were run for another budget do not count.
+    errors[:, [trial not in run for trial in sets]] = np.nan
+    # Whether there is a sub-trajectory depends on the reference alone.
+    known = np.asarray(~np.isnan(errors).all(axis=1))
+    period, objective = config.online.period, config.offline.objective[0]
+    described = averaged(frames.descriptors, frames.stamps, window, period)
+    periods_since = ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64)
+    summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
+    values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
+    simulation = BankSimulation(
+        frames.stamps,
+        frames.T_ref_sensor,
+        described,
+        periods_since,
+        config.sub_trajectory,
+        config.lost_track,
+        motions_from_archive(archive, name, frames, config.lost_track),
+    )
+    labelled = LabelledSequence(
+        name,
+        periods_since[known],
+        described[known],
+        errors[known],
+        blocks=frames.blocks,
+        baseline=archive.read(name, 0).errors[known],
+        values=np.array(values),
+        repeats=_repeats(summaries, objective),
+        block=span(frames.T_ref_sensor, config.sub_trajectory),
+        elevation=float(np.nanmedian(frames.elevations)),
+        simulation=simulation,
+    )
+    return labelled, frames, known
+
+
+def _repeats(
+    summaries: Sequence[Summary | None], objective: Mapping[Metric, float]
+) -> NDArray[np.float64] | None:
+    """The objective in every run of repeated trials, of shape (n_sets, n_repeats), or None."""
+    n_repeats = max((len(s.repeats) for s in summaries if s is not None), default=0)
+    if not n_repeats:
+        return None
+    missing = [np.nan] * n_repeats
+    rows = [missing if s is None else repeated(objective, s.repeats) for s in summaries]
+    return np.array(rows)

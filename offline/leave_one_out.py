@@ -1,0 +1,280 @@
+"""Leave each training sequence out in turn, to find whether adapting pays in other places.
+
+A fixed set and the selection rules are fitted on the other sequences. On the one left out, the
+errors that were recorded for the sets they choose are looked up, period by period; no odometry
+runs.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.descriptor.pca import ScaledPCA
+from adaptune.errors import AdaptuneError
+from adaptune.metrics import bootstrap, cap
+from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
+from adaptune.model.base import complementary
+from offline.labelled import LabelledData, LabelledSequence, comparable, periods
+from offline.tuning import (
+    MIN_SEQUENCES,
+    NO_WORSE,
+    TINY,
+    bank_data,
+    bank_errors,
+    bank_evidence,
+    choose_bank,
+    interval_margin,
+    tune,
+    tune_bank,
+    weights_along,
+)
+
+MOST_SETS = 6
+"""Complementary sets whose worth is reported."""
+BANK = "bank"
+"""Name of the mode with a simulated bank."""
+BANK_SIZE = 4
+"""Its members, unless the study says otherwise."""
+
+Interval = tuple[float, float] | None
+"""The ends, where they are known."""
+Progress = Callable[[int, int], None]
+"""Called with how much is done, and how much there is."""
+Maker = Callable[[LabelledData], Rule]
+"""Makes a rule, with settings chosen on the sequences that it will be fitted on."""
+
+
+class ValidationError(AdaptuneError):
+    """A study that cannot be validated."""
+
+
+class LeftOut(NamedTuple):
+    """What happened on one sequence that was left out.
+
+    Attributes
+    ----------
+    name : str
+    errors : dict
+        For every mode the capped error in percent at each frame, of shape (n,).
+    adapted : dict
+        For every rule the share of periods in which it did not choose the fixed set; of a bank,
+        the share of the weight that the other members had.
+    familiarity : ndarray of shape (n,)
+        See `Selection`; NaN where no rule computes it.
+    portfolio : ndarray of shape (MOST_SETS,)
+        Mean error in percent if the best of 1, 2, ... complementary sets were always known.
+    block : int
+        Frames of a sub-trajectory.
+    """
+
+    name: str
+    errors: dict[str, NDArray[np.float64]]
+    adapted: dict[str, float]
+    familiarity: NDArray[np.float64]
+    portfolio: NDArray[np.float64]
+    block: int = 1
+
+    def interval(self, mode: str) -> Interval:
+        """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
+
+        It is about this drive, and says nothing about other places.
+        """
+        intervals = bootstrap(self.errors[mode], self.errors["fixed"], self.block)
+        return intervals and intervals[1]
+
+
+@dataclass
+class Validation:
+    """All sequences left out, and the conclusion.
+
+    Attributes
+    ----------
+    left_out : list of LeftOut
+    ratios : dict
+        For every mode its mean error over the fixed set's, a number for each sequence.
+    """
+
+    left_out: list[LeftOut]
+    ratios: dict[str, NDArray[np.float64]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        modes = list(self.left_out[0].errors)
+        means = {
+            mode: np.array([s.errors[mode].mean() for s in self.left_out]) + TINY for mode in modes
+        }
+        self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
+
+    @property
+    def modes(self) -> list[str]:
+        """The bank, if one was simulated, and the rules."""
+        return [mode for mode in (BANK, *RULES) if mode in self.ratios]
+
+    @property
+    def default(self) -> str:
+        """The first of them."""
+        return self.modes[0] if self.modes else next(iter(RULES))
+
+    def summary(self, mode: str) -> dict[str, float]:
+        """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
+
+        The interval is Student's, of the logarithms: it is about other sequences like these.
+        """
+        logs = np.log(self.ratios[mode])
+        margin = interval_margin(logs)
+        low, high = logs.mean() - margin, logs.mean() + margin
+        mean, fixed = (
+            np.mean([s.errors[m].mean() for s in self.left_out]) for m in (mode, "fixed")
+        )
+        return {
+            "geometric": float(np.exp(logs.mean())),
+            "low": float(np.exp(low)),
+            "high": float(np.exp(high)),
+            "worst": float(self.ratios[mode].max()),
+            "arithmetic": float(mean / fixed),
+        }
+
+    def portfolio(self) -> NDArray[np.float64]:
+        """Geometric mean of the ratio to the fixed set's error if the best of K sets were known.
+
+        Returns
+        -------
+        ndarray of shape (MOST_SETS,)
+            For K = 1 (the fixed set), 2, ...
+        """
+        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out]) + TINY
+        portfolios = np.array([s.portfolio for s in self.left_out]) + TINY
+        return np.asarray(np.exp(np.log(portfolios / fixed[:, None]).mean(axis=0)))
+
+    def verdict(self, rule: str) -> str:
+        """What to do, in a sentence or two."""
+        s = self.summary(rule)
+        worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
+        share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
+        ratio = (
+            f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
+            f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
+            + (
+                f"others than the fixed set having {share:.0f} % of the weight"
+                if rule == BANK
+                else f"adapting {share:.0f} % of the time"
+            )
+        )
+        if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
+            return f"`{rule}` kept the fixed set: what it was fitted on did not show that it pays."
+        if s["worst"] > NO_WORSE:
+            return f"Do not adapt by `{rule}`: {s['worst']:.2f} times on {worst}; {ratio}."
+        if len(self.left_out) < MIN_SEQUENCES:
+            return f"Too few sequences to advise for `{rule}`: {ratio}."
+        if s["high"] >= 1.0:
+            return f"Nothing shows that `{rule}` pays, nor that it harms: {ratio}."
+        return f"Adapt by `{rule}`: {ratio}, and on none more than {s['worst']:.2f} times."
+
+
+def leave_one_out(
+    data: LabelledData,
+    rules: Mapping[str, Maker] | None = None,
+    progress: Progress = lambda *_: None,
+    bank: int | Sequence[int] = BANK_SIZE,
+) -> Validation:
+    """Leave each sequence out in turn, with all views of it.
+
+    Parameters
+    ----------
+    data
+        The training sequences.
+    rules
+        By name, how to make each; when left out, those of `adaptune.model.RULES` with settings that
+        `tune` chooses again on the other sequences.
+    progress
+        Called about every sequence.
+    bank
+        Number of a bank's members, or their trial numbers, the first of which counts as the fixed
+        one. No bank is simulated with 0, nor without recorded motions.
+
+    Raises
+    ------
+    ValidationError
+        If there are fewer than two sequences.
+    """
+    folds = data.folds()
+    if len(folds) < 2:
+        raise ValidationError(
+            "training: one sequence cannot be validated, for nothing remains to train on when it "
+            "is left out; add sequences"
+        )
+    left_out = []
+    for i, (sequence, others) in enumerate(folds):
+        progress(i, len(folds))
+        left_out.append(
+            leave_out(sequence, others, tuned_rules() if rules is None else rules, bank)
+        )
+    progress(len(folds), len(folds))
+    return Validation(left_out)
+
+
+def tuned_rules() -> dict[str, Maker]:
+    """How to make each of `adaptune.model.RULES`, with settings chosen on what it is fitted on."""
+
+    def paper(_: LabelledData) -> Rule:
+        return make_rule("paper", PairedSettings())
+
+    return {"paired": lambda data: make_rule("paired", tune(data)), "paper": paper}
+
+
+def leave_out(
+    sequence: LabelledSequence,
+    others: LabelledData,
+    rules: Mapping[str, Maker],
+    bank: int | Sequence[int],
+) -> LeftOut:
+    """Fit on the other sequences, and look up what happens on the one left out."""
+    n_sets = len(others.sets)
+    sequence, others = comparable(sequence, others)
+    data, pca = others.training_data()
+    features = pca.transform(sequence.descriptors)
+    capped = cap(sequence.errors)
+    fixed = capped[:, data.sets.column(data.fixed)]
+    first, period = periods(sequence.period)
+    frames = np.arange(len(capped))
+    baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
+    errors, adapted = {"baseline": baseline, "fixed": fixed}, {}
+    familiarity = np.full(len(first), np.nan)
+    for name, make in rules.items():
+        rule = make(others).fit(data)
+        selections = [rule.select(features[i]) for i in first]
+        chosen = data.sets.columns([selection.trial for selection in selections])
+        errors[name] = capped[frames, chosen[period]]
+        adapted[name] = float(np.mean([selection.trial != data.fixed for selection in selections]))
+        if not np.isnan(selections[0].familiarity):
+            familiarity = np.array([selection.familiarity for selection in selections])
+    if bank and sequence.simulation is not None:
+        if not isinstance(bank, int) and len(data.sets) < n_sets:
+            bank = len(bank)
+        errors[BANK], adapted[BANK] = _simulate(sequence, others, data, pca, bank)
+    errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
+    of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
+    errors["oracle, period"] = capped[frames, of_periods.argmin(axis=1)[period]]
+    few = data.sets.columns(complementary(data, MOST_SETS))
+    least = np.minimum.accumulate(of_periods[:, few], axis=1)[period].mean(axis=0)
+    portfolio = least[np.minimum(np.arange(MOST_SETS), len(few) - 1)]
+    return LeftOut(sequence.name, errors, adapted, familiarity[period], portfolio, sequence.block)
+
+
+def _simulate(
+    sequence: LabelledSequence,
+    others: LabelledData,
+    data: TrainingData,
+    pca: ScaledPCA,
+    bank: int | Sequence[int],
+) -> tuple[NDArray[np.float64], float]:
+    """A bank's errors on the sequence left out, and the weight that the fixed set did not have."""
+    members = choose_bank(others, data.fixed, bank) if isinstance(bank, int) else bank
+    settings = tune_bank(others, members, data.fixed)
+    if not settings.adapt:
+        return cap(sequence.errors[:, data.sets.column(data.fixed)]), 0.0
+    near = bank_evidence(sequence, bank_data(others, data, members), pca, settings)
+    weights = weights_along(near, settings)
+    return bank_errors(sequence, members, weights), float(1.0 - weights[:, 0].mean())

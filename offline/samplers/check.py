@@ -1,0 +1,91 @@
+"""Mistakes in a sampler's settings that only the sampler and the parameters show."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
+from adaptune.study.mistakes import Mistake
+from offline.samplers.grid import check_grid
+from offline.samplers.settings import (
+    AnnealingSettings,
+    RandomSettings,
+    SamplerError,
+    Step,
+    optuna_sampler,
+)
+
+_ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
+"""Settings of Optuna's samplers that adaptune sets, and from which key."""
+
+
+def check_sampler(
+    name: str, settings: Mapping[str, Any], space: ParameterSpace, budgeted: bool
+) -> Iterable[Mistake]:
+    """Find mistakes in a sampler's settings.
+
+    Parameters
+    ----------
+    name
+        Name of the sampler.
+    settings
+        Its settings, valid for its model where the sampler is one of adaptune's own.
+    space
+        The tuned parameters.
+    budgeted
+        Whether the search has a budget.
+
+    Yields
+    ------
+    Mistake
+        Its key begins below the settings.
+    """
+    if name == "annealing":
+        for parameter, step in AnnealingSettings.model_validate(settings).steps.items():
+            yield from _check_step(parameter, step, space)
+    elif name in ("grid", "random"):
+        axes = RandomSettings.model_validate(settings).grid
+        if axes is not None:
+            yield from check_grid(axes, space, bounded=budgeted or name == "random")
+    elif name != "sobol":
+        yield from _check_optuna(name, settings, space)
+
+
+def _check_optuna(
+    name: str, settings: Mapping[str, Any], space: ParameterSpace
+) -> Iterable[Mistake]:
+    if taken := next((key for key in _ELSEWHERE if key in settings), None):
+        yield Mistake((taken,), f"is set by offline.{_ELSEWHERE[taken]}")
+        return
+    try:
+        optuna_sampler(name, settings, 0)
+    except SamplerError as error:
+        key, _, rest = str(error).partition(": ")
+        yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
+    if name == "cmaes" and all(isinstance(p, Categorical) for p in space.parameters.values()):
+        yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
+
+
+def _check_step(name: str, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
+    key = ("steps", name)
+    parameter = space.parameters.get(name)
+    if parameter is None:
+        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
+        return
+    allowed = _allowed(parameter)
+    given = step.model_dump(exclude_none=True)
+    for setting in given:
+        if setting not in allowed:
+            kind = "log " * getattr(parameter, "log", False) + parameter.type
+            message = f"steps of a {kind} are set by {' and '.join(allowed)}"
+            yield Mistake((*key, setting), message)
+    still = {k: v for k, v in given.items() if k in allowed}
+    if still and not any(still.values()) and (allowed[0] != "mu" or "sigma" in still):
+        named = " and ".join(f"{k} {v:g}" for k, v in still.items())
+        yield Mistake(key, f"never moves with {named}")
+
+
+def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
+    if isinstance(parameter, Categorical):
+        return ("change",)
+    linear = isinstance(parameter, Integer) and not parameter.log
+    return ("delta_max",) if linear else ("mu", "sigma")

@@ -1,0 +1,199 @@
+"""The samplers by name, and the settings of each."""
+
+import inspect
+import warnings
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from adaptune.errors import AdaptuneError
+from adaptune.space import Value, nearest
+
+OPTUNA = {
+    "cmaes": "optuna.samplers:CmaEsSampler",
+    "gp": "optuna.samplers:GPSampler",
+    "nsga2": "optuna.samplers:NSGAIISampler",
+    "qmc": "optuna.samplers:QMCSampler",
+    "tpe": "optuna.samplers:TPESampler",
+}
+"""Optuna's samplers; their settings are the keywords of the class."""
+NAMES = ("annealing", "grid", "random", "sobol", *OPTUNA)
+SINGLE = ("annealing", "cmaes")
+"""Samplers that minimise one objective only."""
+NEEDS = {"cmaes": "cmaes", "gp": "torch"}
+"""Packages that a sampler needs; adaptune's extra has the sampler's name."""
+
+
+class SamplerError(AdaptuneError):
+    """A sampler that cannot be used."""
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Step(_Settings):
+    """How far a step of annealing moves a parameter.
+
+    Attributes
+    ----------
+    mu, sigma : float, optional
+        For real numbers, and whole numbers in log scale: mean and standard deviation of a normal
+        distribution, in the parameter's unit or, in log scale, of its natural logarithm. By default
+        0 and a twentieth of the range.
+    delta_max : int, optional
+        For other whole numbers: the longest step at temperature 1, by default half of the range.
+        The temperature multiplies it; a step of 1 is always possible.
+    change : float, optional
+        For categories: the probability of another category, by default 0.3.
+    """
+
+    mu: float | None = Field(None, allow_inf_nan=False)
+    sigma: float | None = Field(None, ge=0, allow_inf_nan=False)
+    delta_max: int | None = Field(None, ge=0)
+    change: float | None = Field(None, ge=0, le=1)
+
+
+class AnnealingSettings(_Settings):
+    """Settings of simulated annealing, with the names they have in RUSTLE.
+
+    Attributes
+    ----------
+    initial_temperature, alpha : float
+        A chain begins at the initial temperature; every step multiplies it by `alpha`.
+    energy_scale : float, optional
+        Differences of the error are divided by it before they are compared with the temperature;
+        by default the error of the first trial. 1 is the thesis's rule.
+    reanneal_fixed, reanneal_accepted, reanneal_best : int, optional
+        Return to the initial temperature after this many steps; after this many steps in a row
+        without an acceptance; or without a new best of the chain.
+    stall_accepted, stall_best : int, optional
+        Stop when every chain has made this many steps in a row without an acceptance, or without a
+        new best.
+    chains : int
+        Chains take turns: trial n belongs to chain n modulo `chains`.
+    steps : dict
+        Steps by parameter.
+    """
+
+    initial_temperature: float = Field(0.1, gt=0, allow_inf_nan=False)
+    alpha: float = Field(0.9, gt=0, le=1)
+    energy_scale: float | None = Field(None, gt=0, allow_inf_nan=False)
+    reanneal_fixed: int | None = Field(None, ge=1)
+    reanneal_accepted: int | None = Field(None, ge=1)
+    reanneal_best: int | None = Field(None, ge=1)
+    stall_accepted: int | None = Field(None, ge=1)
+    stall_best: int | None = Field(None, ge=1)
+    chains: int = Field(2, ge=1)
+    steps: dict[str, Step] = {}
+
+
+class Span(_Settings):
+    """`count` values from `low` to `high`, evenly in ratio where the parameter's scale is log."""
+
+    low: float = Field(allow_inf_nan=False)
+    high: float = Field(allow_inf_nan=False)
+    count: int = Field(ge=1)
+
+
+class GridSettings(_Settings):
+    """Settings of `grid`.
+
+    Attributes
+    ----------
+    grid : dict
+        For every number ``[first, step, count]`` or a `Span`; for categories the choices to try,
+        by default all.
+    """
+
+    grid: dict[str, Span | tuple[Value, ...]]
+
+
+class RandomSettings(_Settings):
+    """Settings of `random`: with a grid, it draws the grid's points without repetition."""
+
+    grid: dict[str, Span | tuple[Value, ...]] | None = None
+
+
+def optuna_class(name: str) -> type[Any]:
+    """Class of an Optuna sampler.
+
+    Parameters
+    ----------
+    name
+        One of `OPTUNA`, or ``package.module:Class``.
+
+    Raises
+    ------
+    SamplerError
+        It names the nearest sampler, or what to install.
+    """
+    if name in NEEDS and find_spec(NEEDS[name]) is None:
+        raise SamplerError(
+            f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
+        )
+    path = OPTUNA.get(name, name)
+    if ":" not in path:
+        raise SamplerError(
+            f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
+            f"package.module:Class)"
+        )
+    from optuna.samplers import BaseSampler
+
+    module, _, attribute = path.partition(":")
+    try:
+        found = getattr(import_module(module), attribute)
+    except (ImportError, ValueError) as error:
+        raise SamplerError(
+            f"{name}: cannot import {module} ({error}); install it, or name its folder in "
+            f"PYTHONPATH"
+        ) from error
+    except AttributeError as error:
+        raise SamplerError(f"{name}: {module} has no {attribute or 'class'}") from error
+    if not (isinstance(found, type) and issubclass(found, BaseSampler)):
+        raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
+    return found
+
+
+def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
+    """Make an Optuna sampler.
+
+    Parameters
+    ----------
+    name
+        One of `OPTUNA`, or ``package.module:Class``.
+    settings
+        Keywords of the class.
+    seed
+        The class receives it if it takes one.
+
+    Raises
+    ------
+    SamplerError
+        If it does not take these settings.
+    """
+    cls = optuna_class(name)
+    keywords = inspect.signature(cls).parameters
+    if not any(k.kind is inspect.Parameter.VAR_KEYWORD for k in keywords.values()):
+        for key in settings:
+            if key not in keywords:
+                raise SamplerError(f"{key}: {name} has no such setting; {nearest(key, keywords)}")
+    seeded = {"seed": seed} if "seed" in keywords else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about what is experimental, or deprecated
+        try:
+            return cls(**seeded, **settings)
+        except Exception as error:
+            raise SamplerError(f"{name} does not take its settings: {error}") from error
+
+
+SETTINGS: dict[str, type[BaseModel]] = {
+    "annealing": AnnealingSettings,
+    "grid": GridSettings,
+    "random": RandomSettings,
+    "sobol": type("SobolSettings", (_Settings,), {"__doc__": "`sobol` has no settings."}),
+}
+"""Settings of adaptune's own samplers."""

@@ -1,0 +1,228 @@
+"""The offline stage: run the trials, choose the fixed set, fit the error model."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adaptune import report, yaml
+from adaptune.archive import Archive
+from adaptune.cores import available
+from adaptune.files import write_text
+from adaptune.model import ErrorModel
+from adaptune.parameter_sets import ParameterSets
+from adaptune.space import ParameterSet
+from offline.budget import BUDGETS
+from offline.campaign import Progress, run_batches, run_tasks
+from offline.cluster import Cluster
+from offline.config import TIMED, Metric, OfflineConfig
+from offline.fit import fit, tuned
+from offline.labelled import labelled_data
+from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
+from offline.offline_study import OfflineStudy
+from offline.search import Finished
+from offline.trial import TrialSettings, TrialSetup
+from offline.workers import Pool, Task, Workers
+
+_log = logging.getLogger(__name__)
+
+
+class Training(NamedTuple):
+    """Result of the offline stage.
+
+    Attributes
+    ----------
+    model : ErrorModel
+    means : dict
+        For every training sequence the mean capped error in percent of each trial, by rising
+        number, of shape (n_trials,); NaN where it was not run.
+    fixed : int
+        Number of the trial of the fixed set.
+    rows : list of dict
+        For every training sequence what the baseline, the fixed set and its own best set do there.
+    """
+
+    model: ErrorModel
+    means: dict[str, list[float]]
+    fixed: int
+    rows: list[dict[str, Any]]
+
+
+def train(
+    study: OfflineStudy, progress: Progress = lambda *_: None, cluster: str | None = None
+) -> Training:
+    """Run all trials that are not in the archive yet, and fit the model.
+
+    Parameters
+    ----------
+    study
+        The study; its folder holds the archive and receives the error model, the
+        fixed set (``fixed.yaml``), a table of all trials (``trials.csv``, ``trials.json``), one of
+        the training sequences (``training.csv``, ``training.json``), and where there are several
+        objectives their Pareto front (``pareto.csv``, ``pareto.json``, ``pareto.png``).
+    progress
+        Called about every finished trial.
+    cluster
+        Address of a Dask scheduler, whose workers run the trials; processes of this machine when
+        left out.
+
+    Raises
+    ------
+    AdaptuneError
+        If a sequence cannot be used, or no set keeps the limits.
+    """
+    study.open()
+    config = study.config.offline
+    if timed := sorted(config.metrics & set(TIMED)):
+        _log.warning(
+            "%s differ from run to run: the same study run again will not find the same sets",
+            " and ".join(timed),
+        )
+    archive = Archive(study.folder / "trials")
+    archive.tidy()
+    n_workers = config.workers or available()
+    where = cluster or f"{n_workers} worker{'s' if n_workers > 1 else ''}"
+    _log.info("trials run on %s; each sequence is prepared before its first one", where)
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    memory = config.memory * 1e9
+    with (
+        Cluster(setup, study.training, memory, cluster)
+        if cluster
+        else Workers(setup, n_workers, memory)
+    ) as workers:
+        verdicts = run_batches(study, archive, workers, progress)
+        fixed = choose_fixed(config, verdicts)
+        sets = {n: verdicts[n].parameters for n in sorted({0, fixed})}
+        whole = _run_whole(study.training, sets, archive, workers, progress)
+    model = _fit(study, archive, verdicts, fixed)
+    model.save(study.model_path)
+    finished = {
+        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
+        for name in study.training
+    }
+    means = {
+        name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
+        for name, trials in finished.items()
+    }
+    write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
+    table = _trial_rows(config, verdicts, finished)
+    report.write_rows(study.folder, "trials", list(table.values()))
+    if len(config.objective) > 1:
+        _write_pareto(study.folder, config.objective, verdicts, table)
+    rows = _training_rows(config, verdicts, finished, fixed, whole)
+    report.write_rows(study.folder, "training", rows)
+    return Training(model, means, fixed, rows)
+
+
+def _fit(
+    study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int
+) -> ErrorModel:
+    """Fit the error model to the trials of all sets that keep the limits."""
+    feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
+    parameters = tuple(verdict.parameters for verdict in feasible.values())
+    sets = ParameterSets(study.odometry.space, tuple(feasible), parameters)
+    run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
+    data = labelled_data(archive, run, sets, study.config, study.window)
+    settings = study.config.offline.model_dump(
+        mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
+    )
+    provenance = {"versions": study.odometry.versions} | settings
+    length = study.config.sub_trajectory
+    model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
+    model = tuned(model, data, study.config.online.switching)
+    return model.thinned(study.config.offline.max_frames)
+
+
+def _trial_rows(
+    config: OfflineConfig, verdicts: Mapping[int, Verdict], finished: Finished
+) -> dict[int, dict[str, Any]]:
+    """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
+    rows: dict[int, dict[str, Any]] = {}
+    for n, verdict in verdicts.items():
+        runs = [finished[name][n] for name in verdict.sequences]
+        row = rows[n] = {"trial": n, **verdict.parameters}
+        if config.metrics != {"rte"}:
+            judged = zip(config.objective, verdict.values, strict=True)
+            row |= {label(weights): value for weights, value in judged}
+            for metric in sorted(config.metrics):
+                row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
+        if config.limits:
+            row["excess"] = verdict.excess
+        if config.repeats > 1:
+            row["margin"] = verdict.margin
+        mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
+        row["mean"] = mean
+        for name, trials in finished.items():
+            row[name] = trials[n].mean_error if n in trials else None
+    return rows
+
+
+def _training_rows(
+    config: OfflineConfig,
+    verdicts: Mapping[int, Verdict],
+    finished: Finished,
+    fixed: int,
+    whole: Mapping[str, tuple[float, float]],
+) -> list[dict[str, Any]]:
+    """A row for every training sequence; its own best set is found as the fixed one is."""
+    rows = []
+    for name, runs in finished.items():
+        best = choose_fixed(config, {n: judge(config, [run]) for n, run in runs.items()})
+        rows.append(
+            {
+                "sequence": name,
+                "baseline": runs[0].mean_error,
+                "fixed": runs[fixed].mean_error,
+                "own best": runs[best].mean_error,
+                "lost, baseline": runs[0].lost,
+                "lost, fixed": runs[fixed].lost,
+                "baseline, whole run": whole[name][0],
+                "fixed, whole run": whole[name][1],
+                "_own best trial": best,
+            }
+            | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
+        )
+    return rows
+
+
+def _write_pareto(
+    folder: Path,
+    objective: Sequence[Mapping[Metric, float]],
+    verdicts: Mapping[int, Verdict],
+    trials: Mapping[int, Mapping[str, Any]],
+) -> None:
+    """Write the sets that keep the limits and that no other set beats in every objective."""
+    feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
+    values = np.array([verdicts[n].values for n in feasible])
+    front = [feasible[i] for i in pareto_front(values)]
+    report.write_rows(folder, "pareto", [trials[n] for n in front])
+    names = [label(weights) for weights in objective]
+    on_front = np.array([verdicts[n].values for n in front])
+    report.draw_front(folder / "pareto.png", names, values, on_front)
+
+
+def _run_whole(
+    names: Sequence[str],
+    sets: Mapping[int, ParameterSet],
+    archive: Archive,
+    workers: Pool[Any],
+    progress: Progress,
+) -> dict[str, tuple[float, float]]:
+    """Mean RTE of baseline and fixed set on the training sequences, in one go from end to end."""
+    tasks = [
+        Task(name, (n,), (parameters,), whole=True)
+        for name in names
+        for n, parameters in sets.items()
+        if not archive.trial_path(name, n, whole=True).exists()
+    ]
+    for done, _ in enumerate(run_tasks(archive, workers, tasks), start=1):
+        progress("whole runs", done, len(tasks), "")
+    baseline, fixed = min(sets), max(sets)
+    means = {
+        (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))
+        for name in names
+        for n in sets
+    }
+    return {name: (means[name, baseline], means[name, fixed]) for name in names}

@@ -1,0 +1,150 @@
+"""Validate a study: find whether adapting would pay in places that it was not trained on."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import report
+from adaptune.archive import Archive
+from adaptune.model import ErrorModel, ModelError
+from adaptune.model.paired import ERROR_FLOOR
+from offline.curves import bank_curve, learning_curve
+from offline.labelled import labelled_data
+from offline.leave_one_out import Interval, Validation, leave_one_out
+from offline.offline_study import OfflineStudy
+
+
+class Validated(NamedTuple):
+    """Result of `validate`.
+
+    Attributes
+    ----------
+    validation : Validation
+    rows : list of dict
+        Ratio to the fixed set's error of every mode on every sequence left out.
+    learning, banks : list of dict
+        See `learning_curve` and `bank_curve`; empty where they were not asked for.
+    """
+
+    validation: Validation
+    rows: list[dict[str, Any]]
+    learning: list[dict[str, Any]]
+    banks: list[dict[str, Any]]
+
+
+def validate(
+    study: OfflineStudy,
+    curve: bool = False,
+    sizes: bool = False,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> Validated:
+    """Validate the selection rules on a study's training sequences.
+
+    Parameters
+    ----------
+    study
+        A study that the offline stage has finished; its folder receives ``validation.csv``,
+        ``validation.json`` and ``validation.png``, and its model the summary.
+    curve
+        Compute, too, what fewer training sequences would gain: ``learning.csv``, ``learning.json``.
+    sizes
+        Compute, too, what banks of other sizes would gain: ``banks.csv``, ``banks.json``.
+    progress
+        Called with what is done, and about every sequence.
+
+    Raises
+    ------
+    ModelError
+        If there is no model yet, or it is not this study's.
+    ValidationError
+        If there is only one training sequence.
+    """
+    model = _checked_model(study)
+    complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
+    sets = model.sets.subset([model.sets.trials[column] for column in complete])
+    run = {name: list(sets) for name in model.sequences}
+    archive = Archive(study.folder / "trials")
+    data = labelled_data(archive, run, sets, study.config, study.window)
+    switching = study.config.online.switching
+    named = switching.sets is not None and set(model.bank) <= set(sets)
+    bank = model.bank if named else switching.size
+
+    def stage(what: str) -> Callable[[int, int], None]:
+        return lambda done, total: progress(what, done, total)
+
+    validation = leave_one_out(data, progress=stage("sequences left out"), bank=bank)
+    rows = _rows(validation)
+    report.write_rows(study.folder, "validation", rows)
+    learning = banks = []
+    if curve:
+        learning = learning_curve(data, progress=stage("learning curve"), bank=bank)
+        report.write_rows(study.folder, "learning", learning)
+    if sizes:
+        banks = bank_curve(data, stage("sizes of banks"))
+        report.write_rows(study.folder, "banks", banks)
+    report.draw_validation(
+        study.folder / "validation.png",
+        study.name,
+        validation.ratios,
+        [s.name for s in validation.left_out],
+        *_by_familiarity(validation),
+        validation.portfolio(),
+        learning,
+        banks,
+    )
+    found = {mode: validation.summary(mode) for mode in validation.modes}
+    replace(model, validation=found).save(study.model_path)
+    return Validated(validation, rows, learning, banks)
+
+
+def _checked_model(study: OfflineStudy) -> ErrorModel:
+    path = study.model_path
+    model = ErrorModel.load(path)
+    model.check_study(study.odometry.identity, study.odometry.space, path)
+    if (study.training, study.window) != (model.sequences, model.window):
+        raise ModelError(
+            f"{path}: was fitted to other training sequences or descriptors than the study's; run "
+            f"`adaptune offline` again"
+        )
+    return model
+
+
+def _rows(validation: Validation) -> list[dict[str, Any]]:
+    """Ratios to the fixed set's error, and the intervals of the default rule's."""
+    default = validation.default
+    modes = [mode for mode in validation.ratios if mode != "fixed"]
+    rows: list[dict[str, Any]] = []
+
+    def add(name: str, fixed: float | None, of: dict[str, float], interval: Interval) -> None:
+        rows.append({"left out": name, "fixed [%]": fixed})
+        for mode in modes:
+            rows[-1][mode] = of[mode]
+            if mode == default:
+                ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
+                rows[-1][f"{mode}, 95 %"] = ends
+
+    for i, sequence in enumerate(validation.left_out):
+        of = {mode: float(validation.ratios[mode][i]) for mode in modes}
+        add(sequence.name, sequence.errors["fixed"].mean(), of, sequence.interval(default))
+    summaries = {mode: validation.summary(mode) for mode in modes}
+    for key in ("geometric", "arithmetic", "worst"):
+        ends = summaries[default]["low"], summaries[default]["high"]
+        of = {mode: summaries[mode][key] for mode in modes}
+        add(key, None, of, ends if key == "geometric" else None)
+    return rows
+
+
+def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Familiarity of every frame left out, and its error by the default rule over the fixed's."""
+    rule = validation.default
+    familiarity = np.concatenate([s.familiarity for s in validation.left_out])
+    ratio = np.concatenate(
+        [
+            (s.errors[rule] + ERROR_FLOOR) / (s.errors["fixed"] + ERROR_FLOOR)
+            for s in validation.left_out
+        ]
+    )
+    return familiarity, ratio

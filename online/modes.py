@@ -1,0 +1,169 @@
+"""The modes of a replay: baseline, fixed, and adaptive by each selection rule."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import OdometryInstance, WarmUp
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.hand_over import HandOver
+from adaptune.selector import Selector
+from adaptune.space import ParameterSet
+from adaptune.study.config import SwitchingConfig
+from adaptune.study.study import Mechanism, Study
+
+
+class ModeError(AdaptuneError):
+    """A mode that the model does not allow."""
+
+
+class Mode(NamedTuple):
+    """What runs along a recording, and what chooses its parameters, if anything does."""
+
+    odometry: OdometryInstance
+    selector: Selector | None
+
+
+@dataclass(frozen=True)
+class ReplaySetup:
+    """What a replay depends on, besides the recording and the model.
+
+    Attributes
+    ----------
+    odometry : OdometryFactory
+    rules : tuple of str
+        Selection rules to compare.
+    switching : SwitchingConfig
+    mechanism : str
+        How the odometry changes its parameters.
+    warm_up : WarmUp
+    lost_track : float
+        Metres a second by which the members of a bank may differ and agree.
+    switch_cost : float
+        What a switch must promise, as a share of the fixed set's error.
+    """
+
+    odometry: OdometryFactory
+    rules: tuple[str, ...]
+    switching: SwitchingConfig
+    mechanism: Mechanism
+    warm_up: WarmUp
+    lost_track: float
+    switch_cost: float
+
+    @classmethod
+    def of(cls, study: Study) -> Self:
+        """The setup of a study."""
+        config = study.config
+        return cls(
+            study.odometry,
+            study.rules,
+            config.online.switching,
+            study.mechanism,
+            study.warm_up,
+            config.lost_track,
+            study.switch_cost(),
+        )
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """What is compared: baseline, fixed, and each selection rule."""
+        return ("baseline", "fixed", *self.rules)
+
+    def identity(self, mode: str) -> dict[str, Any] | None:
+        """What an adaptive mode depends on, as plain data; None for baseline and fixed."""
+        if mode not in self.rules:
+            return None
+        used = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
+        settings = self.switching.model_dump(mode="json", include=used[self.mechanism])
+        if self.mechanism != "live":
+            settings["warm_up"] = self.warm_up._asdict()
+        if self.mechanism != "bank":
+            settings["switch_cost"] = self.switch_cost
+        return {"mechanism": self.mechanism} | settings
+
+    def parameters(self, mode: str, model: ErrorModel) -> ParameterSet | None:
+        """The parameters of baseline and fixed, which stay; None for adaptive modes."""
+        constant = {"baseline": self.odometry.space.baseline, "fixed": model.sets[model.fixed]}
+        return constant.get(mode)
+
+    def start(self, mode: str, model: ErrorModel, sequence: str | None = None) -> Mode:
+        """Make a new odometry, or a bank, and its selector.
+
+        Parameters
+        ----------
+        mode
+            One of `modes`.
+        model
+            The error model.
+        sequence
+            Name of the recording; a program that reads whole recordings needs it.
+
+        Raises
+        ------
+        ModeError
+            If the model does not go with the study's bank.
+        """
+        if mode not in self.rules:
+            return Mode(self.odometry(self.parameters(mode, model), sequence), None)
+        if self.mechanism == "bank" and (mode != "paired" or model.bank_adapts):
+            sets = self.members(model)
+            bank = Bank(self.odometry, sets, self.warm_up, self.lost_track)
+            return Mode(bank, Selector(model, mode, list(sets)))
+        fixed = model.sets[model.fixed]
+        selector = Selector(model, mode, (), self.switch_cost)
+        # A bank that was not shown to pay would only cost.
+        if self.mechanism != "hand_over" and self.odometry.description.live:
+            return Mode(self.odometry(fixed), selector)
+        scans = self.switching.catch_up_scans
+        return Mode(HandOver(self.odometry, fixed, self.warm_up, scans), selector)
+
+    def members(self, model: ErrorModel) -> dict[int, ParameterSet]:
+        """The members of the study's bank by their trial numbers, the fixed set first.
+
+        Raises
+        ------
+        ModeError
+            If the study names a set that the model does not know, or one twice, or the model was
+            fitted for another bank.
+        """
+        if self.switching.sets is None:
+            size = self.switching.size
+            complete = int((~np.isnan(model.errors).any(axis=0)).sum())
+            if len(model.bank) < min(size, complete):
+                raise _another_bank("size")
+            if model.bank[0] != model.fixed:
+                raise _another_bank("sets")
+            return {trial: model.sets[trial] for trial in model.bank[:size]}
+        members: dict[int, ParameterSet] = {}
+        for i, named in enumerate(self.switching.sets):
+            trial = model.trial(named)
+            where = f"online.switching.sets.{i}"
+            if trial is None:
+                raise ModeError(
+                    f"{where}: is none of the {len(model.sets)} parameter sets of the model, so "
+                    f"its errors are unknown; name the number of a trial, or the parameters of one "
+                    f"(trials.csv lists them)"
+                )
+            if trial in members:
+                raise ModeError(f"{where}: is in the bank already")
+            if np.isnan(model.errors[:, model.sets.column(trial)]).any():
+                raise ModeError(
+                    f"{where}: was not run on every training sequence, so it cannot be compared "
+                    f"with the others; name another set (trials.csv lists them)"
+                )
+            members[trial] = model.sets[trial]
+        if list(members) != model.bank:
+            raise _another_bank("sets")
+        return members
+
+
+def _another_bank(key: str) -> ModeError:
+    return ModeError(
+        f"online.switching.{key}: the model was fitted for another bank; run `adaptune offline` "
+        f"again, which fits it to the finished trials"
+    )

@@ -1,0 +1,151 @@
+"""The online stage: replay the test sequences in every mode."""
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from adaptune.descriptor.base import DescriptorError
+from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.selection import Selection
+from adaptune.study.study import Study
+from adaptune.trajectory import Trajectory, write_tum
+from online.modes import ReplaySetup
+from online.replay import replay
+from online.stored_replays import ReplayIdentity, is_current, write_replay
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is."""
+
+SCANT = 1.5
+"""Training sequences below which a selection rests on hardly more than one."""
+
+_log = logging.getLogger(__name__)
+
+
+class ReplayError(AdaptuneError):
+    """A study that cannot be replayed."""
+
+
+def run_replays(
+    study: Study, model_path: Path, again: bool = False, progress: Progress = lambda *_: None
+) -> int:
+    """Replay every test sequence in every mode, unless that was done before.
+
+    Parameters
+    ----------
+    study
+        The study; ``replays/<sequence>/<mode>`` in its folder receives the results.
+    model_path
+        The error model.
+    again
+        Replay even what was done before.
+    progress
+        Called about every scan.
+
+    Returns
+    -------
+    int
+        Number of replays that were made.
+
+    Raises
+    ------
+    AdaptuneError
+        If there is no test sequence, or the model is of another odometry or other parameters.
+    """
+    model = ErrorModel.load(model_path)
+    model.check_study(study.odometry.identity, study.odometry.space, model_path)
+    setup = ReplaySetup.of(study)
+    # The set that adaptive modes begin with.
+    fixed = next(iter(setup.members(model))) if setup.mechanism == "bank" else model.fixed
+    if not study.config.test:
+        raise ReplayError("test: name at least one sequence to replay")
+    study.open()
+    digest = model.digest
+    made = 0
+    for name in study.config.test:
+        folder = study.folder / "replays" / name
+        about = {mode: identity(study, setup, model, name, mode, digest) for mode in setup.modes}
+        due = [mode for mode in setup.modes if again or not is_current(folder / mode, about[mode])]
+        if not due:
+            continue
+        sequence = study.sequences.open(name)
+        for mode in due:
+            what, n = f"{name}, {mode}", sequence.n_messages
+            odometry, selector = setup.start(mode, model, name)
+            step = _counter(progress, what, n)
+            health, period = study.config.health, study.config.online.period
+            try:
+                result = replay(sequence, odometry, health, selector, period, step)
+            except DescriptorError as error:
+                raise ReplayError(f"sequences.{name}: {error}") from error
+            finally:
+                odometry.close()
+            progress(what, n, n)
+            if mode == due[0]:
+                _write_reference(folder, sequence.reference(), result.trajectory)
+            write_replay(folder / mode, result, about[mode])
+            warn_of_scant_evidence(what, [choice.selection for choice in result.choices], fixed)
+        made += len(due)
+    return made
+
+
+def _counter(progress: Progress, what: str, n: int) -> Callable[[], None]:
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        progress(what, done, n)
+
+    return step
+
+
+def warn_of_scant_evidence(what: str, selections: Sequence[Selection], fixed: int) -> None:
+    """Warn of selections that rest on hardly more than one training sequence."""
+    left = [s for s in selections if s.trial != fixed]
+    few = sum(s.n_sequences < SCANT for s in left)
+    if few:
+        _log.warning(
+            "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
+            "one training sequence (see selections.csv); more sequences would show whether they "
+            "hold",
+            what,
+            few,
+            len(left),
+        )
+
+
+def identity(
+    study: Study, setup: ReplaySetup, model: ErrorModel | None, name: str, mode: str, digest: str
+) -> ReplayIdentity:
+    """All that a replay depends on; without a model, only what all modes share."""
+    parameters = None if model is None else setup.parameters(mode, model)
+    return ReplayIdentity(
+        mode=mode,
+        parameters=parameters,
+        model=None if parameters else digest,
+        switching=None if parameters else setup.identity(mode),
+        period=study.config.online.period,
+        odometry=study.config.odometry.model_dump(mode="json"),
+        health=study.config.health.model_dump(mode="json"),
+        **study.sequences.identity(name),
+    )
+
+
+def _write_reference(folder: Path, reference: Trajectory | None, odometry: Trajectory) -> None:
+    """Write ``reference.tum``, at the scans' stamps; remove it if there is none."""
+    path = folder / "reference.tum"
+    if reference is None:
+        path.unlink(missing_ok=True)
+        return
+    T = reference.at(odometry.stamps)
+    known = ~np.isnan(T[:, 0, 0])
+    if not known.any():
+        raise ReplayError(
+            f"{folder.name}: the reference does not overlap the scans in time; check that both are "
+            f"of the same recording and clock"
+        )
+    write_tum(path, Trajectory(odometry.stamps[known], T[known]))

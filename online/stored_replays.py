@@ -1,0 +1,263 @@
+"""Replays on disk: trajectory, selections, frames, and what they were made from."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from adaptune.errors import AdaptuneError
+from adaptune.files import replacing, write_text
+from adaptune.trajectory import Trajectory, read_tum, write_tum
+from online.replay import Replay
+
+
+class StoredReplayError(AdaptuneError):
+    """A replay that is missing or damaged."""
+
+
+class ReplayIdentity(BaseModel):
+    """All that a replay depends on.
+
+    Attributes
+    ----------
+    mode : str
+    parameters : dict or None
+        Of a mode that keeps them.
+    model : str or None
+        Digest of the model, of an adaptive mode.
+    switching : dict or None
+        See `online.modes.ReplaySetup.identity`.
+    period : float
+        Seconds.
+    odometry, health, sequence, course, recording
+        Their configuration, and the sizes of the recording's files.
+    """
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
+
+    mode: str
+    parameters: dict[str, Any] | None
+    model: str | None
+    switching: dict[str, Any] | None
+    period: float
+    odometry: dict[str, Any]
+    health: dict[str, Any]
+    sequence: dict[str, Any]
+    course: dict[str, Any] | None
+    recording: list[int] | None
+
+    def differences(self, other: Self) -> list[str]:
+        """What differs in the settings that all modes of a sequence share."""
+        own = ("mode", "parameters", "model", "switching")
+        keys = [key for key in type(self).model_fields if key not in own]
+        return [key for key in keys if getattr(self, key) != getattr(other, key)]
+
+
+class ReplaySummary(BaseModel):
+    """The content of ``replay.json``.
+
+    Attributes
+    ----------
+    scans, selections : int
+    duration_s, replay_s : float
+        Of the recording, and of its replay.
+    restarts : int
+        How often the health check restarted the odometry.
+    unhealthy : dict
+        How often the health check found what.
+    poor_scans : int
+        Scans that were too poor to register.
+    about : ReplayIdentity
+    """
+
+    scans: int
+    duration_s: float
+    replay_s: float
+    restarts: int
+    unhealthy: dict[str, int]
+    poor_scans: int
+    selections: int
+    about: ReplayIdentity
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read ``replay.json``. All files of a replay are there, for this one is written last.
+
+        Raises
+        ------
+        StoredReplayError
+        """
+        path = folder / "replay.json"
+        if not path.exists():
+            raise StoredReplayError(
+                f"{folder}: there is no replay; run `adaptune online` with this study first"
+            )
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError) as error:
+            raise _damaged(path, error) from error
+
+
+def is_current(folder: Path, about: ReplayIdentity) -> bool:
+    """Whether a folder holds a replay of just this."""
+    try:
+        return ReplaySummary.read(folder).about == about
+    except StoredReplayError:
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class StoredReplay:
+    """A replay as it was stored.
+
+    Attributes
+    ----------
+    summary : ReplaySummary
+    trajectory : Trajectory
+    restarted : ndarray of shape (n,)
+        Frames at which the health check restarted the odometry.
+    choice_stamps : ndarray of shape (m,)
+        Nanoseconds, of the scans that selections were made from; the first one of a mode that
+        keeps its parameters.
+    choices : dict
+        For every parameter its values, of shape (m,).
+    """
+
+    summary: ReplaySummary
+    trajectory: Trajectory
+    restarted: NDArray[np.bool_]
+    choice_stamps: NDArray[np.int64]
+    choices: dict[str, Sequence[Any]]
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read what `write_replay` wrote.
+
+        Raises
+        ------
+        StoredReplayError
+            If a file is missing or damaged.
+        """
+        summary = ReplaySummary.read(folder)
+        trajectory = read_tum(folder / "trajectory.tum")
+        restarted = _columns(folder / "frames.csv").get("restarted", [])
+        if len(restarted) != len(trajectory):
+            raise _damaged(folder / "frames.csv", ValueError("not a row for every scan"))
+        stamps, choices = _choices(folder / "selections.csv")
+        if not len(stamps):
+            stamps = trajectory.stamps[:1]
+            choices = {name: [value] for name, value in (summary.about.parameters or {}).items()}
+        return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices)
+
+
+def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
+    """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    replay
+        The replay.
+    about
+        What it was made from.
+    """
+    write_tum(folder / "trajectory.tum", replay.trajectory)
+    _write_selections(folder / "selections.csv", replay)
+    columns = {
+        "stamp_ns": replay.trajectory.stamps,
+        "registered": replay.registered.astype(int),
+        "restarted": replay.restarted.astype(int),
+        "prepare_ms": np.round(1e3 * replay.prepare_seconds, 3),
+        "register_ms": np.round(1e3 * replay.register_seconds, 3),
+    }
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    _write_csv(folder / "frames.csv", list(columns), rows)
+    stamps = replay.trajectory.stamps
+    summary = ReplaySummary(
+        scans=len(stamps),
+        duration_s=round(float(stamps[-1] - stamps[0]) * 1e-9, 3),
+        replay_s=round(replay.seconds, 3),
+        restarts=int(replay.restarted.sum()),
+        unhealthy=replay.unhealthy,
+        poor_scans=int((~replay.registered).sum()),
+        selections=len(replay.choices),
+        about=about,
+    )
+    write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
+
+
+_SELECTION = (
+    "stamp_ns",
+    "trial",
+    "predicted_error_percent",
+    "predicted_fixed_percent",
+    "familiarity",
+    "sequences",
+    "weights",
+    "ms",
+)
+"""Columns of ``selections.csv`` before the parameters."""
+
+
+def _write_selections(path: Path, replay: Replay) -> None:
+    names = list(replay.choices[0].selection.parameters) if replay.choices else []
+    rows = []
+    for stamp, selection, seconds in replay.choices:
+        numbers = (
+            selection.predicted_error,
+            selection.predicted_fixed,
+            selection.familiarity,
+            selection.n_sequences,
+        )
+        weights = (selection.weights or {}).items()
+        rows.append(
+            [stamp, selection.trial, *(f"{x:.4f}" for x in numbers)]
+            + [" ".join(f"{trial}:{weight:.3f}" for trial, weight in weights)]
+            + [f"{1e3 * seconds:.3f}"]
+            + [selection.parameters[name] for name in names]
+        )
+    _write_csv(path, [*_SELECTION, *names], rows)
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _choices(path: Path) -> tuple[NDArray[np.int64], dict[str, Sequence[Any]]]:
+    columns = _columns(path)
+    try:
+        stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
+    except (TypeError, ValueError) as error:
+        raise _damaged(path, error) from error
+    parameters = {name: v for name, v in columns.items() if name not in _SELECTION}
+    return stamps, {name: _numbers(values) for name, values in parameters.items()}
+
+
+def _columns(path: Path) -> dict[str, list[str]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise _damaged(path, error) from error
+    return {key: [row[key] for row in rows] for key in (rows[0] if rows else {})}
+
+
+def _numbers(values: Sequence[str]) -> list[Any]:
+    try:
+        return [float(value) for value in values]
+    except ValueError:
+        return list(values)
+
+
+def _damaged(path: Path, error: Exception) -> StoredReplayError:
+    what = " ".join(str(error).split())
+    return StoredReplayError(f"{path}: is damaged ({what}); run `adaptune online --again`")

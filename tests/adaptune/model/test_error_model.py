@@ -1,0 +1,444 @@
+"""The error model as a file."""
+
+import dataclasses
+import json
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.numpy import save_file
+
+from adaptune.model import RULES, BankSettings, ErrorModel, ModelError, make_rule
+from adaptune.model.model_file import FORMAT, digest
+from adaptune.parameter_sets import ParameterSets
+from adaptune.space import Categorical, Float, Integer, ParameterSpace
+
+SPACE = ParameterSpace(
+    {
+        "distance": Float(low=1.0, high=10.0, baseline=4.0, log=True),
+        "points": Integer(low=1, high=50, baseline=20),
+        "kernel": Categorical(choices=("none", 1, True), baseline="none"),
+    }
+)
+
+
+TRIALS = (0, 2, 4, 6, 8, 10)
+
+
+def random_model(seed=0, n_frames=50, n_sets=6):
+    rng = np.random.default_rng(seed)
+    errors = rng.gamma(1.0, 2.0, (n_frames, n_sets)).astype(np.float32)
+    errors[rng.random(errors.shape) < 0.05] = np.inf
+    return ErrorModel(
+        odometry={"name": "gicp", "settings": {"downsampling": 0.1 + 0.2}},
+        sets=ParameterSets(SPACE, TRIALS[:n_sets], tuple(SPACE.from_unit(rng.random((n_sets, 3))))),
+        fixed=4,
+        length=25.0,
+        sequences=["cave", "Straße"],
+        blocks={"ndt": 90},
+        window=1,
+        descriptors=rng.integers(0, 500, (n_frames, 90)).astype(np.float32),
+        sequence=rng.integers(0, 2, n_frames),
+        errors=errors,
+        bank=[4, 10],
+        vectors=rng.normal(0.0, 1.0, (n_frames, 2, 3)).astype(np.float32),
+        provenance={"seed": n_sets, "note": None},
+        elevations=[-30.7, -15.0],
+    )
+
+
+def test_knows_the_sensors_of_its_training():
+    model = dataclasses.replace(random_model(), elevations=[-30.7, -15.0])
+    assert [model.is_foreign(e) for e in (-33.0, -25.0, -16.0, 0.0)] == [False, True, False, True]
+    model = dataclasses.replace(model, elevations=[])
+    assert not model.is_foreign(0.0)  # where nothing is known, nothing is said
+
+
+def test_views_are_of_one_place():
+    model = dataclasses.replace(random_model(), sequences=["b", "b+mirrored"])
+    data = model.training_data(model.pca())
+    assert not data.sequence.any()
+    assert (data.fixed, data.candidates) == (4, None)
+    data = model.training_data(model.pca(), [10, 4])
+    assert (data.fixed, data.candidates) == (10, (10, 4))
+    np.testing.assert_array_equal(data.vectors, model.vectors[:, ::-1])
+    apart = random_model()
+    assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
+
+
+@given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 70))
+def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
+    model = dataclasses.replace(
+        random_model(n_frames=n + m),
+        sequence=np.repeat([0, 1], [n, m]),
+        errors=np.tile(np.arange(n + m, dtype=np.float32)[:, None], 6),
+    )
+    assert model.thinned(None) is model
+    few = model.thinned(most)
+    few.check()
+    kept = few.errors[:, 0].astype(int)
+    near = max(1, round(300 * len(kept) / (n + m)))
+    assert few.paired == model.paired.model_copy(update={"n_frames": near})
+    settings = BankSettings(n_frames=1000)
+    wide = dataclasses.replace(model, bank_settings=settings).thinned(most)
+    if wide is not model and len(kept) < n + m:
+        assert wide.bank_settings.n_frames == max(1, round(1000 * len(kept) / (n + m)))
+    np.testing.assert_array_equal(few.sequence, model.sequence[kept])
+    np.testing.assert_array_equal(few.descriptors, model.descriptors[kept])
+    if most >= n + m:
+        assert few is model
+        return
+    for s, length in enumerate((n, m)):
+        share = max(1, most * length // (n + m))
+        own = kept[few.sequence == s] - s * n
+        assert len(own) == share
+        gaps = np.diff([-own[0] - 1, *own, 2 * length - own[-1]])
+        assert gaps.max() - gaps.min() <= 2
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(ErrorModel):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        elif field.name == "sets":
+            assert (x.space, x.trials) == (y.space, y.trials)
+            assert repr(x.parameters) == repr(y.parameters)
+        else:
+            assert repr(x) == repr(y)
+
+
+def saved(folder, **changes):
+    path = folder / "model.safetensors"
+    dataclasses.replace(random_model(), **changes).save(path)
+    return path
+
+
+def rewrite(path, arrays=None, text=None, **header):
+    """Change parts of a file as somebody could who knows the format."""
+    with safe_open(path, "np") as file:
+        said = json.loads(file.metadata()["adaptune"]) | (text or {})
+        parts = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    parts |= arrays or {}
+    said["header"] |= header
+    said["digest"] = digest(said["header"], parts)
+    parts = {name: np.ascontiguousarray(part) for name, part in parts.items()}
+    save_file(parts, path, {"adaptune": json.dumps(said)})
+
+
+def refused(path):
+    """The message, which must name the file."""
+    with pytest.raises(ModelError) as caught:
+        ErrorModel.load(path)
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_model_survives_bit_for_bit(tmp_path):
+    model = random_model()
+    path = saved(tmp_path)
+    loaded = ErrorModel.load(path)
+    assert_same(loaded, model)
+    assert list(tmp_path.iterdir()) == [path]
+    loaded.save(tmp_path / "again.safetensors")
+    assert_same(ErrorModel.load(tmp_path / "again.safetensors"), model)
+
+
+def test_a_loaded_model_chooses_as_the_saved_one_did(tmp_path):
+    model, loaded = random_model(), ErrorModel.load(saved(tmp_path))
+    np.testing.assert_array_equal(loaded.pca().components_, model.pca().components_)
+    for name in RULES:
+        a, b = (make_rule(name, m.paired).fit(m.training_data(m.pca())) for m in (model, loaded))
+        for feature in np.random.default_rng(1).normal(size=(5, 10)):
+            np.testing.assert_array_equal(a.predict(feature), b.predict(feature))
+            assert repr(a.select(feature)) == repr(b.select(feature))
+
+
+def test_training_data_is_the_model_in_numbers():
+    model = random_model()
+    pca = model.pca()
+    data = model.training_data(pca)
+    np.testing.assert_array_equal(data.features, pca.transform(model.descriptors))
+    assert data.sets is model.sets
+    np.testing.assert_array_equal(data.errors, model.errors)
+    np.testing.assert_array_equal(data.sequence, model.sequence)
+    assert data.fixed == 4
+
+
+def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_path):
+    model = random_model()
+    model.errors[model.sequence == 1, 3:] = np.nan
+    model = dataclasses.replace(
+        model,
+        blocks={"mine:shape": 88, "two": 2},
+        window=3,
+        descriptors=np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
+        validation={"paired": {"geometric": 0.6, "verdict": "Adapt."}},
+    )
+    model.save(tmp_path / "model.safetensors")
+    assert_same(ErrorModel.load(tmp_path / "model.safetensors"), model)
+
+
+def test_the_digest_is_of_what_selections_depend_on(tmp_path):
+    model = random_model()
+    assert ErrorModel.load(saved(tmp_path)).digest == model.digest
+    for same in ({"validation": {"paired": {}}}, {"provenance": {}}):
+        assert dataclasses.replace(model, **same).digest == model.digest
+    errors = model.errors.copy()
+    errors[3, 4] += 1
+    for other in ({"fixed": 0}, {"window": 2}, {"errors": errors}, {"blocks": {"mine": 90}}):
+        assert dataclasses.replace(model, **other).digest != model.digest
+
+
+def test_a_missing_model(tmp_path):
+    assert "there is no such model" in refused(tmp_path / "model.safetensors")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.99, 0.9999])
+def test_a_file_cut_short_is_refused(tmp_path, share):
+    path = saved(tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    refused(path)
+
+
+def flipped(tmp_path, places):
+    """Flip the bits at `places`, one after the other; how many of them were refused."""
+    path, model = saved(tmp_path), random_model()
+    data = path.read_bytes()
+    count = 0
+    for place in places:
+        byte, bit = divmod(place % (8 * len(data)), 8)
+        harmed = bytearray(data)
+        harmed[byte] ^= 1 << bit
+        path.write_bytes(harmed)
+        try:
+            loaded = ErrorModel.load(path)
+        except ModelError:
+            count += 1
+        else:
+            # Spaces and commas in the text may change without a consequence.
+            assert_same(loaded, model)
+    return count
+
+
+def test_a_flipped_bit_is_refused_or_means_nothing(tmp_path):
+    size = 8 * saved(tmp_path).stat().st_size
+    places = np.random.default_rng(0).integers(0, size, 300).tolist()
+    assert flipped(tmp_path, places) > 290
+    assert flipped(tmp_path, range(0, 8 * 400, 3)) > 1000
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"distance: 3\n", b"PK\x03\x04", bytes(1000), b"\xff" * 1000]
+)
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(content)
+    refused(path)
+
+
+def test_other_archives_and_arrays_are_refused(tmp_path):
+    path = tmp_path / "model.safetensors"
+    save_file({"stamps": np.arange(3)}, path)
+    refused(path)
+    np.savez(tmp_path / "model.npz", stamps=np.arange(3))
+    refused(tmp_path / "model.npz")
+    np.save(tmp_path / "array.npy", np.arange(3))
+    refused(tmp_path / "array.npy")
+    refused(tmp_path)
+
+
+class Trap:
+    """Reports that it is unpickled."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was loaded",))
+
+
+def test_a_pickle_is_refused(tmp_path):
+    path = tmp_path / "model.safetensors"
+    with path.open("wb") as file:
+        np.save(file, np.array([Trap()], object), allow_pickle=True)
+    refused(path)
+
+
+def test_an_older_format_is_refused_by_name(tmp_path):
+    path = saved(tmp_path)
+    rewrite(path, text={"version": "0.0.1", "format": FORMAT - 1})
+    assert "older adaptune (0.0.1)" in refused(path)
+
+
+def test_a_newer_format_is_refused_by_name(tmp_path):
+    path = saved(tmp_path)
+    rewrite(path, text={"version": "7.8.9", "format": FORMAT + 1})
+    message = refused(path)
+    assert "7.8.9" in message
+    assert "newer" in message
+
+
+def test_what_a_newer_file_adds_does_not_hurt_while_the_format_is_the_same(tmp_path):
+    path = saved(tmp_path)
+    rewrite(path, {"extra": np.arange(3)}, remark="hello")
+    assert_same(ErrorModel.load(path), random_model())
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"fixed": 1},
+        {"fixed": -1},
+        {"fixed": None},
+        {"trials": [0, 2, 4, 6, 8]},
+        {"trials": [0, 2, 4, 6, 8, 8]},
+        {"bank": [4, 5]},
+        {"bank": [4, 4]},
+        {"sequences": ["cave"]},
+        {"sets": [{"distance": 4.0, "points": 3, "kernel": "none"}] * 5},
+        {"sets": [{"distance": 4.0, "points": 3, "kernel": "none"}] * 5 + [{"distance": 4.0}]},
+        {"sets": [{"distance": 99.0, "points": 3, "kernel": "none"}] * 6},
+        {"space": {"distance": {"type": "float", "low": 3}}},
+        {"space": {}},
+        {"length": 0.0},
+        {"length": "25"},
+        {"length": float("nan")},
+        {"blocks": {"ndt": 80}},
+        {"blocks": {"ndt": 90, "more": 0}},
+        {"blocks": {"ndt": 90.0}},
+        {"window": 0},
+        {"sequences": "ab"},
+        {"provenance": []},
+        {"sets": [[1]] * 6},
+        {"odometry": None},
+    ],
+)
+def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
+    path = saved(tmp_path)
+    rewrite(path, **header)
+    refused(path)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"descriptors": np.zeros((49, 90), np.uint16)},
+        {"descriptors": np.zeros((50, 80), np.uint16)},
+        {"sequence": np.zeros(49, np.uint32)},
+        {"sequence": np.full(50, 2, np.uint32)},
+        {"errors": np.zeros((50, 5), np.float32)},
+        {"errors": np.zeros(50, np.float32)},
+        {"errors": np.full((50, 6), np.nan, np.float32)},
+        {"errors": np.full((50, 6), -1.0, np.float32)},
+        {"errors": np.zeros((50, 6))},
+        {"descriptors": np.full((50, 90), np.nan, np.float32)},
+        {"errors": np.zeros((50, 6), np.int32)},
+    ],
+)
+def test_arrays_that_do_not_go_together_are_refused(tmp_path, arrays):
+    path = saved(tmp_path)
+    rewrite(path, arrays)
+    refused(path)
+
+
+def test_an_empty_model_is_refused(tmp_path):
+    path = saved(
+        tmp_path,
+        descriptors=np.zeros((0, 90), np.float32),
+        sequence=np.zeros(0, int),
+        errors=np.zeros((0, 6), np.float32),
+    )
+    refused(path)
+
+
+@pytest.mark.parametrize("name", ["model", "model.v2", "model.bin"])
+def test_a_model_keeps_the_name_it_is_given(tmp_path, name):
+    path = tmp_path / name
+    random_model().save(path)
+    assert list(tmp_path.iterdir()) == [path]
+    assert_same(ErrorModel.load(path), random_model())
+
+
+def peak(path):
+    """Bytes taken at most while a file is loaded, or refused."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ModelError):
+            ErrorModel.load(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "shape", [[10**6, 10**6], [2**31, 2], [-1, 6], [2**64, 2**64], [50, 7], [300], [], [50, 0]]
+)
+def test_shapes_that_the_file_does_not_bear_out_are_refused(tmp_path, shape):
+    path = saved(tmp_path)
+    content = path.read_bytes()
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + size])
+    header["errors"]["shape"] = shape
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + size :])
+    assert peak(path) < 2_000_000
+
+
+@pytest.mark.parametrize("size", [0, 1, 10**6, 2**31, 2**63, 2**64 - 1])
+def test_a_header_that_is_said_to_be_longer_than_the_file_is_refused(tmp_path, size):
+    path = saved(tmp_path)
+    path.write_bytes(size.to_bytes(8, "little") + path.read_bytes()[8:])
+    assert peak(path) < 2_000_000
+
+
+def attempt(path):
+    """A model, or the sentence that refuses it, in which the file is named."""
+    try:
+        return ErrorModel.load(path), str(path)
+    except ModelError as error:
+        return None, str(error)
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+def test_whatever_happens_to_the_bytes_a_sentence_is_all_that_comes_of_it(tmp_path, data):
+    path = saved(tmp_path)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        # Most of a file is numbers: its header is where it is fragile.
+        at = data.draw(st.integers(0, len(content)) | st.integers(0, 700))
+        length = data.draw(st.integers(0, 40))
+        content[at : at + length] = data.draw(st.binary(max_size=40))
+    path.write_bytes(content)
+    tracemalloc.start()
+    loaded, message = attempt(path)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert taken < 4_000_000
+    assert str(path) in message
+    assert "\n" not in message
+    if loaded is not None:
+        assert_same(loaded, random_model())
+
+
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+def test_any_header_is_understood_or_refused(tmp_path, data):
+    """The digest keeps damage away from the header; here somebody computes it again."""
+    path = saved(tmp_path)
+    json_values = st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+        max_leaves=5,
+    )
+    keys = ["space", "trials", "sets", "bank", "fixed", "length", "sequences", "blocks", "window"]
+    rewrite(path, **{data.draw(st.sampled_from(keys)): data.draw(json_values)})
+    _, message = attempt(path)
+    assert str(path) in message

@@ -1,0 +1,163 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adaptune.archive import Frames, Trial
+from adaptune.geometry import invert, steps
+from adaptune.metrics import sub_trajectory_rte
+from adaptune.odometry import Odometry, WarmUp
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import Registration
+from adaptune.selection import Selection
+from adaptune.sequence import Scan
+from adaptune.space import Float, ParameterSpace
+from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
+
+N = 60
+LENGTH = 5.0
+
+
+def straight(scales):
+    """Poses along x, each step as long as it says."""
+    T = np.tile(np.eye(4), (N, 1, 1))
+    T[1:, 0, 3] = np.cumsum(np.broadcast_to(scales, N - 1))
+    return T
+
+
+def frames():
+    return Frames(
+        np.arange(N, dtype=np.int64) * 10**8,
+        straight(0.3),
+        np.zeros((N, 90), np.float32),
+        {"ndt": 90},
+        np.zeros(N, np.float32),
+    )
+
+
+def trial(T_odom_sensor, restarted=None):
+    restarted = np.zeros(N, bool) if restarted is None else restarted
+    errors = sub_trajectory_rte(frames().T_ref_sensor, T_odom_sensor, LENGTH, restarted)
+    return Trial({}, T_odom_sensor, errors, restarted, np.ones(N, bool), np.zeros(N))
+
+
+def lost_at(i, scale=0.3):
+    """A trial that loses track at a frame, and goes on at the reference."""
+    T = straight(scale)
+    T[i:] = T[i:] + (frames().T_ref_sensor[i] - T[i])
+    restarted = np.zeros(N, bool)
+    restarted[i] = True
+    return trial(T, restarted)
+
+
+def simulated(trials, weights, lost_track=3.0):
+    f = frames()
+    motions = recorded_motions(f, trials, lost_track)
+    simulation = BankSimulation(
+        f.stamps,
+        f.T_ref_sensor,
+        f.descriptors,
+        np.arange(N) // 10,
+        LENGTH,
+        lost_track,
+        lambda members: motions[:, list(members)],
+    )
+    return simulation, simulation.errors(range(len(trials)), np.tile(weights, (6, 1)))
+
+
+def test_errors_are_vectors_as_long_as_they_say():
+    of = trial(straight(0.33))
+    vectors = error_vectors(frames(), of, LENGTH)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), of.errors, rtol=1e-5)
+    known = ~np.isnan(of.errors)
+    assert (vectors[known, 0] > 9.0).all()
+    # Of several runs the mean is told, and the first one's poses.
+    np.testing.assert_allclose(
+        error_vectors(frames(), trial(straight(0.33)), LENGTH)[known],
+        vectors[known],
+    )
+    lost = error_vectors(frames(), lost_at(20), LENGTH)
+    assert np.isinf(lost[10]).all()
+    assert np.isfinite(lost[25]).all()
+
+
+def test_members_that_err_in_opposite_directions_make_up_for_it():
+    trials = [trial(straight(0.33)), trial(straight(0.27))]
+    for weights, expected in (([1.0, 0.0], 10.2), ([0.5, 0.5], 0.0), ([0.0, 1.0], 10.2)):
+        _, errors = simulated(trials, weights)
+        known = errors[~np.isnan(errors)]
+        assert len(known) == (~np.isnan(trials[0].errors)).sum()
+        np.testing.assert_allclose(known, expected, atol=1e-6)
+
+
+def test_a_member_that_lost_track_is_left_out():
+    sound, lost = trial(straight(0.33)), lost_at(20, 0.27)
+    _, errors = simulated([sound, lost], [0.6, 0.4])
+    np.testing.assert_allclose(errors[5:20].max(), 100 * 0.012 * 16 / LENGTH, atol=1.5)
+    # If it is heard more, its failure is the bank's.
+    _, errors = simulated([sound, lost], [0.1, 0.9])
+    assert (errors[10:20] == 30.0).all()
+    assert (errors[20:30] < 30.0).all()
+    # Where all are lost, so is the bank, and agreement in that is none.
+    _, errors = simulated([lost, lost_at(20)], [0.5, 0.5])
+    assert (errors[10:20] == 30.0).all()
+
+
+def test_where_a_piece_of_a_trial_began_nothing_is_known():
+    T = straight(0.33)
+    T[30:] = T[30:] + (frames().T_ref_sensor[30] - T[30])
+    pieces = trial(T)
+    motions = recorded_motions(frames(), [pieces], 3.0)
+    assert np.isnan(motions[29]).all()
+    assert np.isfinite(np.delete(motions, 29, axis=0)).all()
+    # Vectors point where they would without the border, but for the one step.
+    vectors = error_vectors(frames(), pieces, LENGTH)
+    whole = error_vectors(frames(), trial(straight(0.33)), LENGTH)
+    known = np.isfinite(whole[:, 0])
+    assert (vectors[known, 0] > 0.0).all()
+    _, errors = simulated([pieces], [1.0])
+    # There the reference's motion stands in.
+    assert errors[25] == pytest.approx(pieces.errors[5] * 16 / 17, rel=0.01)
+
+
+class Recorded(Odometry):
+    """Makes the motions of a trial."""
+
+    space = ParameterSpace({"number": Float(low=0.0, high=9.0, baseline=0.0)})
+    live = clean = False
+
+    def __init__(self, parameters, trials):
+        self.steps = steps(trials[int(parameters["number"])].T_odom_sensor)
+
+    def prepare(self, scan):
+        return scan.stamp
+
+    def start(self, _prepared, T_odom_sensor, _T_previous_current=None):
+        self.T = T_odom_sensor
+
+    def register(self, prepared):
+        self.T = self.T @ self.steps[prepared // 10**8 - 1]
+        return Registration(self.T, True)
+
+
+def test_it_is_what_a_bank_does():
+    """Weights that change, members that disagree but are not lost."""
+    rng = np.random.default_rng(0)
+    trials = [trial(straight(0.3 + rng.normal(0.0, 0.1, N - 1))) for _ in range(3)]
+    weights = rng.dirichlet(np.ones(3), 6)
+    simulation, _ = simulated(trials, weights[0])
+    sets = [{"number": float(i)} for i in range(3)]
+    box = Bank(lambda p: Recorded(p, trials), dict(enumerate(sets)), WarmUp(), 1e9)
+    f = frames()
+    poses = [np.eye(4)]
+    for i, stamp in enumerate(f.stamps):
+        prepared = box.prepare(Scan(int(stamp), np.zeros((30, 3), np.float32)))
+        box.apply(Selection(0, {}, dict(enumerate(weights[i // 10]))))
+        if i == 0:
+            box.start(prepared, np.eye(4))
+        else:
+            poses.append(box.register(prepared).T_odom_sensor)
+    expected = sub_trajectory_rte(f.T_ref_sensor, np.array(poses), LENGTH)
+    alone = replace(simulation, lost_track=1e9)
+    np.testing.assert_allclose(alone.errors(range(3), weights), np.minimum(expected, 30.0))
+    np.testing.assert_allclose(invert(poses[0]), np.eye(4))

@@ -1,0 +1,43 @@
+import json
+
+import pytest
+
+from adaptune.errors import AdaptuneError
+from offline.offline_study import load_study
+from online import switching
+
+
+def test_every_mechanism_is_priced(study_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(switching, "PERIOD", 1.0)
+    given = ["online.switching.mechanism=hand_over", "online.switching.warm_up=0.3"]
+    study = load_study(study_file, given, tmp_path)
+    seen = []
+    rows = switching.measure_switching(study, 10.0, lambda *told: seen.append(told))
+    ratios = {row["mechanism"]: row["RTE ratio"] for row in rows}
+    # All of the drive lies within every warm-up but the last.
+    assert list(ratios) == [
+        "none",
+        "live",
+        "hand_over, 4 s",
+        "hand_over, 8 s",
+        "hand_over, 12 s",
+        "hand_over, 0.3 s",
+        "bank",
+    ]
+    assert ratios["none"] == 1.0
+    assert ratios["live"] == pytest.approx(1.0, abs=1e-3)
+    assert ratios["bank"] == pytest.approx(1.0, abs=1e-9)
+    assert ratios["hand_over, 0.3 s"] != 1.0
+    assert all(row["ms a scan"] > 0 for row in rows)
+    assert seen[-1][0] == "two, bank"
+    assert seen[-1][1:] == (40, 40)
+    kept = json.loads((tmp_path / "switching.json").read_text())
+    assert kept["switch_cost"] == pytest.approx(ratios["hand_over, 0.3 s"] - 1.0)
+    assert study.switch_cost() == max(0.0, kept["switch_cost"])
+
+
+def test_too_short_to_tell(study_file, tmp_path):
+    study = load_study(study_file, folder=tmp_path)
+    with pytest.raises(AdaptuneError, match=r"one, none: holds no sub-trajectory of 3 m"):
+        switching.measure_switching(study, 0.5)
+    assert not (tmp_path / "switching.json").exists()

@@ -1,0 +1,65 @@
+"""The documentation leads where it says, and names commands that exist."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from adaptune.cli import app
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+GUIDE = [page for page in (ROOT / "docs").glob("*.md") if page.stem != "README"]
+CODE = re.compile(r"^```.*?^```|^    .*?$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+
+
+def without_code_blocks(page: Path) -> str:
+    text = page.read_text(encoding="utf-8")
+    return re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def links(page: Path) -> list[str]:
+    found = re.findall(r"\]\(([^)\s]+)\)", without_code_blocks(page))
+    return [link for link in found if not re.match(r"[a-z]+:", link)]
+
+
+def targets(page: Path) -> set[Path]:
+    return {(page.parent / link.partition("#")[0]).resolve() for link in links(page)}
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub makes them."""
+    headings = HEADING.findall(without_code_blocks(page))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_anchors_exist(page):
+    broken = []
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+    assert broken == []
+
+
+@pytest.mark.parametrize("index", ["README.md", "docs/README.md"])
+def test_index_lists_the_whole_guide(index):
+    assert set(GUIDE) <= targets(ROOT / index)
+
+
+def test_index_lists_all_research_notes():
+    index = ROOT / "docs/research/README.md"
+    assert set(index.parent.glob("*.md")) - {index} <= targets(index)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_exist(page):
+    code = "\n".join(CODE.findall(page.read_text(encoding="utf-8")))
+    named = set(re.findall(r"(?:^|[\s`/])adaptune ([a-z]+)\b", code))
+    assert named <= set(get_command(app).commands)
