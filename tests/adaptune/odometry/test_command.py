@@ -14,8 +14,8 @@ from needs import lacking
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
-from offline.train import train
 from offline.offline_study import load_study
+from offline.train import train
 from offline.trial import PreparedSequence, run_trials
 from online.comparison import compare, run_replays
 
