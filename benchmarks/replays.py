@@ -73,8 +73,8 @@ def geometric(data: TrainingData) -> int:
     return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
 
 
-Way = tuple[Callable[[], OdometryInstance], Policy | None]
-"""What is driven, and what chooses its parameters."""
+Way = tuple[Callable[[], OdometryInstance], Policy | None, list[int] | None]
+"""What makes the odometry, what chooses its parameters, and the members of a bank."""
 
 
 def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
@@ -145,8 +145,8 @@ def main() -> None:
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
         row = f"{' '.join(scenes):32}"
-        for make, policy in driven.values():
-            result = replay(scans, make(), HealthCheck(), policy, sets)
+        for make, policy, members in driven.values():
+            result = replay(scans, make(), HealthCheck(), policy, sets, members=members)
             errors = sub_trajectory_rte(
                 T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY
             )
