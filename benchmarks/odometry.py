@@ -29,6 +29,7 @@ from adaptune.odometry import OdometryInstance, WarmUp
 from adaptune.odometry.hand_over import HandOver
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
+from adaptune.selection import Selection
 from adaptune.sequence import Scan, SequenceError
 from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.views import WithImu
@@ -42,7 +43,7 @@ WARM_UPS = (
 )
 EVERY = 5.0
 SOME = 30
-"""Scans from which is told what another process adds."""
+"""Scans for which another process is measured."""
 
 
 class Clock:
@@ -94,29 +95,29 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
 
 
 def drive(
-    box: OdometryInstance, scans: list[Scan], before: Callable[[int], None] = lambda _: None
+    odometry: OdometryInstance, scans: list[Scan], before: Callable[[int], None] = lambda _: None
 ) -> tuple[Poses, float]:
     """Poses, and what a scan took in milliseconds of processors' time, the median."""
-    box.start(box.prepare(scans[0]), np.eye(4))
+    odometry.start(odometry.prepare(scans[0]), np.eye(4))
     poses, at = [np.eye(4)], []
     for i, scan in enumerate(scans[1:], start=1):
         before(i)
-        poses.append(box.register(box.prepare(scan)).T_odom_sensor)
+        poses.append(odometry.register(odometry.prepare(scan)).T_odom_sensor)
         # Another process tells what it has computed with each pose, not before the first.
-        at.append(computed(box))
+        at.append(computed(odometry))
     return np.array(poses), 1e3 * float(np.median(np.diff(at)))
 
 
-def computed(box: OdometryInstance) -> float:
+def computed(odometry: OdometryInstance) -> float:
     """Seconds of processors' time, here and in the other process if there is one."""
-    return time.process_time() + (box.cpu if isinstance(box, Isolated) else 0.0)
+    return time.process_time() + (odometry.usage.cpu if odometry.usage.memory else 0.0)
 
 
 def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     """Poses, milliseconds a scan, and those of them not in the odometry's own code; medians."""
     clock = Clock()
-    box: Any = odometry_class(name)()
-    box.start(box.prepare(scans[0]), np.eye(4))
+    odometry: Any = odometry_class(name)()
+    odometry.start(odometry.prepare(scans[0]), np.eye(4))
     originals = small_gicp.align, small_gicp.preprocess_points
     registration = open3d.load().pipelines.registration
     ndt = registration.registration_ndt
@@ -126,12 +127,12 @@ def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     registration.registration_ndt = clock.wrap(ndt)
     cloud.voxel_down_sample = clock.wrap(downsample)
     for attribute in ("_kiss", "_pipeline", "_lio"):
-        if hasattr(box, attribute):
-            setattr(box, attribute, Timed(getattr(box, attribute), clock))
+        if hasattr(odometry, attribute):
+            setattr(odometry, attribute, Timed(getattr(odometry, attribute), clock))
     poses, whole, own = [np.eye(4)], [], []
     for scan in scans[1:]:
         at, begin = clock.seconds, time.process_time()
-        poses.append(box.register(box.prepare(scan)).T_odom_sensor)
+        poses.append(odometry.register(odometry.prepare(scan)).T_odom_sensor)
         whole.append(time.process_time() - begin)
         own.append(clock.seconds - at)
     small_gicp.align, small_gicp.preprocess_points = originals
@@ -167,12 +168,12 @@ def adapters(path: Path, length: float) -> None:
 
 
 def rte_of(
-    box: OdometryInstance,
+    odometry: OdometryInstance,
     scans: list[Scan],
     T_ref: Poses,
     switch: Callable[[int], None] | None = None,
 ) -> float:
-    """RTE in percent of a box that is made to switch every so often."""
+    """RTE in percent of an odometry that is made to switch every so often."""
     first = scans[0].stamp
 
     def before(i: int) -> None:
@@ -180,15 +181,15 @@ def rte_of(
         if switch is not None and now > last:
             switch(now)
 
-    poses, _ = drive(box, scans, before)
+    poses, _ = drive(odometry, scans, before)
     return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
 
 
-def there_and_back(box: Any) -> None:
-    """Change all real numbers a little and back, so that a box does what a change takes."""
-    real = {name: v for name, v in box.parameters.items() if isinstance(v, float)}
-    box.configure({name: v * (1.0 + 1e-9) for name, v in real.items()})
-    box.configure(real)
+def there_and_back(odometry: Any) -> None:
+    """Change all real numbers a little and back, so that an odometry does what a change takes."""
+    real = {name: v for name, v in odometry.parameters.items() if isinstance(v, float)}
+    odometry.apply(Selection(0, {name: v * (1.0 + 1e-9) for name, v in real.items()}))
+    odometry.apply(Selection(0, real))
 
 
 def switching(path: Path, names: list[str]) -> None:
@@ -204,8 +205,9 @@ def switching(path: Path, names: list[str]) -> None:
 
         row = [rte_of(make({}), scans, T_ref)]
         for warm_up in WARM_UPS:
-            box = HandOver(make, {"number": 0}, warm_up)
-            row.append(rte_of(box, scans, T_ref, lambda n, box=box: box.configure({"number": n})))
+            odometry = HandOver(make, {"number": 0}, warm_up)
+            switch = lambda n, one=odometry: one.apply(Selection(n, {"number": n}))  # noqa: E731
+            row.append(rte_of(odometry, scans, T_ref, switch))
         itself = ""
         if cls.live:
             live: Any = cls()
@@ -216,23 +218,23 @@ def switching(path: Path, names: list[str]) -> None:
 
 
 def faults() -> None:
-    """Print what is told of every kind of fault, and whether the odometry went on."""
+    """Print the message of every kind of fault, and whether the odometry went on."""
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
     import faulty
 
     for fault in faulty.FAULTS:
         settings = faulty.Settings(fault=fault)
-        box = Isolated("faulty:Faulty", {}, settings, Limits(seconds=1.0, memory=1.0))
+        odometry = Isolated("faulty:Faulty", {}, settings, Limits(seconds=1.0, memory=1.0))
         scans = [Scan(i * 10**8, np.zeros((5, 3), np.float32)) for i in range(6)]
-        box.start(scans[0], np.eye(4))
-        lost = [i for i in range(1, 6) if np.isnan(box.register(scans[i]).T_odom_sensor).any()]
-        box.start(scans[5], np.eye(4))
-        again = fault == "shape" or np.isfinite(box.register(scans[5]).T_odom_sensor).all()
+        odometry.start(scans[0], np.eye(4))
+        lost = [i for i in range(1, 6) if np.isnan(odometry.register(scans[i]).T_odom_sensor).any()]
+        odometry.start(scans[5], np.eye(4))
+        again = fault == "shape" or np.isfinite(odometry.register(scans[5]).T_odom_sensor).all()
         print(
             f"{fault:20} lost from scan {lost[0]}, {'goes' if again else 'does not go'} on: ",
             end="",
         )
-        print(box.faults[0])
+        print(odometry.faults[0])
 
 
 if __name__ == "__main__":

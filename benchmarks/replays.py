@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from adaptune.model.fusion import Steady
-from gain import ODOMETRIES, WINDOW, labelled, study_of, training_courses, trials
+from gain import ODOMETRIES, WINDOW, factory_of, labelled, training_courses, trials
 from numpy.typing import NDArray
 from offline.validation import choose_bank, training_data, tune, tune_bank
 
@@ -74,8 +74,8 @@ def geometric(data: TrainingData) -> int:
     return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
 
 
-Way = tuple[Callable[[], OdometryInstance], Policy | None]
-"""What is driven, and what chooses its parameters."""
+Way = tuple[Callable[[], OdometryInstance], Policy | None, list[int] | None]
+"""What makes the odometry, what chooses its parameters, and the members of a bank."""
 
 
 def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
@@ -84,15 +84,15 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
     data, pca = training_data(sequences, units)
     settings = tune(sequences, units)
     print(f"settings of the paired rule: {settings}")
-    study = study_of(odometry)
-    sets = study.odometry.space.from_unit(units)
+    factory = factory_of(odometry)
+    sets = factory.space.from_unit(units)
 
     def alone(number: int | None) -> Way:
-        return lambda: study.odometry(None if number is None else sets[number]), None
+        return lambda: factory(None if number is None else sets[number]), None
 
     def live(name: str) -> Way:
         rule = RULES[name](settings, 0.0).fit(data)
-        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca)
+        return lambda: factory(sets[data.fixed]), asking(rule, pca)
 
     def bank(size: int, even: bool = False) -> Way:
         members = choose_bank(sequences, data.fixed, size)
@@ -106,7 +106,7 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
         policy = asking(rule, pca)
         if even:
             policy = lambda *_: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
-        return lambda: Bank(study.odometry, [sets[i] for i in members], WarmUp()), policy
+        return lambda: Bank(factory, [sets[i] for i in members], WarmUp()), policy
 
     return sets, {
         "baseline": alone(None),
@@ -146,8 +146,8 @@ def main() -> None:
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
         row = f"{' '.join(scenes):32}"
-        for make, policy in driven.values():
-            result = replay(scans, make(), HealthCheck(), policy, sets)
+        for make, policy, members in driven.values():
+            result = replay(scans, make(), HealthCheck(), policy, sets, members=members)
             errors = sub_trajectory_rte(
                 T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY
             )

@@ -7,7 +7,6 @@ always return to the driver.
 
 import base64
 import contextlib
-import copy
 import dataclasses
 import hashlib
 import io
@@ -251,8 +250,7 @@ def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
     given["folder"] = setup.sequences.folder.absolute()
     sequences, odometry = AwaySequences(**given, digests=digests), setup.odometry
     if odometry.program_input is not None:
-        odometry = copy.copy(odometry)
-        odometry.program_input = sequences.program_input
+        odometry = dataclasses.replace(odometry, program_input=sequences.program_input)
     return TrialSetup(setup.settings, odometry, sequences)
 
 

@@ -1,10 +1,11 @@
 """Make an odometry from its name, wherever it runs."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-from adaptune.odometry.base import BaseSettings, Description, OdometryInstance
+from adaptune.odometry.base import Description, OdometryInstance
 from adaptune.odometry.command import Command
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import Process
@@ -13,63 +14,42 @@ from adaptune.odometry.registry import AnyOdometry, odometry_class, versions
 from adaptune.space import ParameterSet, ParameterSpace
 
 
+@dataclass(frozen=True)
 class OdometryFactory:
-    """Makes instances of one odometry.
-
-    It pickles: class and settings are looked up where they are first used.
-
-    Parameters
-    ----------
-    name
-        The odometry, see `odometry_class`.
-    settings
-        What the odometry's `settings_type` validates, or an instance of it.
-    space
-        The parameters that are tuned.
-    limits
-        Limits of odometries in processes of their own.
-    program_input
-        Gives the recording of a sequence, for programs that run whole recordings.
-    strict_sequences
-        Sequences on which such a program must not fail with the baseline's parameters: there its
-        failure is an error, not a fault.
+    """Makes instances of one odometry, in any process: it pickles.
 
     Attributes
     ----------
     name : str
+        The odometry, see `adaptune.odometry.registry.odometry_class`.
+    settings : BaseSettings
+        Its settings; a mapping is validated.
     space : ParameterSpace
+        The parameters that are tuned.
+    limits : Limits
+        Limits of odometries in processes of their own.
     program_input : callable, optional
+        Gives the recording of a sequence, for programs that run whole recordings.
+    strict_sequences : collection of str
+        Sequences on which such a program must not fail with the baseline's parameters: there its
+        failure is an error, not a fault.
     """
 
-    def __init__(
-        self,
-        name: str,
-        settings: Mapping[str, Any] | BaseSettings,
-        space: ParameterSpace,
-        limits: Limits,
-        program_input: Callable[[str], ProgramInput] | None = None,
-        strict_sequences: Collection[str] = (),
-    ):
-        self.name = name
-        self.space = space
-        self._given = settings
-        self._limits = limits
-        self.program_input = program_input
-        self._strict_sequences = strict_sequences
+    name: str
+    settings: Any
+    space: ParameterSpace
+    limits: Limits
+    program_input: Callable[[str], ProgramInput] | None = None
+    strict_sequences: Collection[str] = ()
 
-    def __getstate__(self) -> dict[str, Any]:
-        cached = ("odometry_class", "settings", "description")
-        return {key: value for key, value in vars(self).items() if key not in cached}
+    def __post_init__(self) -> None:
+        settings = self.odometry_class.settings_type.model_validate(self.settings)
+        object.__setattr__(self, "settings", settings)
 
     @cached_property
     def odometry_class(self) -> AnyOdometry:
         """Class of the odometry."""
         return odometry_class(self.name)
-
-    @cached_property
-    def settings(self) -> Any:
-        """Settings of the odometry, validated."""
-        return self.odometry_class.settings_type.model_validate(self._given)
 
     @cached_property
     def description(self) -> Description:
@@ -107,13 +87,13 @@ class OdometryFactory:
         cls, given = self.odometry_class, self.space.baseline | (parameters or {})
         if issubclass(cls, Command):
             # A failure with the baseline's parameters means that something is missing.
-            strict = sequence in self._strict_sequences and given == self.space.baseline
+            strict = sequence in self.strict_sequences and given == self.space.baseline
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            return cls(given, self.settings, self._limits, read, strict)
+            return cls(given, self.settings, self.limits, read, strict)
         if issubclass(cls, Process):
-            return cls(given, self.settings, self._limits)
+            return cls(given, self.settings, self.limits)
         if cls.clean and not isolated:
             return cls(given, self.settings)
-        return Isolated(self.name, given, self.settings, self._limits)
+        return Isolated(self.name, given, self.settings, self.limits)

@@ -10,14 +10,15 @@ import program
 import pytest
 import yaml
 from needs import lacking
+from setups import setup_of
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
 from offline.train import train
-from offline.trial import PreparedSequence, run_trials
-from online.comparison import compare, run_replays
+from online.comparison import compare
+from online.run_replays import run_replays
 
 STUDY = """\
 odometry:
@@ -68,8 +69,9 @@ OTHER = {"registration.voxel": 0.6, "distance": 2.0}
 
 
 def run(study, parameters=OTHER, whole=False):
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [parameters], whole)
+    setup = setup_of(study)
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [parameters], whole)
     return trial, sequence
 
 

@@ -1,0 +1,81 @@
+import pickle
+import sys
+
+import numpy as np
+import pytest
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.program_input import ProgramInput
+from adaptune.sequence import Scan
+from adaptune.space import Float, ParameterSpace
+
+SPACE = ParameterSpace({"keyframe_interval": Float(low=1.0, high=9.0, baseline=2.0)})
+
+
+def factory(name="gicp", settings=None, space=SPACE, **rest):
+    return OdometryFactory(name, settings or {}, space, Limits(), **rest)
+
+
+def test_it_makes_what_the_name_says():
+    gicp = factory(settings={"downsampling": 0.3})
+    instance = gicp({"keyframe_interval": 4.0})
+    assert type(instance) is KeyframeGicp
+    assert instance.settings == gicp.settings == Settings(downsampling=0.3)
+    assert instance.parameters == KeyframeGicp.space.baseline | {"keyframe_interval": 4.0}
+    # The baseline of the study's space, not the odometry's own.
+    assert gicp().parameters["keyframe_interval"] == 2.0
+    assert gicp.description == KeyframeGicp.describe(gicp.settings)
+    assert gicp.identity == {"name": "gicp", "settings": gicp.settings.model_dump(mode="json")}
+    assert "small_gicp" in gicp.versions
+    assert gicp(isolated=True).usage.memory == 0.0
+    with pytest.raises(OdometryError, match="did you mean 'gicp'"):
+        _ = factory("gipc").description
+
+
+def test_what_is_not_tuned_keeps_its_setting_in_another_process():
+    settings = {"parameters": {"num_keyframes": 16}}
+    space = ParameterSpace({"b_max": Float(low=0.05, high=1.0, baseline=0.2)})
+    assert factory("mad_icp", settings, space)().parameters == {"b_max": 0.2}
+
+
+def test_it_pickles_with_and_without_what_it_has_looked_up():
+    gicp = factory(settings={"downsampling": 0.3})
+    for _ in range(2):  # The second time with its class and description.
+        copy = pickle.loads(pickle.dumps(gicp))
+        assert copy.identity == gicp.identity
+        assert copy.description == gicp.description
+        assert copy({"keyframe_interval": 3.0}).parameters["keyframe_interval"] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("sequence", "parameters", "strict"),
+    [("one", {}, True), ("one", {"x": 0.7}, False), ("two", {}, False)],
+)
+def test_a_program_must_not_fail_on_strict_sequences_with_the_baseline(
+    tmp_path, sequence, parameters, strict
+):
+    asked = []
+
+    def program_input(name):
+        asked.append(name)
+        return ProgramInput(tmp_path, "/points", "", np.arange(3, dtype=np.int64), None)
+
+    command = factory(
+        "command",
+        {"command": [sys.executable, "-c", "raise SystemExit(3)"]},
+        ParameterSpace({"x": Float(low=0.0, high=1.0, baseline=0.5)}),
+        program_input=program_input,
+        strict_sequences=("one",),
+    )
+    instance = command(parameters, sequence)
+    scan = instance.prepare(Scan(0, np.zeros((0, 3), np.float32)))
+    if strict:
+        with pytest.raises(OdometryError, match="ended with code 3"):
+            instance.start(scan, np.eye(4))
+    else:
+        instance.start(scan, np.eye(4))
+        assert "ended with code 3" in instance.faults[0]
+    assert asked == [sequence]
