@@ -18,14 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gain import ODOMETRIES, WINDOW, labelled, study_of, training_courses, trials
+from adaptune.model.fusion import Steady
+from gain import ODOMETRIES, WINDOW, factory_of, labelled, training_courses, trials
 from numpy.typing import NDArray
+from offline.validation import choose_bank, training_data, tune, tune_bank
 
 from adaptune.descriptor.ndt import ndt_histogram
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
-from adaptune.model.fusion import Steady
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.odometry import OdometryInstance, WarmUp
 from adaptune.odometry.bank import Bank
@@ -33,7 +34,6 @@ from adaptune.odometry.health import HealthCheck
 from adaptune.sequence import Scan
 from adaptune.simulation import Course, simulate
 from adaptune.space import ParameterSet
-from offline.validation import choose_bank, training_data, tune, tune_bank
 from online.replay import Policy, replay
 
 ORDERS = (
@@ -83,15 +83,15 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
     data, pca = training_data(sequences, units)
     settings = tune(sequences, units)
     print(f"settings of the paired rule: {settings}")
-    study = study_of(odometry)
-    sets = study.odometry.space.from_unit(units)
+    factory = factory_of(odometry)
+    sets = factory.space.from_unit(units)
 
     def alone(number: int | None) -> Way:
-        return lambda: study.odometry(None if number is None else sets[number]), None, None
+        return lambda: factory(None if number is None else sets[number]), None
 
     def live(name: str) -> Way:
         rule = RULES[name](settings, 0.0).fit(data)
-        return lambda: study.odometry(sets[data.fixed]), asking(rule, pca), None
+        return lambda: factory(sets[data.fixed]), asking(rule, pca)
 
     def bank(size: int, even: bool = False) -> Way:
         members = choose_bank(sequences, data.fixed, size)
@@ -105,8 +105,7 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
         policy = asking(rule, pca)
         if even:
             policy = lambda *_: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
-        in_bank = {i: sets[i] for i in members}
-        return lambda: Bank(study.odometry, in_bank, WarmUp()), policy, members
+        return lambda: Bank(factory, [sets[i] for i in members], WarmUp()), policy
 
     return sets, {
         "baseline": alone(None),

@@ -10,14 +10,15 @@ import program
 import pytest
 import yaml
 from needs import lacking
+from setups import setup_of
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
 from offline.train import train
-from offline.trial import PreparedSequence, run_trials
-from online.comparison import compare, run_replays
+from online.comparison import compare
+from online.run_replays import run_replays
 
 STUDY = """\
 odometry:
@@ -68,8 +69,9 @@ OTHER = {"registration.voxel": 0.6, "distance": 2.0}
 
 
 def run(study, parameters=OTHER, whole=False):
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [parameters], whole)
+    setup = setup_of(study)
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [parameters], whole)
     return trial, sequence
 
 
@@ -273,9 +275,9 @@ evalio_bag, run, -c, '{{parameters}}']"
 def test_the_whole_way(make):
     study = make("pretend", "offline.trials=2")
     training = train(study)
-    assert training.model.space.names == ("registration.voxel", "distance")
+    assert training.model.sets.space.names == ("registration.voxel", "distance")
     assert run_replays(study, study.folder / "model.safetensors") == 2
-    assert {row["mode"] for row in compare(study)} == {"baseline", "fixed"}
+    assert {row.mode for row in compare(study)} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")
     with pytest.raises(ConfigurationError, match=r"other values of odometry\.template"):
@@ -285,7 +287,7 @@ def test_the_whole_way(make):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("odometry.parameters=", "odometry.parameters: define what is tuned"),
+        ("odometry.parameters=", "odometry.parameters: define the parameters"),
         ("odometry.parameters.distance={low: 1, high: 2, baseline: 1}", "give its type, one of"),
         ("odometry.parameters.distance.type=real", "give its type, one of float, integer"),
         ("odometry.parameters.distance.low=9", "low (9) must be less than high"),
@@ -301,8 +303,8 @@ def test_the_whole_way(make):
         ("odometry.settings.format=tumm", "odometry.settings.format: Input should be"),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
         ("online.rules=[paired]", "online.rules: a command runs whole recordings"),
-        ("online.switching.mechanism=live", "a command runs whole recordings: it cannot change"),
-        ("online.switching.mechanism=bank", "a command runs whole recordings: it cannot change"),
+        ("online.switching.mechanism=live", "a command runs whole recordings and cannot change"),
+        ("online.switching.mechanism=bank", "a command runs whole recordings and cannot change"),
         ("odometry.settings.command=sh", 'settings.command: give a list, not "sh"'),
     ],
 )

@@ -10,6 +10,7 @@ import faulty
 import numpy as np
 import pytest
 import turns
+from setups import setup_of
 
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
@@ -20,7 +21,6 @@ from adaptune.selection import Selection
 from adaptune.sequence import Imu, Scan
 from adaptune.sequence.imu import ImuNoise
 from offline.offline_study import load_study
-from offline.trial import PreparedSequence, run_trials
 from offline.workers import Task, Workers, run
 from online.replay import replay
 
@@ -137,8 +137,9 @@ def faulty_study(study_file, tmp_path, fault):
 
 def test_a_trial_keeps_its_faults_and_goes_on_at_the_reference(study_file, tmp_path):
     study = faulty_study(study_file, tmp_path, "abort")
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [{"x": 0.5}])
+    setup = setup_of(study)
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [{"x": 0.5}])
     assert np.flatnonzero(trial.restarted).tolist() == [12]
     np.testing.assert_array_equal(trial.T_odom_sensor[12], sequence.frames.T_ref_sensor[12])
     assert "SIGABRT" in trial.faults[0]
@@ -147,7 +148,7 @@ def test_a_trial_keeps_its_faults_and_goes_on_at_the_reference(study_file, tmp_p
     archive = Archive(tmp_path)
     archive.write("one", 0, trial)
     assert archive.read("one", 0).faults == trial.faults
-    (whole,) = run_trials(study, sequence, [{"x": 0.5}], whole=True)
+    (whole,) = setup.run(sequence, [{"x": 0.5}], whole=True)
     assert np.isfinite(whole.errors[5])
     assert whole.faults
 
@@ -155,7 +156,7 @@ def test_a_trial_keeps_its_faults_and_goes_on_at_the_reference(study_file, tmp_p
 def test_the_campaign_goes_on(study_file, tmp_path):
     study = faulty_study(study_file, tmp_path, "segmentation fault")
     tasks = [Task("one", (n,), ({"x": 0.5},)) for n in range(2)]
-    with Workers(study, 1) as workers:
+    with Workers(setup_of(study), 1, 1e9) as workers:
         results = [result for _, result, _ in run(workers, tasks)]
     assert ["SIGSEGV" in result.trials[0].faults[0] for result in results] == [True, True]
 

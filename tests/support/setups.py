@@ -1,0 +1,23 @@
+"""What trials of a study need."""
+
+import dataclasses
+
+from offline.trial import TrialSettings, TrialSetup
+
+
+def setup_of(study, odometry=None, **settings):
+    """The setup of a study, with another odometry or other settings."""
+    of_study = dataclasses.replace(TrialSettings.of(study.config), **settings)
+    return TrialSetup(of_study, odometry or study.odometry, study.sequences)
+
+
+def made_of(odometry_class, study, instances=None):
+    """Make instances of a class with a study's settings, and append them to a list."""
+
+    def make(parameters=None, _sequence=None, isolated=False):  # noqa: ARG001
+        made = odometry_class(parameters, study.odometry.settings)
+        if instances is not None:
+            instances.append(made)
+        return made
+
+    return make
