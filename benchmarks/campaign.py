@@ -34,9 +34,8 @@ import drives
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
 from adaptune.simulation import record
-from adaptune.study.study import Study
-from offline import campaign
-from offline.offline_study import load_study
+from offline import train as training
+from offline.offline_study import OfflineStudy, load_study
 from offline.workers import Task, TaskResult
 
 STUDY = """\
@@ -48,7 +47,7 @@ offline: {{sampler: sobol, trials: {trials}}}
 N_FRAMES = 600
 
 
-def bare(study: Study, sets: Sequence[dict[str, Any]]) -> None:
+def bare(study: OfflineStudy, sets: Sequence[dict[str, Any]]) -> None:
     """What any program would have to do."""
     settings: Any = study.odometry.settings
     prepared = [
@@ -93,9 +92,9 @@ def _answer(queue: Any, function: Callable[..., Any], arguments: tuple[Any, ...]
     queue.put((time.monotonic() - begin, returned))
 
 
-def train(study: Study) -> list[dict[str, Any]]:
+def train(study: OfflineStudy) -> list[dict[str, Any]]:
     """Run a campaign, and tell its parameter sets."""
-    return campaign.train(study).model.sets
+    return training.train(study).model.sets
 
 
 def speed(trials: int, scans: int) -> None:
@@ -182,9 +181,9 @@ def _memory() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-def fill(study: Study) -> None:
+def fill(study: OfflineStudy) -> None:
     """Run a drawn campaign, and tell the memory on the way."""
-    campaign.Workers = Drawn  # type: ignore[assignment,misc]
+    training.Workers = Drawn  # type: ignore[assignment,misc]
     at = [100, 300, 1000, 3000, 10_000, 30_000]
 
     def tell(what: str, done: int, *_: object) -> None:
@@ -192,7 +191,7 @@ def fill(study: Study) -> None:
             at.pop(0)
             print(f"{done:6d} trials: driver {_memory():6.1f} MB", flush=True)
 
-    campaign.train(study, tell)
+    training.train(study, tell)
     print(f"with the model of all: at most {_peak():.1f} MB")
 
 
@@ -200,12 +199,12 @@ def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-def resume(study: Study) -> float:
+def resume(study: OfflineStudy) -> float:
     """Run a drawn campaign again, and tell when the first trial was asked for."""
     pool = Drawn()
-    campaign.Workers = lambda *_: pool  # type: ignore[assignment,misc]
+    training.Workers = lambda *_: pool  # type: ignore[assignment,misc]
     begin = time.monotonic()
-    campaign.train(study)
+    training.train(study)
     return pool.asked - begin
 
 
@@ -216,7 +215,7 @@ def size(trials: int) -> None:
         file = drives.write_study(folder)
         given = ["training=[one]", "offline.sampler=random", "offline.batch=100"]
 
-        def study(n: int) -> Study:
+        def study(n: int) -> OfflineStudy:
             return load_study(file, [*given, f"offline.trials={n}"], folder / "run")
 
         wall, _ = in_child(fill, study(trials))

@@ -23,6 +23,20 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
+from offline.fusion import Drive, error_vectors, periods, recorded_motions
+from offline.validation import (
+    BANK_SIZE,
+    NO_WORSE,
+    LabelledSequence,
+    Maker,
+    Validation,
+    choose_bank,
+    learning_curve,
+    leave_one_out,
+    training_data,
+    tune,
+    tune_bank,
+)
 
 from adaptune.archive import Frames
 from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
@@ -41,25 +55,13 @@ from adaptune.model import (
     fusion,
 )
 from adaptune.model.base import complementary
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import Course, simulate
-from adaptune.study.config import StudyConfig
-from adaptune.study.study import Study
-from offline.fusion import Drive, error_vectors, periods, recorded_motions
+from offline.config import OfflineConfig
 from offline.samplers import make_sampler
-from offline.trial import run_trials
-from offline.validation import (
-    BANK_SIZE,
-    NO_WORSE,
-    LabelledSequence,
-    Maker,
-    Validation,
-    choose_bank,
-    learning_curve,
-    leave_one_out,
-    training_data,
-    tune,
-    tune_bank,
-)
+from offline.trial import TrialSettings, run_trials
 
 ODOMETRIES = ("gicp", "ndt")
 N_SETS = 16
@@ -92,10 +94,10 @@ def training_courses(seed: int, length: float) -> dict[str, Course]:
     return single | mixed
 
 
-def study_of(odometry: str) -> Study:
-    """A study of nothing but defaults."""
-    config = StudyConfig.model_validate({"odometry": {"name": odometry}, "training": ["-"]})
-    return Study(config, Path("-"))
+def factory_of(name: str) -> OdometryFactory:
+    """An odometry with its default settings, all of whose parameters are tuned."""
+    space: Any = getattr(odometry_class(name), "space", None)
+    return OdometryFactory(name, {}, space, Limits())
 
 
 class Prepared:
@@ -118,15 +120,13 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
         {"ndt": N_FEATURES},
         np.array([lowest_elevation(scan) for scan in scans], np.float32),
     )
-    study = study_of(odometry)
-    offline = study.config.offline.model_copy(
-        update={"sampler": "sobol", "batch": N_SETS, "seed": seed}
-    )
-    sets = make_sampler(study.odometry.space, offline).propose([])
-    box = study.odometry()
-    sequence: Any = Prepared(path.stem, [box.prepare(scan) for scan in scans], frames)
-    trials = run_trials(study, sequence, sets)
-    length, lost_track = study.config.sub_trajectory, study.config.lost_track
+    factory, settings = factory_of(odometry), TrialSettings()
+    config = OfflineConfig(sampler="sobol", batch=N_SETS, seed=seed)
+    sets = make_sampler(factory.space, config).propose([])
+    one = factory()
+    prepared = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
+    trials = run_trials(settings, factory, prepared, sets)
+    length, lost_track = settings.sub_trajectory, settings.lost_track
     vectors = [error_vectors(frames, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials, lost_track)[..., :3, :]
     with replacing(path) as beside, beside.open("wb") as file:
@@ -135,7 +135,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
             stamps=frames.stamps,
             T_world_sensor=frames.T_ref_sensor,
             histograms=frames.descriptors.astype(np.uint16),
-            sets=study.odometry.space.to_unit(sets),
+            sets=factory.space.to_unit(sets),
             errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
             vectors=np.stack(vectors, axis=1),
             motions=motions.astype(np.float32),
@@ -174,14 +174,14 @@ def labelled(paths: list[Path]) -> tuple[list[LabelledSequence], NDArray[np.floa
             few = found["motions"]
             motions = np.tile(np.eye(4), (*few.shape[:2], 1, 1))
             motions[..., :3, :] = few
-            config = study_of("gicp").config
+            settings = TrialSettings()
             drive = Drive(
                 stamps,
                 T_world_sensor,
                 described,
                 period,
-                config.sub_trajectory,
-                config.lost_track,
+                settings.sub_trajectory,
+                settings.lost_track,
                 partial(np.take, motions, axis=1),
             )
             sequences.append(

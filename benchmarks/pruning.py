@@ -17,11 +17,10 @@ from pathlib import Path
 from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.simulation import record
-from adaptune.study.study import Study
 from offline.campaign import run_batches
-from offline.train import train
 from offline.objective import choose_fixed
-from offline.offline_study import load_study
+from offline.offline_study import OfflineStudy, load_study
+from offline.train import train
 from offline.workers import Outcome, Result, Task
 
 RULES = ("halving", "hyperband", "wilcoxon")
@@ -75,7 +74,7 @@ def study_file(folder: Path, seed: int, given: argparse.Namespace) -> Path:
     return path
 
 
-def scans(study: Study) -> int:
+def scans(study: OfflineStudy) -> int:
     """Number of scans registered in all trials of a study."""
     archive = Archive(study.folder / "trials")
     return sum(

@@ -32,11 +32,10 @@ from scipy.stats import wilcoxon
 from adaptune import cores, report
 from adaptune.simulation import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
-from adaptune.study.study import Study
 from offline.config import OfflineConfig
 from offline.offline_study import load_study
 from offline.samplers import make_sampler
-from offline.trial import PreparedSequence, run_trials
+from offline.trial import PreparedSequence, TrialSettings, TrialSetup
 
 TRIALS = 96
 SEEDS = range(20)
@@ -150,23 +149,24 @@ sub_trajectory: 10.0
 """
 
 
-def prepare(folder: Path, *overrides: str) -> tuple[Study, PreparedSequence]:
+def prepare(folder: Path, *overrides: str) -> tuple[TrialSetup, PreparedSequence]:
     """Simulate the course, if it is not there yet, and prepare it for an odometry."""
     file = folder / "samplers.yaml"
     file.write_text(STUDY)
     study = load_study(file, overrides, folder / "run")
     if not study.sequences.recording("course").exists():
         record(study.config.courses["course"], study.sequences.recording("course"))
-    return study, PreparedSequence(study, "course", 8e9)
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    return setup, setup.prepare("course", 8e9)
 
 
 def table(folder: Path) -> None:
     """Compare on recorded trials of GICP."""
-    study, sequence = prepare(folder)
-    space = study.odometry.space
+    setup, sequence = prepare(folder)
+    space = setup.odometry.space
     unit = (np.arange(SIDE) + 0.5) / SIDE
     points = np.stack(np.meshgrid(*[unit] * len(space), indexing="ij"), -1).reshape(-1, len(space))
-    trials = run_trials(study, sequence, space.from_unit(points))
+    trials = setup.run(sequence, space.from_unit(points))
     errors = np.array([trial.mean_error for trial in trials])
     print(f"table: {len(errors)} trials, {errors.min():.3f} to {errors.max():.3f} %", flush=True)
 
@@ -179,30 +179,30 @@ def table(folder: Path) -> None:
 
 def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Rows of the thesis's table for an odometry, and the curves of each sampler."""
-    study, sequence = prepare(folder, f"odometry.name={name}", *THESIS[name])
+    setup, sequence = prepare(folder, f"odometry.name={name}", *THESIS[name])
     known: dict[str, tuple[float, float]] = {}
 
     def measures(s: ParameterSet) -> tuple[float, float]:
         if repr(s) not in known:
-            (trial,) = run_trials(study, sequence, [s])
+            (trial,) = setup.run(sequence, [s])
             known[repr(s)] = trial.mean_error, trial.metrics["rpe"]
         return known[repr(s)]
 
-    base = measures(study.odometry.space.baseline)
+    base = measures(setup.odometry.space.baseline)
     rows: list[dict[str, Any]] = [{"": name, "sampler": "defaults", "RTE %": base[0]}]
     rows[0] |= {"RTE change": "", "RPE m": base[1], "RPE change": ""}
     curves: dict[str, Any] = {}
-    side = round((THESIS_TRIALS - 1) ** (1 / len(study.odometry.space)))
+    side = round((THESIS_TRIALS - 1) ** (1 / len(setup.odometry.space)))
     axes = {
         n: {"low": p.low, "high": p.high, "count": side}
-        for n, p in study.odometry.space.parameters.items()
+        for n, p in setup.odometry.space.parameters.items()
         if not isinstance(p, Categorical)
     }
     for sampler in ("grid", "random", "annealing", "tpe"):
         best = []
         for seed in THESIS_SEEDS:
             search = make_sampler(
-                study.odometry.space,
+                setup.odometry.space,
                 OfflineConfig(
                     sampler=sampler,
                     sampler_settings={"grid": axes} if sampler == "grid" else {},

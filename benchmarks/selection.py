@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import optuna
 from numpy.typing import NDArray
+from offline.validation import BANK_FRAMES, BANK_SIZE
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
@@ -37,7 +38,6 @@ from adaptune.model import (
     TrainingData,
 )
 from adaptune.space import Float, ParameterSpace
-from offline.validation import BANK_FRAMES, BANK_SIZE
 
 LENGTHS = (4541, 1101, 4661, 801, 271, 2761)
 """Scans of KITTI's sequences 00 to 05."""

@@ -24,11 +24,10 @@ from adaptune.model import ErrorModel, Selection
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import crop
 from adaptune.sequence import Scan, SequenceConfig, open_sequence
-from adaptune.study.study import Study
 from adaptune.trajectory import read_kitti
+from offline.offline_study import OfflineStudy, load_study
 from offline.train import train
-from offline.offline_study import load_study
-from offline.trial import PreparedSequence, run_trials
+from offline.trial import TrialSettings, TrialSetup
 from online.replay import adaptive, replay
 
 REPETITIONS = 5
@@ -79,20 +78,21 @@ def bare_gicp(
     return np.array(poses)
 
 
-def trial(study: Study) -> None:
+def trial(study: OfflineStudy) -> None:
     """One trial over prepared scans."""
-    sequence = PreparedSequence(study, "hall_begin", 8e9)
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    sequence = setup.prepare("hall_begin", 8e9)
     prepared = [(scan.cloud, scan.tree) for scan in sequence]
     parameters = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
     iterations = study.odometry.settings.iterations  # type: ignore[attr-defined]
     compare(
         f"trial, {len(prepared)} scans",
-        lambda: run_trials(study, sequence, [parameters], whole=True),
+        lambda: setup.run(sequence, [parameters], whole=True),
         lambda: bare_gicp(prepared, 2.0, 1.0, iterations),
     )
 
 
-def adaptive_replay(study: Study, model: ErrorModel) -> None:
+def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
     """Replay from the bag, selecting once a second, against read, prepare and align."""
     fixed = model.sets[model.fixed]
     street = study.sequences.open("street")

@@ -188,8 +188,6 @@ def replay(
         Seconds between selections.
     progress
         Called after every scan.
-    members
-        Of a bank, the sets that the weights of a selection belong to.
 
     Raises
     ------

@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from adaptune.study.config import RENAMED
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
 
@@ -41,13 +42,13 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
         assert load_study(study_file, [*stiff, given]).mechanism == mechanism
 
 
-def test_the_price_of_switching_is_kept_with_the_study(study_file, tmp_path):
+def test_the_study_keeps_the_switch_cost(study_file, tmp_path):
     study = load_study(study_file, folder=tmp_path)
     assert study.switch_cost() == 0.0
     found = {"of": study.switching_identity(), "switch_cost": 0.07}
     (tmp_path / "switching.json").write_text(json.dumps(found))
     assert study.switch_cost() == 0.07
-    # Another mechanism has another price.
+    # Another mechanism has another cost.
     other = load_study(study_file, ["online.switching.mechanism=hand_over"], tmp_path)
     assert other.switch_cost() == 0.0
     (tmp_path / "switching.json").write_text(json.dumps(found | {"switch_cost": -0.02}))
@@ -115,7 +116,10 @@ def test_reads_a_study(study_file, tmp_path):
             "{max_correspondence_distance: [1, 5, 0], keyframe_interval: [1, 0, 3]}}}",
             ["grid.max_correspondence_distance", "grid.keyframe_interval"],
         ),
-        ("offline={sampler: annealing, objective: [rte, rpe]}", ["annealing knows one objective"]),
+        (
+            "offline={sampler: annealing, objective: [rte, rpe]}",
+            ["annealing minimises one objective"],
+        ),
         ("offline.objective=rtee", ["offline.objective: there is no metric 'rtee'", "'rte'"]),
         ("offline.objective={rte: 1, appe: 1}", ["there is no metric 'appe'", "'ape'"]),
         ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
@@ -210,13 +214,11 @@ GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
             "offline: {sampler: grid, sampler_settings: {\n grid: {max_correspondence_distance:"
             " [1, 0.0001, 31623], keyframe_interval: {low: 1, high: 9, count: 31623}}}}",
             15,
-            "has 1,000,014,129 points, and nothing says when to stop; give offline.trials, hours,",
+            "has 1,000,014,129 points, and the study sets no budget; give offline.trials, hours,",
         ),
     ],
 )
-def test_names_mistakes_in_what_a_sampler_is_told_with_their_lines(
-    study_file, offline, line, words
-):
+def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline, line, words):
     file = study_file.with_name("sampler.yaml")
     lines = study_file.read_text().splitlines()
     file.write_text("\n".join([*lines[:-1], offline, ""]))
@@ -239,14 +241,14 @@ def test_a_large_grid_may_be_walked_with_a_budget(study_file):
     )
 
 
-def test_tells_what_to_install(study_file, monkeypatch):
+def test_names_what_to_install(study_file, monkeypatch):
     monkeypatch.setattr("offline.samplers.settings.find_spec", lambda _: None)
     for name, package in (("gp", "torch"), ("cmaes", "cmaes")):
         text = failure(study_file, f"offline.sampler={name}")
         assert f"{name} needs the package {package}: pip install 'adaptune[{name}]'" in text
 
 
-def test_tells_all_mistakes_at_once_with_their_lines(study_file):
+def test_reports_all_mistakes_at_once_with_their_lines(study_file):
     file = study_file.with_name("wrong.yaml")
     file.write_text(
         study_file.read_text()
@@ -263,6 +265,18 @@ def test_tells_all_mistakes_at_once_with_their_lines(study_file):
         "offline.trails",
     ]
     assert [int(line.split("line ")[1].split(":")[0]) for line in lines] == [6, 9, 12, 14]
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_a_renamed_key_names_the_new_one(study_file, old, new):
+    *sections, key = old.split(".")
+    file = study_file.with_name("renamed.yaml")
+    nested = "".join(f"{'  ' * i}{section}:\n" for i, section in enumerate(sections))
+    text = study_file.read_text()
+    file.write_text(f"{text}{nested}{'  ' * len(sections)}{key}: 3\n")
+    line = len(text.splitlines()) + len(sections) + 1
+    assert failure(file) == f"{file}, line {line}: {old}: is now called {new}"
+    assert failure(study_file, f"{old}=3") == f"-o: {old}: is now called {new}"
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from offline.budget import Clock, max_trials, spent
-from offline.train import train
 from offline.config import OfflineConfig
 from offline.objective import Verdict
 from offline.offline_study import load_study
+from offline.train import train
 
 
 def verdicts(*values):
@@ -103,9 +103,9 @@ def test_a_grid_is_walked_to_its_end(study_file, tmp_path, caplog):
     caplog.set_level("INFO")
     given = ["offline.sampler=grid", GRID, "offline.trials="]
     training = train(load_study(study_file, given, tmp_path / "run"))
-    pairs = [tuple(s.values()) for s in training.model.sets]
+    pairs = [tuple(s.values()) for s in training.model.sets.parameters]
     assert pairs[0] == (2.0, 1.0)
     assert pairs[1:] == [(d, k) for d in (1.0, 3.0) for k in (1.0, 5.0, 9.0)]
     assert "the search ends: there is nothing else to try" in caplog.text
     again = train(load_study(study_file, given, tmp_path / "run"))
-    assert again.model.sets == training.model.sets
+    assert again.model.sets.parameters == training.model.sets.parameters

@@ -15,8 +15,8 @@ from adaptune.descriptor import averaged
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.study.mistakes import ConfigurationError
-from offline.train import train
 from offline.offline_study import load_study
+from offline.train import train
 from offline.workers import WorkerError, Workers
 
 
@@ -69,7 +69,7 @@ def test_the_fixed_set_has_the_least_mean_of_means(trained):
 def test_the_model_is_that_of_the_trials(trained):
     study, training = trained
     model = ErrorModel.load(study.folder / "model.safetensors")
-    assert model.sets == training.model.sets
+    assert model.sets.parameters == training.model.sets.parameters
     assert model.sequences == ["one", "two"]
     assert model.errors.shape == (58, 10)
     frames = Archive(study.folder / "trials").read_frames("two")

@@ -10,11 +10,12 @@ import kills
 import optuna
 import postgres
 import pytest
+from setups import setup_of
 
 from offline import cluster
-from offline.train import train
 from offline.cluster import Cluster, ClusterError
 from offline.offline_study import load_study
+from offline.train import train
 
 distributed = pytest.importorskip("distributed")
 
@@ -82,14 +83,18 @@ def local(study_file, tmp_path_factory):
     return kills.contents(study.folder)
 
 
+def cluster_of(study, address):
+    return Cluster(setup_of(study), study.training, 1e9, address)
+
+
 def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler):
     study = load_study(study_file, [], tmp_path / "study")
     with pytest.raises(ClusterError, match="has no workers; start some with `dask worker tcp"):
-        Cluster(study, scheduler[0])
+        cluster_of(study, scheduler[0])
     with pytest.raises(ClusterError, match="cannot be reached"):
-        Cluster(study, "tcp://127.0.0.1:1")
+        cluster_of(study, "tcp://127.0.0.1:1")
     with pytest.raises(ClusterError, match="cannot be reached"):
-        Cluster(study, "nonsense://x")
+        cluster_of(study, "nonsense://x")
 
 
 def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, workers, local):
@@ -100,8 +105,8 @@ def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, wor
         study = load_study(study_file, [f"offline.storage={url}"], tmp_path / "study")
         train(study, cluster=scheduler[0])
         storage = url.replace("://", "+pg8000://")
-        told = optuna.load_study(study_name="study", storage=storage)
-        assert [t.user_attrs["adaptune trial"] for t in told.trials] == list(range(10))
+        mirror = optuna.load_study(study_name="study", storage=storage)
+        assert [t.user_attrs["adaptune trial"] for t in mirror.trials] == list(range(10))
     assert kills.contents(study.folder) == local
 
 
@@ -111,8 +116,8 @@ def test_recordings_that_workers_lack_are_sent_once(
 ):
     own, digests = cluster.fingerprint, []
 
-    def elsewhere(study, name):
-        digests.append(f"{own(study, name)}-sent")
+    def elsewhere(config):
+        digests.append(f"{own(config)}-sent")
         return digests[-1]
 
     # The workers, which are not patched, find that theirs are other recordings.

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from offline.validate import validate
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
 from adaptune.study.mistakes import ConfigurationError
-from offline.train import train
 from offline.offline_study import load_study
 from offline.pruning import estimate, rungs, survivors
+from offline.train import train
+from offline.validate import validate
 
 
 @given(st.sampled_from(["halving", "hyperband", "wilcoxon"]), st.integers(1, 50), st.integers(1, 9))

@@ -8,8 +8,8 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.study.mistakes import ConfigurationError
-from offline.train import train
 from offline.offline_study import load_study
+from offline.train import train
 
 
 @pytest.fixture

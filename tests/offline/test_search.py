@@ -6,18 +6,20 @@ import itertools
 import drawn
 import numpy as np
 import pytest
-from offline.validation import labelled_sequences, leave_one_out
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.model import ErrorModel
+from adaptune.parameter_sets import ParameterSets
 from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
-from offline.train import train
+from offline.labelled import labelled_data
+from offline.leave_one_out import leave_one_out
 from offline.objective import choose_fixed
 from offline.offline_study import load_study
 from offline.search import make_stages, owner
+from offline.train import train
 
 NAMES = ["one", "two", "three"]
 
@@ -59,6 +61,11 @@ def run(study):
     return verdicts, seen, archive
 
 
+def stages_of(study, finished):
+    space = study.odometry.space
+    return make_stages(study.config.offline, space, study.training, finished)
+
+
 def sets(archive):
     """All parameter sets in the archive, by sequence and number."""
     return {(name, n): s.parameters for name in NAMES for n, s in archive.finished(name).items()}
@@ -68,7 +75,7 @@ def sets(archive):
 def test_every_number_is_of_one_search(study_of, kind):
     study = study_of(sets=kind)
     finished = {name: {} for name in NAMES}
-    stages = make_stages(study, finished)
+    stages = stages_of(study, finished)
     searches = [search for stage in stages for search in stage.searches]
     assert len(searches) == {"shared": 1, "own": 3, "both": 4}[kind]
     numbers = sorted(search.number(i) for search in searches for i in range(1, 20))
@@ -167,7 +174,7 @@ def test_a_search_that_is_over_waits_for_the_others(study_of):
 
 def test_views_search_for_themselves(study_of):
     study = study_of(sets="own", augment="[{reverse: true}]")
-    (stage,) = make_stages(study, {name: {} for name in study.training})
+    (stage,) = stages_of(study, {name: {} for name in study.training})
     assert [search.sequences for search in stage.searches] == [[name] for name in study.training]
     assert len(stage.searches) == 6
 
@@ -175,23 +182,24 @@ def test_views_search_for_themselves(study_of):
 def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     study = study_of(sets="own")
     verdicts, _, archive = run(study)
-    fixed = choose_fixed(study.config.offline, verdicts)
-    from offline.campaign import fit
-
-    model = fit(study, archive, verdicts, fixed)
-    assert np.isnan(model.errors).any()
-    sequences, unit, _ = labelled_sequences(study, model)
-    complete = [n for n, v in verdicts.items() if v.complete]
-    assert len(unit) == len(complete)
-    for sequence in sequences:
-        assert [n for n, own in zip(complete, sequence.own, strict=True) if own] == [
-            n for n in complete if owner(study.config.offline, NAMES, n) == sequence.name
+    sets = ParameterSets(
+        study.odometry.space, tuple(verdicts), tuple(v.parameters for v in verdicts.values())
+    )
+    seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
+    data = labelled_data(archive, seen, sets, study.config, study.window)
+    assert np.isnan(data.sequences[0].errors).any()
+    complete = data.complete()
+    assert list(complete.sets) == [n for n, v in verdicts.items() if v.complete]
+    assert complete.fixed() == choose_fixed(study.config.offline, verdicts)
+    for sequence in complete.sequences:
+        assert sequence.own.tolist() == [
+            owner(study.config.offline, NAMES, n) == sequence.name for n in complete.sets
         ]
-    validation = leave_one_out(sequences, unit)
+    validation = leave_one_out(complete)
     for left_out in validation.left_out:
         known = [
             archive.finished(left_out.name)[n].mean_error
-            for n in complete
+            for n in complete.sets
             if owner(study.config.offline, NAMES, n) != left_out.name
         ]
         assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
@@ -210,7 +218,9 @@ def test_from_end_to_end(study_file, tmp_path):
     assert len(rows) == len(model.sets) == 1 + 2 * 4
     run_everywhere = [row for row in rows if row["mean"]]
     assert 1 <= len(run_everywhere) <= 3
-    assert float(rows[model.fixed]["mean"]) == min(float(row["mean"]) for row in run_everywhere)
+    assert float(rows[model.sets.column(model.fixed)]["mean"]) == min(
+        float(row["mean"]) for row in run_everywhere
+    )
     for s, name in enumerate(("one", "two")):
         missing = np.isnan(model.errors[model.sequence == s])
         assert (missing.all(axis=0) == missing.any(axis=0)).all()

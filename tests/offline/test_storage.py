@@ -10,7 +10,7 @@ from optuna.storages.journal import JournalFileBackend
 
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
-from offline.storage import JOURNAL, StorageError, Told, open_mirror
+from offline.storage import JOURNAL, MirrorRow, StorageError, open_mirror
 
 
 @pytest.fixture
@@ -24,14 +24,18 @@ def at(study_file, folder, *overrides):
     return study
 
 
-def told(number):
+def mirror_of(study, finished):
+    return open_mirror(study.folder, study.config.offline, study.odometry.space, finished)
+
+
+def row(number):
     rng = np.random.default_rng(number)
     parameters = {
         "max_correspondence_distance": rng.uniform(0.1, 5.0),
         "keyframe_interval": rng.uniform(0.5, 15.0),
     }
     attributes = {"one": rng.random(), "lost": number}
-    return Told(parameters, (rng.gamma(1.0),), attributes, {"ms_per_scan <= 9": rng.normal()})
+    return MirrorRow(parameters, (rng.gamma(1.0),), attributes, {"ms_per_scan <= 9": rng.normal()})
 
 
 def in_journal(study):
@@ -43,33 +47,33 @@ def assert_mirrors(mirror, n):
     trials = mirror.get_trials()
     assert [trial.number for trial in trials] == list(range(n))
     for trial in trials:
-        expected = told(trial.number)
+        expected = row(trial.number)
         assert (trial.params, trial.values) == (expected.parameters, list(expected.values))
         assert expected.attributes.items() <= trial.user_attrs.items()
         assert trial.constraints == expected.constraints
 
 
 def test_trials_are_told_once_and_in_order(study):
-    open_mirror(study, {}).tell(range(3), told)
-    mirror = open_mirror(study, {})
-    mirror.tell(range(3), told)
-    mirror.tell(range(5), told)
-    mirror.tell(range(4), told)
+    mirror_of(study, {}).report(range(3), row)
+    mirror = mirror_of(study, {})
+    mirror.report(range(3), row)
+    mirror.report(range(5), row)
+    mirror.report(range(4), row)
     assert_mirrors(in_journal(study), 5)
 
 
 def test_numbers_may_come_in_any_order(study):
     """As where every sequence has a search of its own."""
-    open_mirror(study, {}).tell([0, 3, 1], told)
-    open_mirror(study, {}).tell([0, 3, 6, 1, 4], told)
+    mirror_of(study, {}).report([0, 3, 1], row)
+    mirror_of(study, {}).report([0, 3, 6, 1, 4], row)
     numbers = [trial.user_attrs["adaptune trial"] for trial in in_journal(study).get_trials()]
     assert numbers == [0, 3, 1, 6, 4]
 
 
 def test_a_journal_that_knows_all_is_not_replayed(study, monkeypatch):
-    open_mirror(study, {}).tell(range(3), told)
+    mirror_of(study, {}).report(range(3), row)
     monkeypatch.setattr(optuna, "create_study", None)
-    open_mirror(study, {}).tell(range(3), None)
+    mirror_of(study, {}).report(range(3), None)
 
 
 def cut_short(journal):
@@ -92,14 +96,14 @@ def lock(journal):
 
 @pytest.mark.parametrize("harm", [cut_short, garble, empty, Path.unlink, lock])
 def test_a_damaged_journal_is_made_anew(study, harm):
-    open_mirror(study, {}).tell(range(4), told)
+    mirror_of(study, {}).report(range(4), row)
     harm(study.folder / JOURNAL)
-    open_mirror(study, {}).tell(range(5), told)
+    mirror_of(study, {}).report(range(5), row)
     assert_mirrors(in_journal(study), 5)
 
 
 def test_what_is_no_number_is_a_failed_trial(study):
-    open_mirror(study, {}).tell(range(1), lambda n: told(n)._replace(values=(float("nan"),)))
+    mirror_of(study, {}).report(range(1), lambda n: row(n)._replace(values=(float("nan"),)))
     (trial,) = in_journal(study).get_trials()
     assert trial.state == optuna.trial.TrialState.FAIL
 
@@ -114,28 +118,28 @@ def database():
 def test_a_database_is_told_the_same(study_file, tmp_path, database):
     _, url = database
     study = at(study_file, tmp_path, f"offline.storage={url}")
-    open_mirror(study, {}).tell(range(3), told)
-    finished = {n: told(n).parameters for n in range(3)}
-    open_mirror(study, finished).tell(range(5), told)
+    mirror_of(study, {}).report(range(3), row)
+    finished = {n: row(n).parameters for n in range(3)}
+    mirror_of(study, finished).report(range(5), row)
     mirror = optuna.load_study(study_name="mirrored", storage=url.replace("://", "+pg8000://"))
     assert_mirrors(mirror, 5)
-    for others in ({}, {0: told(7).parameters}):
+    for others in ({}, {0: row(7).parameters}):
         with pytest.raises(StorageError, match="holds 5 trials of another study named mirrored"):
-            open_mirror(study, others)
+            mirror_of(study, others)
 
 
 def test_a_database_that_goes_is_told_later(study_file, tmp_path, database, caplog):
     server, url = database
     study = at(study_file, tmp_path, f"offline.storage={url}")
-    mirror = open_mirror(study, {})
-    mirror.tell(range(1), told)
+    mirror = mirror_of(study, {})
+    mirror.report(range(1), row)
     server.stop()
-    mirror.tell(range(2), told)
-    mirror.tell(range(3), told)
-    assert caplog.text.count("is not told of trials now") == 1
+    mirror.report(range(2), row)
+    mirror.report(range(3), row)
+    assert caplog.text.count("does not receive trials now") == 1
     server.start()
-    mirror.tell(range(4), told)
-    mirror.tell(range(5), told)
+    mirror.report(range(4), row)
+    mirror.report(range(5), row)
     assert_mirrors(mirror._mirror, 5)
 
 
@@ -153,7 +157,7 @@ def test_a_storage_that_cannot_be_used_is_told_without_its_password(
 ):
     study = at(study_file, tmp_path, f"offline.storage={url}")
     with pytest.raises(StorageError, match=words) as told_:
-        open_mirror(study, {})
+        mirror_of(study, {})
     assert "offline.storage" in str(told_.value)
     assert "secret" not in str(told_.value)
 

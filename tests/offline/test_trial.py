@@ -4,15 +4,16 @@ import itertools
 import drives
 import numpy as np
 import pytest
+from setups import made_of, setup_of
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
 from adaptune.metrics import sub_trajectory_rte, window_ends
 from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.study.study import Study
+from adaptune.sequence import SequenceConfig
 from offline.offline_study import load_study
-from offline.trial import PreparedSequence, episodes, run_trials
+from offline.trial import episodes
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 
@@ -23,8 +24,8 @@ def study(study_file, tmp_path_factory):
 
 
 def test_a_good_trial(study):
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [GOOD])
+    sequence = setup_of(study).prepare("one", 1e9)
+    (trial,) = setup_of(study).run(sequence, [GOOD])
     assert trial.parameters == GOOD
     assert not trial.restarted.any()
     assert trial.registered.all()
@@ -37,7 +38,7 @@ def test_a_good_trial(study):
 
 def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_path):
     study = load_study(study_file, ["descriptor=[ndt, motion]"], tmp_path)
-    frames = PreparedSequence(study, "one", 1e9).frames
+    frames = setup_of(study).prepare("one", 1e9).frames
     assert frames.blocks == {"ndt": 90, "motion": 2}
     np.testing.assert_allclose(frames.descriptors[:2, 90], 0.0)
     # 0.3 m a scan, ten scans a second.
@@ -48,26 +49,26 @@ def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_p
 def test_what_cannot_be_described_names_the_sequence(study_file, tmp_path):
     study = load_study(study_file, ["descriptor=[ndt, intensity]"], tmp_path)
     with pytest.raises(AdaptuneError, match=r"sequences.one: the points of .* no intensity"):
-        PreparedSequence(study, "one", 1e9)
+        setup_of(study).prepare("one", 1e9)
 
 
 def test_trials_side_by_side_are_those_one_by_one(study):
-    sequence = PreparedSequence(study, "one", 1e9)
+    sequence = setup_of(study).prepare("one", 1e9)
     sets = [GOOD, GOOD | {"keyframe_interval": 5.0}, GOOD | {"max_correspondence_distance": 0.2}]
-    together = run_trials(study, sequence, sets)
+    together = setup_of(study).run(sequence, sets)
     for parameters, trial in zip(sets, together, strict=True):
-        (alone,) = run_trials(study, sequence, [parameters])
+        (alone,) = setup_of(study).run(sequence, [parameters])
         np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
     assert not np.array_equal(together[0].T_odom_sensor, together[1].T_odom_sensor)
 
 
 @pytest.mark.parametrize("memory", [0.0, 2e6])
 def test_scans_that_do_not_fit_are_read_again(study, memory):
-    whole = PreparedSequence(study, "one", 1e9)
-    part = PreparedSequence(study, "one", memory)
+    whole = setup_of(study).prepare("one", 1e9)
+    part = setup_of(study).prepare("one", memory)
     assert part.nbytes <= memory < whole.nbytes
     for _ in range(2):
-        (a,), (b,) = run_trials(study, whole, [GOOD]), run_trials(study, part, [GOOD])
+        (a,), (b,) = setup_of(study).run(whole, [GOOD]), setup_of(study).run(part, [GOOD])
         np.testing.assert_array_equal(a.T_odom_sensor, b.T_odom_sensor)
 
 
@@ -92,29 +93,24 @@ class Slipping(KeyframeGicp):
         return Registration(T @ self.slip, ok)
 
 
-def test_a_lost_track_starts_anew_at_the_reference(study, monkeypatch):
-    boxes = []
-
-    def odometry(self, parameters=None, _=None):
-        boxes.append(Slipping(parameters, self.settings))
-        return boxes[-1]
-
-    monkeypatch.setattr(Study, "odometry", odometry)
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [GOOD])
+def test_a_lost_track_starts_anew_at_the_reference(study):
+    instances = []
+    setup = setup_of(study, made_of(Slipping, study, instances))
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [GOOD])
     frames = sequence.frames
     # 3 m/s at 10 Hz bounds a step's departure by 0.3 m: the second slip is none.
     assert 10 in np.flatnonzero(trial.restarted)
     assert 25 not in np.flatnonzero(trial.restarted)
     np.testing.assert_array_equal(trial.T_odom_sensor[10], frames.T_ref_sensor[10])
-    _, T, motion = next(s for s in boxes[-1].starts if s[0] == 10 and s[2] is not None)
+    _, T, motion = next(s for s in instances[-1].starts if s[0] == 10 and s[2] is not None)
     np.testing.assert_array_equal(T, frames.T_ref_sensor[10])
     np.testing.assert_allclose(
         motion, invert(frames.T_ref_sensor[9]) @ frames.T_ref_sensor[10], atol=1e-12
     )
 
 
-def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monkeypatch):
+def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study):
     class Lost(Slipping):
         def register(self, prepared):
             self.scan += 1
@@ -124,9 +120,9 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monk
                 T[1, 3] += 5.0
             return Registration(T, ok)
 
-    monkeypatch.setattr(Study, "odometry", lambda self, p=None, _=None: Lost(p, self.settings))
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(study, sequence, [GOOD])
+    setup = setup_of(study, made_of(Lost, study))
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [GOOD])
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     # Eleven steps of 0.3 m are more than 3 m: windows from -1 (none) to 9 cross the step to 10.
     assert np.flatnonzero(np.isinf(trial.errors)).tolist() == list(range(10))
@@ -134,13 +130,13 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study, monk
     assert trial.mean_error == pytest.approx((10 * 30.0 + trial.errors[10:29].sum()) / 29)
     # What the odometry did counts, not the new start.
     assert trial.unhealthy == {"max_speed": 1}
-    (whole,) = run_trials(study, sequence, [GOOD], whole=True)
+    (whole,) = setup.run(sequence, [GOOD], whole=True)
     assert not whole.restarted.any()
     assert whole.unhealthy == {"max_speed": 2}
     assert np.isfinite(whole.errors[:29]).all()
 
 
-def test_repeats_are_averaged_and_kept(study, monkeypatch):
+def test_repeats_are_averaged_and_kept(study):
     made = []
 
     class Wavering(KeyframeGicp):
@@ -159,9 +155,9 @@ def test_repeats_are_averaged_and_kept(study, monkeypatch):
             T[1, 3] += 5.0 * (self.number == 4 and self.scan == 10)
             return Registration(T, ok)
 
-    monkeypatch.setattr(Study, "odometry", lambda self, p=None, _=None: Wavering(p, self.settings))
-    sequence = PreparedSequence(study, "one", 1e9)
-    (trial,) = run_trials(with_offline(study, repeats=3), sequence, [GOOD])
+    wavering = made_of(Wavering, study)
+    sequence = setup_of(study, wavering).prepare("one", 1e9)
+    (trial,) = setup_of(study, wavering, repeats=3).run(sequence, [GOOD])
     assert len(made) == 4
     errors = [of_run["rte"] for of_run in trial.repeats]
     assert errors[0] < errors[1] < errors[2]
@@ -169,13 +165,13 @@ def test_repeats_are_averaged_and_kept(study, monkeypatch):
     assert trial.errors[5] > 10.0
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     assert trial.metrics["ape"] == pytest.approx(np.mean([r["ape"] for r in trial.repeats]))
-    (alone,) = run_trials(study, sequence, [GOOD])
+    (alone,) = setup_of(study, wavering).run(sequence, [GOOD])
     np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
 
 
 @pytest.mark.parametrize("length", [1.0, 2.5, 3.0, 50.0])
 def test_every_sub_trajectory_lies_in_an_episode(study, length):
-    T = PreparedSequence(study, "one", 1e9).frames.T_ref_sensor
+    T = setup_of(study).prepare("one", 1e9).frames.T_ref_sensor
     pieces = episodes(T, length)
     assert pieces[0][0] == 0
     assert pieces[-1][1] == len(T)
@@ -186,22 +182,14 @@ def test_every_sub_trajectory_lies_in_an_episode(study, length):
         assert ends[begin:after].max() < end
 
 
-def test_episodes_begin_anew_and_do_not_hide_what_happens_between(study, monkeypatch):
-    boxes = []
-
-    def odometry(self, parameters=None, _=None):
-        boxes.append(Slipping(parameters, self.settings))
-        return boxes[-1]
-
-    monkeypatch.setattr(Study, "odometry", odometry)
-    short = dataclasses.replace(
-        study, config=study.config.model_copy(update={"sub_trajectory": 1.0})
-    )
-    short = with_offline(short, runs="episodes")
-    sequence = PreparedSequence(short, "one", 1e9)
-    (trial,) = run_trials(short, sequence, [GOOD])
+def test_episodes_begin_anew_and_do_not_hide_what_happens_between(study):
+    instances = []
+    slipping = made_of(Slipping, study, instances)
+    setup = setup_of(study, slipping, sub_trajectory=1.0, runs="episodes")
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [GOOD])
     pieces = episodes(sequence.frames.T_ref_sensor, 1.0)
-    assert [b.starts[0][0] for b in boxes[1:]] == [0] * len(pieces)
+    assert [b.starts[0][0] for b in instances[1:]] == [0] * len(pieces)
     for begin, _ in pieces:
         np.testing.assert_array_equal(
             trial.T_odom_sensor[begin], sequence.frames.T_ref_sensor[begin]
@@ -217,37 +205,30 @@ def test_episodes_begin_anew_and_do_not_hide_what_happens_between(study, monkeyp
 
 
 def test_whole_runs_as_trials(study):
-    sequence = PreparedSequence(study, "one", 1e9)
-    (a,) = run_trials(with_offline(study, runs="whole", repeats=1), sequence, [GOOD])
-    (b,) = run_trials(study, sequence, [GOOD], whole=True)
+    sequence = setup_of(study).prepare("one", 1e9)
+    (a,) = setup_of(study, runs="whole", repeats=1).run(sequence, [GOOD])
+    (b,) = setup_of(study).run(sequence, [GOOD], whole=True)
     np.testing.assert_array_equal(a.errors, b.errors)
-
-
-def with_offline(study, **changes):
-    offline = study.config.offline.model_copy(update=changes)
-    return dataclasses.replace(study, config=study.config.model_copy(update={"offline": offline}))
 
 
 def test_a_reference_of_another_time_is_refused(study, tmp_path):
     drives.write_bag(tmp_path / "late.bag", drives.scans(0, 12), reference_delay=10**12)
     with pytest.raises(AdaptuneError, match=r"late\.bag: the reference tells of .*clock_offset"):
-        PreparedSequence(with_bag(study, tmp_path / "late.bag"), "one", 1e9)
+        prepare(study, tmp_path / "late.bag")
 
 
 def test_a_sequence_shorter_than_the_sub_trajectory_is_refused(study, tmp_path):
     drives.write_bag(tmp_path / "short.bag", drives.scans(0, 9))
     with pytest.raises(AdaptuneError, match=r"path of 2\.4 m holds no sub-trajectory of 3 m"):
-        PreparedSequence(with_bag(study, tmp_path / "short.bag"), "one", 1e9)
+        prepare(study, tmp_path / "short.bag")
 
 
 def test_a_sequence_without_reference_is_refused(study):
     with pytest.raises(AdaptuneError, match=r"sequences\.one: training needs a reference"):
-        PreparedSequence(with_bag(study, study.config.sequences["one"].bag, None), "one", 1e9)
+        prepare(study, study.config.sequences["one"].bag, None)
 
 
-def with_bag(study, bag, reference="/truth"):
-    entry = study.config.sequences["one"].model_copy(
-        update={"bag": str(bag), "reference": reference}
-    )
-    config = study.config.model_copy(update={"sequences": {"one": entry}})
-    return dataclasses.replace(study, config=config)
+def prepare(study, bag, reference="/truth"):
+    config = SequenceConfig(bag=str(bag), points="/points", reference=reference)
+    sequences = dataclasses.replace(study.sequences, recordings={"one": config})
+    dataclasses.replace(setup_of(study), sequences=sequences).prepare("one", 1e9)

@@ -7,18 +7,16 @@ import numpy as np
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.model import ErrorModel, Selection, Settings
+from adaptune.model import BankSettings, ErrorModel
+from adaptune.selection import Selection
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
-from offline.train import train
 from offline.offline_study import load_study
-from online.comparison import (
-    ComparisonError,
-    _warn_of_scant_evidence,
-    bank_sets,
-    compare,
-    run_replays,
-)
+from offline.train import train
+from online.comparison import compare
+from online.modes import ModeError, ReplaySetup
+from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
+from online.stored_replays import StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
 
@@ -38,14 +36,14 @@ def replayed(trained):
 
 def test_rows_and_files(replayed):
     rows = compare(replayed)
-    assert [(row["sequence"], row["mode"]) for row in rows] == [("three", mode) for mode in MODES]
-    of = {row["mode"]: row for row in rows}
-    assert of["fixed"]["vs fixed"] == 1.0
+    assert [(row.sequence, row.mode) for row in rows] == [("three", mode) for mode in MODES]
+    of = {row.mode: row for row in rows}
+    assert of["fixed"].vs_fixed == 1.0
     for row in rows:
         # Three blocks of a sub-trajectory's length say nothing of other drives.
-        assert row["_blocks"] < 10
-        assert row["95 %"] is None
-        assert row["vs fixed"] == pytest.approx(row["RTE [%]"] / of["fixed"]["RTE [%]"])
+        assert row.blocks < 10
+        assert row.ratio_interval is None
+        assert row.vs_fixed == pytest.approx(row.rte / of["fixed"].rte)
     folder = replayed.folder / "comparison"
     with (folder / "comparison.csv").open() as file:
         assert [row["mode"] for row in csv.DictReader(file)] == MODES
@@ -57,14 +55,14 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
     model = ErrorModel.load(replayed.folder / "model.safetensors")
     folder = replayed.folder / "replays/three"
     about = {m: json.loads((folder / m / "replay.json").read_text())["about"] for m in MODES}
-    assert about["baseline"]["parameters"] == replayed.space.baseline
+    assert about["baseline"]["parameters"] == replayed.odometry.space.baseline
     assert about["fixed"]["parameters"] == model.sets[model.fixed]
     for mode in ("paired", "paper"):
         with (folder / mode / "selections.csv").open() as file:
             rows = list(csv.DictReader(file))
         assert len(rows) == 4  # 40 scans at 10 Hz
         for row in rows:
-            chosen = model.sets[int(row["set"])]
+            chosen = model.sets[int(row["trial"])]
             assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
 
 
@@ -76,9 +74,9 @@ def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
         blocks=model.blocks | {"intensity": 29},
         descriptors=np.hstack([model.descriptors, lit]),
     )
-    model.save(tmp_path / "lit.npz")
-    with pytest.raises(ComparisonError, match=r"sequences\.three: the points of scan .* no intens"):
-        run_replays(trained, tmp_path / "lit.npz", again=True)
+    model.save(tmp_path / "lit.safetensors")
+    with pytest.raises(ReplayError, match=r"sequences\.three: the points of scan .* no intens"):
+        run_replays(trained, tmp_path / "lit.safetensors", again=True)
 
 
 @pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
@@ -87,19 +85,18 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
     given = [f"online.switching.mechanism={mechanism}", "online.switching.warm_up=0.5"]
     study = load_study(study_file, [*given, "online.period=0.5"], trained.folder)
     assert run_replays(study, trained.folder / "model.safetensors") == 4
-    row = next(row for row in compare(study) if row["mode"] == "paired")
-    assert row["RTE [%]"] < 3.0
+    row = next(row for row in compare(study) if row.mode == "paired")
+    assert row.rte < 3.0
     folder = study.folder / "replays/three/paired"
     about = json.loads((folder / "replay.json").read_text())["about"]
     assert about["switching"]["mechanism"] == mechanism
     assert about["switching"]["warm_up"]["seconds"] == 0.5
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
-    members = model.bank if mechanism == "bank" else range(len(model.sets))
+    members = model.bank if mechanism == "bank" else model.sets
     for row in rows:
-        # The numbers are those of the model, not of the bank.
-        assert int(row["set"]) in members
-        chosen = model.sets[int(row["set"])]
+        assert int(row["trial"]) in members
+        chosen = model.sets[int(row["trial"])]
         assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
         # Two training sequences do not show that a bank pays.
         assert row["weights"] == ""
@@ -110,30 +107,30 @@ def test_a_bank_that_pays_is_weighed(trained, study_file):
     """And what is replayed does not end in failure."""
     model = ErrorModel.load(trained.folder / "model.safetensors")
     assert len(model.bank) == 4
-    assert model.fusion.hedge == 1.0
-    paying = replace(model, fusion=Settings(hedge=0.5))
-    path = trained.folder / "paying.npz"
+    assert not model.bank_adapts
+    paying = replace(model, bank_settings=BankSettings(min_fixed_share=0.5))
+    path = trained.folder / "paying.safetensors"
     paying.save(path)
     study = load_study(study_file, ["online.switching.mechanism=bank"], trained.folder)
     run_replays(study, path)
     folder = study.folder / "replays/three"
     with (folder / "paired/selections.csv").open() as file:
         for row in csv.DictReader(file):
-            weights = [float(weight) for weight in row["weights"].split()]
-            assert len(weights) == 4
-            assert weights[0] >= 0.5
-            assert sum(weights) == pytest.approx(1.0, abs=0.002)
-            assert int(row["set"]) == model.fixed
+            pairs = [pair.split(":") for pair in row["weights"].split()]
+            weights = {int(trial): float(weight) for trial, weight in pairs}
+            assert list(weights) == model.bank
+            assert weights[model.fixed] >= 0.5
+            assert sum(weights.values()) == pytest.approx(1.0, abs=0.002)
+            assert int(row["trial"]) == model.fixed
     # The published rule chooses among its members.
     with (folder / "paper/selections.csv").open() as file:
-        assert {int(row["set"]) for row in csv.DictReader(file)} <= set(model.bank)
-    error = next(row["RTE [%]"] for row in compare(study) if row["mode"] == "paired")
-    assert error < 3.0
+        assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.bank)
+    assert next(row.rte for row in compare(study) if row.mode == "paired") < 3.0
     more = load_study(study_file, ["online.switching.mechanism=bank"], trained.folder)
-    with pytest.raises(ComparisonError, match=r"switching\.size: the model was fitted for another"):
-        bank_sets(more, replace(model, bank=model.bank[:3]))
-    with pytest.raises(ComparisonError, match=r"switching\.sets: the model was fitted for another"):
-        bank_sets(more, replace(model, bank=model.bank[::-1]))
+    with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
+        ReplaySetup.of(more).members(replace(model, bank=model.bank[:3]))
+    with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
+        ReplaySetup.of(more).members(replace(model, bank=model.bank[::-1]))
     run_replays(trained, trained.folder / "model.safetensors")
 
 
@@ -142,34 +139,29 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
     bank = "online.switching.mechanism=bank"
     named = load_study(study_file, [bank, "online.switching.sets=[3, 0]"], trained.folder)
     of_two = replace(model, bank=[3, 0])
-    assert bank_sets(named, of_two) == ([3, 0], [model.sets[3], model.sets[0]])
+    members = ReplaySetup.of(named).members(of_two)
+    assert list(members.items()) == [(3, model.sets[3]), (0, model.sets[0])]
     values = "{" + ", ".join(f"{k}: {v!r}" for k, v in model.sets[4].items()) + "}"
     named = load_study(study_file, [bank, f"online.switching.sets=[{values}, 1]"], trained.folder)
-    assert bank_sets(named, replace(model, bank=[4, 1]))[0] == [4, 1]
+    assert list(ReplaySetup.of(named).members(replace(model, bank=[4, 1]))) == [4, 1]
     # They go by their trials, whatever sets were left out of the model.
-    some = replace(
-        model,
-        sets=model.sets[2:],
-        errors=model.errors[:, 2:],
-        fixed=0,
-        provenance={"trials": model.trials[2:]},
-        bank=[1, 0],
-    )
+    some = replace(model, sets=model.sets.subset(model.sets.trials[2:]), bank=[3, 2])
+    some = replace(some, errors=model.errors[:, 2:], fixed=2)
     by_number = load_study(study_file, [bank, "online.switching.sets=[3, 2]"], trained.folder)
-    assert bank_sets(by_number, some) == ([1, 0], [model.sets[3], model.sets[2]])
+    assert list(ReplaySetup.of(by_number).members(some)) == [3, 2]
     twice = load_study(study_file, [bank, "online.switching.sets=[3, 3]"], trained.folder)
-    with pytest.raises(ComparisonError, match=r"switching\.sets\.1: is in the bank already"):
+    with pytest.raises(ModeError, match=r"switching\.sets\.1: is in the bank already"):
         run_replays(twice, trained.folder / "model.safetensors")
-    with pytest.raises(ComparisonError, match=r"switching\.sets: the model was fitted for another"):
-        bank_sets(named, replace(model, bank=[0, 1, 2]))
+    with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
+        ReplaySetup.of(named).members(replace(model, bank=[0, 1, 2]))
     errors = model.errors.copy()
     errors[:3, 4] = np.nan
-    with pytest.raises(ComparisonError, match=r"switching\.sets\.0: was not run on every"):
-        bank_sets(named, replace(model, errors=errors))
+    with pytest.raises(ModeError, match=r"switching\.sets\.0: was not run on every"):
+        ReplaySetup.of(named).members(replace(model, errors=errors))
     for unknown in ("[0, 10]", "[{keyframe_interval: 1.2345}, 0]"):
         study = load_study(study_file, [bank, f"online.switching.sets={unknown}"], trained.folder)
-        with pytest.raises(ComparisonError, match=r"switching\.sets\..: is none of the 10"):
-            bank_sets(study, model)
+        with pytest.raises(ModeError, match=r"switching\.sets\..: is none of the 10"):
+            ReplaySetup.of(study).members(model)
 
 
 def test_replays_are_made_once(replayed, study_file):
@@ -186,10 +178,10 @@ def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_
     study = load_study(study_file, ["sequences.three.reference="], trained.folder)
     run_replays(study, trained.folder / "model.safetensors")
     rows = compare(study)
-    assert [row["RTE [%]"] for row in rows] == [None] * 4
+    assert [row.rte for row in rows] == [None] * 4
     assert not (study.folder / "replays/three/reference.tum").exists()
     run_replays(trained, trained.folder / "model.safetensors")
-    assert compare(trained)[0]["RTE [%]"] is not None
+    assert compare(trained)[0].rte is not None
 
 
 def test_a_written_reference_is_that_of_the_scans(replayed):
@@ -209,10 +201,10 @@ def test_rows_over_several_sequences(replayed, study_file):
     )
     run_replays(study, replayed.folder / "model.safetensors")
     rows = compare(study)
-    assert [row["sequence"] for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all 2"] * 4
+    assert [row.sequence for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all 2"] * 4
     a, b, all_ = rows[3], rows[7], rows[11]
-    assert all_["RTE [%]"] == pytest.approx((a["RTE [%]"] + b["RTE [%]"]) / 2)
-    assert all_["vs fixed"] == pytest.approx((a["vs fixed"] * b["vs fixed"]) ** 0.5)
+    assert all_.rte == pytest.approx((a.rte + b.rte) / 2)
+    assert all_.vs_fixed == pytest.approx((a.vs_fixed * b.vs_fixed) ** 0.5)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +223,7 @@ def test_refuses_a_model_of_something_else(trained, study_file, override, words)
 
 def test_names_a_missing_replay(study_file, tmp_path):
     study = load_study(study_file, [], tmp_path / "study")
-    with pytest.raises(ComparisonError, match="adaptune online"):
+    with pytest.raises(StoredReplayError, match="adaptune online"):
         compare(study)
 
 
@@ -262,7 +254,7 @@ def test_a_damaged_replay_is_named(replayed, file, text):
     before = path.read_text()
     path.write_text(text)
     try:
-        with pytest.raises(ComparisonError, match=rf"{file}: is damaged .*--again"):
+        with pytest.raises(StoredReplayError, match=rf"{file}: is damaged .*--again"):
             compare(replayed)
     finally:
         path.write_text(before)
@@ -270,15 +262,15 @@ def test_a_damaged_replay_is_named(replayed, file, text):
 
 def test_replays_of_another_setting_are_refused(replayed, study_file):
     other = load_study(study_file, ["online.period=2"], replayed.folder)
-    with pytest.raises(ComparisonError, match="was replayed with another period"):
+    with pytest.raises(StoredReplayError, match="was replayed with another period"):
         compare(other)
 
 
-def test_selections_that_rest_on_one_sequence_are_told_of(caplog):
-    def selection(index, sequences):
-        return Selection(index, 0.5, 1.0, 1.0, sequences)
+def test_a_warning_of_selections_that_rest_on_one_sequence(caplog):
+    def selection(trial, n_sequences):
+        return Selection(trial, {}, n_sequences=n_sequences)
 
-    _warn_of_scant_evidence("a", [selection(0, 1.0), selection(1, 3.0), selection(1, math.nan)], 0)
+    warn_of_scant_evidence("a", [selection(0, 1.0), selection(1, 3.0), selection(1, math.nan)], 0)
     assert not caplog.messages
-    _warn_of_scant_evidence("b", [selection(0, 1.0), selection(1, 1.2), selection(1, 3.0)], 0)
+    warn_of_scant_evidence("b", [selection(0, 1.0), selection(1, 1.2), selection(1, 3.0)], 0)
     assert caplog.messages[0].startswith("b: 1 of 2 selections of another set")

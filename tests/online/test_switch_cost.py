@@ -4,15 +4,15 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from offline.offline_study import load_study
-from online import switching
+from online import switch_cost
 
 
-def test_every_mechanism_is_priced(study_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(switching, "PERIOD", 1.0)
+def test_the_switch_cost_of_every_mechanism(study_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(switch_cost, "PERIOD", 1.0)
     given = ["online.switching.mechanism=hand_over", "online.switching.warm_up=0.3"]
     study = load_study(study_file, given, tmp_path)
     seen = []
-    rows = switching.measure_switching(study, 10.0, lambda *told: seen.append(told))
+    rows = switch_cost.measure_switching(study, 10.0, lambda *step: seen.append(step))
     ratios = {row["mechanism"]: row["RTE ratio"] for row in rows}
     # All of the drive lies within every warm-up but the last.
     assert list(ratios) == [
@@ -36,8 +36,8 @@ def test_every_mechanism_is_priced(study_file, tmp_path, monkeypatch):
     assert study.switch_cost() == max(0.0, kept["switch_cost"])
 
 
-def test_too_short_to_tell(study_file, tmp_path):
+def test_a_sequence_can_be_too_short(study_file, tmp_path):
     study = load_study(study_file, folder=tmp_path)
     with pytest.raises(AdaptuneError, match=r"one, none: holds no sub-trajectory of 3 m"):
-        switching.measure_switching(study, 0.5)
+        switch_cost.measure_switching(study, 0.5)
     assert not (tmp_path / "switching.json").exists()

@@ -151,6 +151,6 @@ def check_once(folder: Path, n_trials: int, sequences: list[str]) -> None:
     assert len(lines) == n_trials * len(sequences)
     storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / "optuna.log")))
     (name,) = optuna.get_all_study_names(storage)
-    told = optuna.load_study(study_name=name, storage=storage)
-    numbers = [t.user_attrs["adaptune trial"] for t in told.trials]
+    mirror = optuna.load_study(study_name=name, storage=storage)
+    numbers = [t.user_attrs["adaptune trial"] for t in mirror.trials]
     assert numbers == list(range(n_trials))

@@ -132,7 +132,7 @@ def test_says_the_same_when_asked_again(config):
 
 
 def test_refuses_a_history_that_is_not_all_before(config):
-    with pytest.raises(ValueError, match="batches have 8 trials; 15 are no whole ones"):
+    with pytest.raises(ValueError, match="batches have 8 trials; 15 is not a multiple"):
         make_sampler(SPACE, config).propose(run(config, 2)[:15])
 
 

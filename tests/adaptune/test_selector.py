@@ -1,0 +1,181 @@
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptune.descriptor.motion import speed_and_turn_rate
+from adaptune.descriptor.ndt import describe
+from adaptune.model import BankRule, BankSettings, ErrorModel
+from adaptune.odometry.base import Motions
+from adaptune.parameter_sets import ParameterSets
+from adaptune.selection import Selection
+from adaptune.selector import Selector
+from adaptune.sequence.scan import Scan
+from adaptune.simulation import Course, simulate
+from adaptune.space import Float, ParameterSpace
+
+SPACE = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
+SETS = ParameterSets(SPACE, (3, 5), ({"speed": 1.0}, {"speed": 8.0}))
+STILL = Motions(np.eye(4), {})
+
+
+def drive_cave(sensor, seed):
+    course = Course(scenes=("cave",), length=10.0, sensor=sensor, seed=seed)
+    return [Scan(s.stamp, s.points) for s in list(simulate(course))[::10]]
+
+
+def of_two_caves():
+    """Fitted to scans of an HDL-32E."""
+    drives = [drive_cave("hdl32e", seed) for seed in (1, 2)]
+    trained = [scan for drive in drives for scan in drive]
+    return ErrorModel(
+        odometry={"name": "gicp"},
+        sets=SETS,
+        fixed=3,
+        length=25.0,
+        sequences=["one", "two"],
+        blocks={"ndt": 90},
+        window=1,
+        descriptors=np.stack([describe(scan) for scan in trained]),
+        sequence=np.repeat([0, 1], [len(drive) for drive in drives]),
+        errors=np.tile(np.float32([1.0, 0.1]), (len(trained), 1)),
+        provenance={},
+        elevations=[-30.7, -30.7],
+        bank=[3, 5],
+        vectors=np.zeros((len(trained), 2, 3), np.float32),
+    )
+
+
+def selections(selector, scans, motions=STILL):
+    """One selection for every scan."""
+    made = []
+    for scan in scans:
+        selector.observe(scan.stamp, scan, motions)
+        made.append(selector.select())
+    return made
+
+
+def test_scans_of_another_sensor_get_the_fixed_set(caplog):
+    """A cave looks alike to many sensors; what lies lowest does not."""
+    model = of_two_caves()
+    for sensor, chosen in (("hdl32e", 5), ("vlp16", 3)):
+        made = selections(Selector(model, members=()), drive_cave(sensor, 3))
+        assert np.mean([s.trial == chosen for s in made]) > 0.9
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert "-15 degrees, those of training at -31" in caplog.text
+    assert all(s.trial == 3 and s.familiarity == 0.0 for s in made)
+    # The published rule has no such doubts.
+    made = selections(Selector(model, "paper"), drive_cave("vlp16", 3))
+    assert all(s.trial == 5 and s.parameters == {"speed": 8.0} for s in made)
+
+
+def moving(metres):
+    T = np.eye(4)
+    T[0, 3] = metres
+    return Motions(T, {})
+
+
+def with_motion():
+    """Two places that differ by how fast they were passed, and by which set is better."""
+    model = of_two_caves()
+    slowly = model.sequence == 0
+    motion = np.column_stack([np.where(slowly, 0.5, 5.0), np.zeros(len(slowly))])
+    return replace(
+        model,
+        descriptors=np.hstack([model.descriptors, motion]).astype(np.float32),
+        blocks={"ndt": 90, "motion": 2},
+        errors=np.where(slowly[:, None], [0.1, 1.0], [1.0, 0.1]).astype(np.float32),
+    )
+
+
+def test_places_differ_by_the_sensors_motion():
+    selector = Selector(with_motion(), "paper")
+    (scan, *_) = drive_cave("hdl32e", 3)
+    for speed, chosen in ((0.5, 3), (5.0, 5)):
+        selector.reset()
+        for i in range(30):
+            motions = STILL if i < 2 else moving(0.1 * speed)
+            selector.observe(i * 10**8, scan, motions)
+        assert selector.select().trial == chosen
+
+
+@pytest.fixture(scope="module")
+def by_motion():
+    return Selector(with_motion(), "paper")
+
+
+@given(st.lists(st.tuples(st.integers(1, 40), st.floats(-1.0, 1.0)), min_size=2, max_size=40))
+def test_its_motion_is_that_of_the_last_second_of_poses(by_motion, steps):
+    stamps = np.cumsum([gap for gap, _ in steps]) * 5 * 10**7
+    poses = np.tile(np.eye(4), (len(steps), 1, 1))
+    poses[1:, 0, 3] = np.cumsum([x for _, x in steps[1:]])
+    selector, scan = by_motion, Scan(0, np.zeros((0, 3), np.float32))
+    selector.reset()
+    for i, stamp in enumerate(stamps.tolist()):
+        motions = STILL if i < 2 else moving(steps[i - 1][1])
+        selector.observe(stamp, scan, motions)
+        with patch("adaptune.selector.fill_in") as fill_in:
+            selector.select()
+        want = speed_and_turn_rate(stamps[:i], poses[:i])[-1] if i else np.zeros(2)
+        np.testing.assert_allclose(fill_in.call_args.args[2], want, atol=1e-6)
+
+
+def test_a_scan_comes_before_a_selection():
+    with pytest.raises(ValueError, match="observe a scan"):
+        Selector(of_two_caves()).select()
+
+
+def test_after_a_reset_it_is_as_new():
+    scans = drive_cave("hdl32e", 3)
+    selector = Selector(replace(of_two_caves(), window=3))
+    first = selections(selector, scans)
+    assert repr(selections(selector, scans)) != repr(first)
+    selector.reset()
+    assert repr(selections(selector, scans)) == repr(first)
+
+
+def test_it_takes_the_bank_that_was_shown_to_pay():
+    model = of_two_caves()
+    assert Selector(model).members == (3, 5)
+    assert Selector(model, "paper").members == ()
+    assert Selector(model, members=()).members == ()
+    unpaid = replace(model, bank_settings=BankSettings(adapt=False))
+    assert Selector(unpaid).members == ()
+    assert Selector(model, "paper", [5, 3]).fixed == 5
+
+
+def test_a_banks_weights_change_slowly(monkeypatch):
+    found = [(1.0, 0.0), (0.0, 1.0), (0.0, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0)]
+    model, left = of_two_caves(), []
+
+    def selection(weights, familiarity=1.0):
+        weights = dict(zip((3, 5), weights, strict=True))
+        return Selection(3, {}, weights, 0.2, 1.0, familiarity, 2.0)
+
+    monkeypatch.setattr(
+        BankRule, "select", lambda *_: selection(left.pop(0) if left else (1.0, 0.0))
+    )
+    selector = Selector(model)
+    left[:] = found
+    made = selections(selector, drive_cave("hdl32e", 3)[: len(found)])
+    for i, one in enumerate(made):
+        mean = np.mean(found[max(0, i - 4) : i + 1], axis=0)
+        np.testing.assert_allclose(list(one.weights.values()), mean)
+        assert one.trial == (3, 5)[np.argmax(mean)]
+        assert one.parameters == SETS[one.trial]
+    # Doubt acts at once, but not for long.
+    left[:] = [(0.0, 1.0)]
+    scan = drive_cave("hdl32e", 3)[0]
+    with monkeypatch.context() as patched:
+        patched.setattr(BankRule, "select", lambda *_: selection((1.0, 0.0), 0.0))
+        assert selections(selector, [scan])[0].weights == {3: 1.0, 5: 0.0}
+    (one,) = selections(selector, [scan])
+    np.testing.assert_allclose(list(one.weights.values()), [0.2, 0.8])
+    # Another sensor leaves the fixed set all the weight, and at once.
+    selector.reset()
+    left[:] = found[1:3]
+    for one in selections(selector, drive_cave("vlp16", 3)[:2]):
+        assert one.weights == {3: 1.0, 5: 0.0}

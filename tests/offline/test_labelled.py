@@ -1,0 +1,87 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from tables import table
+
+from adaptune.archive import Summary
+from offline.config import OfflineConfig
+from offline.labelled import LabelledData, LabelledSequence
+from offline.objective import choose_fixed, judge
+
+
+def labelled(runs):
+    """Sequences on which each of three sets had these values in repeated runs."""
+    sequences = [
+        LabelledSequence(
+            f"s{i}",
+            np.arange(4),
+            np.zeros((4, 90), np.float32),
+            np.tile(np.mean(of_sets, axis=1).astype(np.float32), (4, 1)),
+            values=np.mean(of_sets, axis=1),
+            repeats=np.array(of_sets),
+        )
+        for i, of_sets in enumerate(runs)
+    ]
+    return LabelledData(sequences, table(np.eye(3), (0, 2, 5)))
+
+
+def verdicts(runs):
+    """The same as the campaign judges it."""
+    config = OfflineConfig(repeats=len(runs[0][0]))
+    return config, {
+        trial: judge(
+            config,
+            [
+                Summary({}, float(np.mean(r[i])), 0, 0, 1.0, repeats=[{"rte": v} for v in r[i]])
+                for r in runs
+            ],
+        )
+        for i, trial in enumerate((0, 2, 5))
+    }
+
+
+def test_the_fixed_set_is_surely_good_here_as_in_the_campaign():
+    # The second set has the least mean by luck; the third is surely better than the first.
+    runs = [[[1.0, 1.0, 1.1], [0.1, 0.2, 2.3], [0.9, 0.91, 0.92]]] * 2
+    config, found = verdicts(runs)
+    assert min(found, key=lambda trial: found[trial].values) == 2
+    assert choose_fixed(config, found) == 5
+    data = labelled(runs)
+    assert data.fixed() == 5
+    assert data.training_data()[0].fixed == 5
+
+
+values = st.lists(
+    st.lists(st.lists(st.floats(0.1, 9.0), min_size=3, max_size=3), min_size=3, max_size=3),
+    min_size=1,
+    max_size=4,
+)
+
+
+@given(values)
+def test_there_is_one_definition_of_fixed(runs):
+    config, found = verdicts(runs)
+    bounds = [verdict.values[0] + verdict.margin for verdict in found.values()]
+    if len(np.unique(np.round(bounds, 9))) == 3:
+        assert labelled(runs).fixed() == choose_fixed(config, found)
+
+
+def test_a_sequence_is_left_out_with_its_views():
+    of_one = labelled([[[1.0], [2.0], [3.0]]]).sequences[0]
+    names = ["a", "b", "a+noise", "c"]
+    data = LabelledData(
+        [LabelledSequence(n, *list(vars(of_one).values())[1:]) for n in names], SETS
+    )
+    left_out = {one.name: [s.name for s in others.sequences] for one, others in data.folds()}
+    assert left_out == {"a": ["b", "c"], "b": ["a", "a+noise", "c"], "c": ["a", "b", "a+noise"]}
+
+
+SETS = table(np.eye(3), (0, 2, 5))
+
+
+def test_a_set_that_misses_frames_is_not_complete():
+    data = labelled([[[1.0], [2.0], [3.0]]] * 2)
+    data.sequences[1].errors[0, 1] = np.nan
+    complete = data.complete()
+    assert complete.sets.trials == (0, 5)
+    assert complete.sequences[0].values.tolist() == [1.0, 3.0]
