@@ -60,9 +60,7 @@ class Bank(Recorded):
     @property
     def usage(self) -> Usage:
         """CPU time and memory of all members together."""
-        usages = [member.usage for member in self._members]
-        memory = [usage.memory for usage in usages if usage.memory is not None]
-        return Usage(sum(usage.cpu for usage in usages), sum(memory) if memory else None)
+        return Usage.total((member.usage for member in self._members), sum)
 
     @property
     def motions(self) -> Motions:

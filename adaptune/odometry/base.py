@@ -3,7 +3,7 @@
 import functools
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -93,6 +93,13 @@ class Usage(NamedTuple):
     cpu: float
     memory: float | None
 
+    @classmethod
+    def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
+        """CPU time of all together, and the sum or the maximum of their memory."""
+        cpu, peaks = zip(*usages, strict=True)
+        known = [peak for peak in peaks if peak is not None]
+        return cls(sum(cpu), memory(known) if known else None)
+
 
 class Motions(NamedTuple):
     """How the sensor moved over the last scan, before any health check.
@@ -100,8 +107,7 @@ class Motions(NamedTuple):
     Attributes
     ----------
     T_previous_current : ndarray of shape (4, 4)
-        Motion of the odometry or of the whole bank. NaN if there was no pose. After a start it is
-        the motion that `start` received, or the identity.
+        NaN if there was no pose. After a start, what `start` received, or the identity.
     members : dict of ndarray
         The same for each member of a bank, by trial number; empty for single odometries.
     """
@@ -367,13 +373,7 @@ class Odometry(Recorded):
 
 @functools.cache
 def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
-    """Import modules of a package that one of adaptune's extras installs.
-
-    Raises
-    ------
-    OdometryError
-        If it is not installed.
-    """
+    """Import modules of a package that one of adaptune's extras installs; an error without it."""
     try:
         return tuple(map(import_module, modules))
     except ImportError as error:

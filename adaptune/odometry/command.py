@@ -84,12 +84,7 @@ class Command(Recorded):
     read
         Gives the recording at the first start; None if scans are only prepared.
     strict
-        Whether a run that fails is an error, not a fault.
-
-    Attributes
-    ----------
-    faults : list of str
-        What went wrong, with the last lines that the program wrote. Unknown poses are NaN.
+        Whether a run that fails is an error, not a fault, which quotes the program's last lines.
     """
 
     faults: Sequence[str] = ()
@@ -132,7 +127,7 @@ class Command(Recorded):
 
     def start(
         self,
-        prepared: NDArray[np.int64],
+        prepared: Any,
         T_odom_sensor: Poses,
         T_previous_current: Poses | None = None,  # noqa: ARG002
     ) -> None:
@@ -286,13 +281,8 @@ def _at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
 def _ending(process: subprocess.Popen[bytes]) -> Iterator[None]:
     """End a program and its children after the block, or when this process receives SIGTERM."""
 
-    def end() -> None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
     def terminate(number: int, _: object) -> None:
-        end()
+        isolation.end_group(process)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
@@ -302,6 +292,6 @@ def _ending(process: subprocess.Popen[bytes]) -> Iterator[None]:
     try:
         yield
     finally:
-        end()
+        isolation.end_group(process)
         if before is not None:
             signal.signal(signal.SIGTERM, before)

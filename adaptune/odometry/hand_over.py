@@ -53,7 +53,7 @@ class HandOver(Recorded):
     @property
     def usage(self) -> Usage:
         """CPU time of all instances together, and the most memory that one of them took."""
-        return _sum([self._ended_usage, *(one.usage for one in self._instances)])
+        return Usage.total([self._ended_usage, *(one.usage for one in self._instances)], max)
 
     @property
     def _instances(self) -> list[OdometryInstance]:
@@ -132,9 +132,4 @@ class HandOver(Recorded):
     def _end(self, instance: OdometryInstance) -> None:
         instance.close()
         self._ended_faults += instance.faults
-        self._ended_usage = _sum([self._ended_usage, instance.usage])
-
-
-def _sum(usages: list[Usage]) -> Usage:
-    memory = [usage.memory for usage in usages if usage.memory is not None]
-    return Usage(sum(usage.cpu for usage in usages), max(memory, default=None))
+        self._ended_usage = Usage.total([self._ended_usage, instance.usage], max)

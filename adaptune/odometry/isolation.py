@@ -70,7 +70,8 @@ class Isolated(Recorded):
     """An odometry that lives in another process, a new one with every start.
 
     If that process ends, or returns a pose that is none, this is a *fault*: the pose of that scan
-    is NaN, and so are all that follow until a new start.
+    is NaN, and so are all that follow until a new start. A fault quotes the last lines that the
+    odometry wrote.
 
     Parameters
     ----------
@@ -80,11 +81,6 @@ class Isolated(Recorded):
         See `Odometry`.
     limits
         What each process may use.
-
-    Attributes
-    ----------
-    faults : list of str
-        What went wrong, each with the last lines that the odometry wrote.
     """
 
     faults: Sequence[str] = ()
@@ -247,6 +243,13 @@ def bounded(command: Sequence[str], memory: float, *limits: str) -> list[str]:
     """A command with a limit on its address space in gigabytes, and further limits of ulimit."""
     bounds = "; ".join(f"ulimit {limit}" for limit in (f"-v {round(memory * 1e6)}", *limits))
     return ["/bin/sh", "-c", f'{bounds}; exec "$@"', "sh", *command]
+
+
+def end_group(process: subprocess.Popen[bytes]) -> None:
+    """End a process that leads a session, and its children."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def last_lines(output: BinaryIO) -> str:

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import signal
 import socket
 import subprocess
 import tempfile
@@ -21,13 +20,7 @@ _FIRST_ANSWER = 60.0
 
 
 def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
-    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``.
-
-    Raises
-    ------
-    OdometryError
-        If it is neither.
-    """
+    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``; else an error."""
     kind, colon, rest = address.partition(":")
     if kind == "unix" and colon and rest:
         return socket.AF_UNIX, rest
@@ -88,13 +81,7 @@ class Process(Isolated):
 
     @staticmethod
     def describe(settings: Settings) -> Description:
-        """What the program reports about itself.
-
-        Raises
-        ------
-        OdometryError
-            If the program cannot be reached, or does not describe itself.
-        """
+        """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json())
 
     def close(self) -> None:
@@ -103,9 +90,7 @@ class Process(Isolated):
             self._socket.close()
             self._socket = None
         if self._program is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._program.pid, signal.SIGKILL)
-            self._program.wait()
+            isolation.end_group(self._program)
             self._program = None
 
     def _hello(self) -> dict[str, Any]:

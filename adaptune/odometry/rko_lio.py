@@ -133,23 +133,17 @@ class RkoLio(OwnFrameOdometry):
         if not prepared.usable:
             return None
         bindings = _bindings()
+        points, times = bindings._Vector3sVector(prepared.points), prepared.stamps
+        scan = points, bindings._VectorInt64(times), prepared.begin, prepared.end
         try:
-            self._lio.register_scan(
-                self._T_base_sensor,
-                bindings._Vector3sVector(prepared.points),
-                bindings._VectorInt64(prepared.stamps),
-                prepared.begin,
-                prepared.end,
-            )
+            self._lio.register_scan(self._T_base_sensor, *scan)
         except (bindings.InputError, bindings.RegistrationError):
             return None
-        T_own_base: Poses = self._lio.pose()
-        return T_own_base @ self._T_base_sensor
+        return np.asarray(self._lio.pose() @ self._T_base_sensor)
 
 
 def _levelling(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The smallest rotation that takes a direction of shape (3,) to +z."""
     if not np.linalg.norm(up) > 0:
         return np.eye(3)
-    R: NDArray[np.float64] = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-    return R
+    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix())

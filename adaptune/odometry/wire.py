@@ -92,13 +92,7 @@ def send(stream: BinaryIO, header: Mapping[str, Any], **arrays: NDArray[Any] | N
 
 
 def receive(stream: Readable) -> Message | None:
-    """Read a message, or None where the stream has ended.
-
-    Raises
-    ------
-    WireError
-        If the stream holds something else, or ends in the middle.
-    """
+    """Read a message, or None where the stream has ended; else there is a `WireError`."""
     first = stream.read(_LENGTH.size)
     if not first:
         return None
@@ -149,13 +143,7 @@ Make = Callable[[str, ParameterSet, BaseSettings], OdometryInstance]
 
 
 def python_class(name: str) -> type[Odometry]:
-    """Class of an odometry that this process can run.
-
-    Raises
-    ------
-    OdometryError
-        If there is none, or it is a program of the user.
-    """
+    """Class of an odometry that this process can run; an error for programs of the user."""
     cls = odometry_class(name)
     if not issubclass(cls, Odometry):
         raise OdometryError(f"{name}: is a program of the user, not a class that can be served")
@@ -176,13 +164,7 @@ def hello(
 
 
 def announced(answer: Message) -> Description:
-    """Description of an odometry in its answer to a hello.
-
-    Raises
-    ------
-    OdometryError
-        If the answer is not one of this version.
-    """
+    """Description of an odometry in its answer to a hello; an error if of another version."""
     header = answer.header
     if (version := header.get("version")) != VERSION:
         raise OdometryError(f"it speaks version {version} of the protocol, this adaptune {VERSION}")
@@ -196,7 +178,7 @@ def announced(answer: Message) -> Description:
 def serve(
     reader: Readable, writer: BinaryIO, name: str | None = None, make: Make = make_here
 ) -> None:
-    """Answer messages with an odometry until the stream ends.
+    """Answer messages with an odometry until the stream ends; anything else is a `WireError`.
 
     Parameters
     ----------
@@ -206,11 +188,6 @@ def serve(
         The only odometry to serve; otherwise each hello names one.
     make
         Makes it.
-
-    Raises
-    ------
-    WireError
-        If the stream holds something else than messages.
     """
     odometry: OdometryInstance | None = None
     while (message := receive(reader)) is not None:

@@ -138,14 +138,10 @@ class Pipeline(OwnFrameOdometry):
         self._needs_times = bool(parameters.get("deskew"))
         pipeline = pipelines.all_pipelines()[self.pipeline]()
         pipeline.set_params(parameters)
-        pipeline.set_lidar_params(
-            types.LidarParams(
-                num_rows=self._shape[0],
-                num_columns=self._shape[1],
-                min_range=self.settings.min_range,
-                max_range=self.settings.max_range,
-            )
-        )
+        ranges = {"min_range": self.settings.min_range, "max_range": self.settings.max_range}
+        rows, columns = self._shape
+        lidar = types.LidarParams(num_rows=rows, num_columns=columns, **ranges)
+        pipeline.set_lidar_params(lidar)
         self._T_imu_sensor = np.eye(4)
         if prepared.imu is not None:
             self._T_imu_sensor = invert(prepared.imu.T_sensor_imu)
@@ -172,10 +168,7 @@ class Pipeline(OwnFrameOdometry):
         """Pass a scan on, and return the last pose that comes back."""
         self._pipeline.add_lidar(to_evalio(prepared))
         estimates = self._pipeline.saved_estimates()
-        if not estimates:
-            return None
-        T_own_imu: Poses = estimates[-1][1].to_mat()
-        return T_own_imu @ self._T_imu_sensor
+        return estimates[-1][1].to_mat() @ self._T_imu_sensor if estimates else None
 
 
 def _imu_parameters(imu: Imu) -> Any:
@@ -191,10 +184,8 @@ class RingedPipeline(Pipeline):
     """A pipeline that needs to know which laser measured each point."""
 
     settings_type = GridSettings
-
     # What the settings leave open follows from the first scan.
-    _rows: int = 0
-    _columns: int = 0
+    _rows = _columns = 0
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         if scan.rings is None:

@@ -21,27 +21,13 @@ stamp, uint32 laser. The laser is left out where the pipeline does not ask for i
 
 
 class Prepared(NamedTuple):
-    """A scan in evalio's layout.
-
-    Attributes
-    ----------
-    stamp : int
-    cloud : ndarray of shape (n, 4) or (n, 5)
-        float32, the last columns hold bytes of uint32, see `FIELDS`; an image row by row.
-    shape : tuple of int
-        Rows and columns.
-    usable : bool
-        Whether enough points are in range.
-    timed : bool
-        Whether the points have times that differ.
-    imu : Imu, optional
-    """
+    """A scan in evalio's layout; the last columns of its cloud hold bytes of uint32."""
 
     stamp: int
-    cloud: NDArray[np.float32]
-    shape: tuple[int, int]
-    usable: bool
-    timed: bool
+    cloud: NDArray[np.float32]  # of shape (n, 4) or (n, 5), see `FIELDS`; an image row by row
+    shape: tuple[int, int]  # rows and columns
+    usable: bool  # whether enough points are in range
+    timed: bool  # whether the points have times that differ
     imu: Imu | None
 
 
