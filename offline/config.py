@@ -154,13 +154,7 @@ class OfflineConfig(StudySection):
         return any((self.trials, self.hours, self.stagnation, self.target))
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
-        """Find mistakes in the sampler and its settings.
-
-        Parameters
-        ----------
-        space
-            The tuned parameters; None where they have mistakes.
-        """
+        """Find mistakes in the sampler and its settings."""
         key = ("sampler_settings",)
         if len(self.objective) > 1 and self.sampler in SINGLE:
             others = ", ".join(sorted(set(NAMES) - set(SINGLE)))

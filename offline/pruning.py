@@ -100,14 +100,6 @@ def _worse(values: Values, best: Values) -> bool:
 
 
 def estimate(values: Values, baseline: Values) -> float:
-    """Estimate the mean of a stopped trial from its ratio to the baseline so far.
-
-    Parameters
-    ----------
-    values
-        The trial's values, on the first sequences.
-    baseline
-        The baseline's values, on all of them.
-    """
+    """Estimate the mean of a stopped trial from its ratio so far to the whole baseline."""
     seen = float(np.mean(baseline[: len(values)]))
     return float(np.mean(values)) * (float(np.mean(baseline)) / seen if seen > 0.0 else 1.0)

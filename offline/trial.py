@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +135,7 @@ class PreparedSequence:
                 f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points"
             )
         at = np.array(stamps, np.int64)
-        T_ref_sensor = _reference(name, scans, at, settings)
+        T_ref_sensor = reference_poses(name, scans, at, settings)
         described = np.array(descriptors)
         # When a scan is described online, the pose of the scan before is known.
         motion = speed_and_turn_rate(at, T_ref_sensor)
@@ -158,9 +158,16 @@ def _described(describe: Describer, scan: sequence.Scan, name: str) -> NDArray[n
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
-def _reference(
+def reference_poses(
     name: str, scans: sequence.Sequence, stamps: NDArray[np.int64], settings: TrialSettings
 ) -> Poses:
+    """Reference poses at the scans' stamps, of shape (n, 4, 4), NaN where they are not known.
+
+    Raises
+    ------
+    AdaptuneError
+        If no error can be measured on the sequence.
+    """
     reference = scans.reference()
     if reference is None:
         raise AdaptuneError(
@@ -168,26 +175,6 @@ def _reference(
             f"(reference: ...)"
         )
     T_ref_sensor = reference.at(stamps)
-    check_reference(name, T_ref_sensor, settings)
-    return T_ref_sensor
-
-
-def check_reference(name: str, T_ref_sensor: Poses, settings: TrialSettings) -> None:
-    """Refuse a sequence on which no error can be measured.
-
-    Parameters
-    ----------
-    name
-        Name of the sequence.
-    T_ref_sensor
-        Reference poses at the scans' stamps, NaN where they are not known.
-    settings
-        Settings of the trials.
-
-    Raises
-    ------
-    AdaptuneError
-    """
     if np.isnan(T_ref_sensor).all():
         raise AdaptuneError(
             f"sequences.{name}: the reference does not overlap the scans in time; check that both "
@@ -207,6 +194,7 @@ def check_reference(name: str, T_ref_sensor: Poses, settings: TrialSettings) -> 
             f"sequences.{name}: its path holds no sub-trajectory of {shortest:g} m, the shortest "
             f"of KITTI's error; judge by another metric (offline.objective, offline.limits)"
         )
+    return T_ref_sensor
 
 
 class _Run:
@@ -292,21 +280,10 @@ def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
     return list(zip(begins, ends, strict=True))
 
 
-class Scans(Protocol):
-    """Prepared scans with their frames."""
-
-    name: str
-    frames: Frames
-
-    def __iter__(self) -> Iterator[Any]:
-        """Read the prepared scans."""
-        ...
-
-
 def run_trials(
     settings: TrialSettings,
     odometry: OdometryFactory,
-    scans: Scans,
+    scans: PreparedSequence,
     sets: Sequence[ParameterSet],
     whole: bool = False,
 ) -> list[Trial]:
@@ -447,6 +424,8 @@ class TrialSetup:
         scans = self.sequences.open(name)
         return PreparedSequence(name, scans, self.odometry, self.settings, memory)
 
-    def run(self, scans: Scans, sets: Sequence[ParameterSet], whole: bool = False) -> list[Trial]:
+    def run(
+        self, scans: PreparedSequence, sets: Sequence[ParameterSet], whole: bool = False
+    ) -> list[Trial]:
         """Run trials, see `run_trials`."""
         return run_trials(self.settings, self.odometry, scans, sets, whole)

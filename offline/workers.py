@@ -176,15 +176,7 @@ def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
 
 
 class Sequences:
-    """The sequences that a worker has prepared, as many as its memory holds.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    memory
-        Bytes that prepared scans may take.
-    """
+    """The sequences that a worker has prepared, as many as its memory holds."""
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup

@@ -30,15 +30,6 @@ def check(
 ) -> tuple[C | None, list[Mistake]]:
     """Validate a study's data, and find the mistakes that the models cannot find.
 
-    Parameters
-    ----------
-    config_type
-        The model of the data.
-    data
-        The data of the YAML; receives absolute paths in the odometry's settings.
-    folder
-        Folder of the YAML, to which paths are relative.
-
     Returns
     -------
     config : StudyConfig, optional

@@ -48,21 +48,7 @@ def validated(
     mistakes: list[Mistake],
     context: dict[str, Any] | None = None,
 ) -> M | None:
-    """Validate a section; None if it has mistakes, which are added to `mistakes`.
-
-    Parameters
-    ----------
-    model
-        What the section must be.
-    data
-        The section.
-    key
-        Leads to the section.
-    mistakes
-        Receives what is found.
-    context
-        See `pydantic.BaseModel.model_validate`.
-    """
+    """Validate a section; None if it has mistakes, which are added to `mistakes`."""
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:

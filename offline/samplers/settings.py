@@ -121,11 +121,6 @@ class RandomSettings(_Settings):
 def optuna_class(name: str) -> type[Any]:
     """Class of an Optuna sampler.
 
-    Parameters
-    ----------
-    name
-        One of `OPTUNA`, or ``package.module:Class``.
-
     Raises
     ------
     SamplerError
@@ -160,15 +155,6 @@ def optuna_class(name: str) -> type[Any]:
 
 def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
     """Make an Optuna sampler.
-
-    Parameters
-    ----------
-    name
-        One of `OPTUNA`, or ``package.module:Class``.
-    settings
-        Keywords of the class.
-    seed
-        The class receives it if it takes one.
 
     Raises
     ------
