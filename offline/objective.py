@@ -192,11 +192,6 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
 
     A set that breaks limits is worse by `SEVERITY` times the baseline's value, and more with a
     larger excess: the sampler keeps away from it.
-
-    Parameters
-    ----------
-    history
-        Results of all trials; the first one is the baseline's.
     """
     if not any(result.constraints for result in history):
         return list(history)

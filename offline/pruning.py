@@ -37,17 +37,7 @@ Values = Sequence[float]
 
 
 def rungs(pruning: Pruning, batch: int, n: int) -> list[int]:
-    """Numbers of sequences after which trials of a batch stop; the last one is all of them.
-
-    Parameters
-    ----------
-    pruning
-        The rule.
-    batch
-        Number of the batch.
-    n
-        Number of sequences.
-    """
+    """Numbers of sequences after which trials of a batch may stop; the last one is `n`, all."""
     if pruning == "none" or batch == 0:
         return [n]
     if pruning == "wilcoxon":

@@ -25,17 +25,6 @@ class Search:
     baseline, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers
     do not depend on a budget.
 
-    Parameters
-    ----------
-    sampler
-        Proposes the sets.
-    sequences
-        The sequences on which the sets are run.
-    finished
-        All trials of the study.
-    place
-        j and n, see above.
-
     Attributes
     ----------
     sequences : list of str
@@ -79,13 +68,7 @@ class Search:
         return {self.number(i): verdict for i, verdict in enumerate(self.verdicts)}
 
     def begin(self, hours: float) -> bool:
-        """Begin the next batch; False if the search has ended.
-
-        Parameters
-        ----------
-        hours
-            Hours that all batches before took.
-        """
+        """Begin the next batch after so many hours; False if the search has ended."""
         if self.end is None:
             best = self.number(self.best)
             self.end = spent(self._config, self.verdicts, self.best, hours, best)

@@ -31,21 +31,7 @@ EPISODE = 4.0
 
 @dataclass(frozen=True)
 class TrialSettings:
-    """What a trial depends on beside odometry, sequence and parameter set.
-
-    Attributes
-    ----------
-    sub_trajectory : float
-        Metres over which errors are measured.
-    lost_track : float
-        Metres a second by which a step of an odometry that loses track departs from the reference.
-    health : HealthCheck
-    descriptors : tuple of str
-    runs, repeats
-        See `OfflineConfig`.
-    metrics : frozenset of str
-        The metrics by which trials are judged.
-    """
+    """What a trial depends on besides odometry, sequence and parameter set."""
 
     sub_trajectory: float = 25.0
     lost_track: float = 3.0
@@ -291,20 +277,7 @@ def run_trials(
 
     With ``runs: restart``, an odometry that loses track restarts at the reference with that scan.
     The sub-trajectories across that frame count as failures; later ones are judged on their own.
-    `OfflineConfig` describes the other kinds of runs.
-
-    Parameters
-    ----------
-    settings
-        Settings of the trials.
-    odometry
-        Makes instances of the odometry.
-    scans
-        The sequence.
-    sets
-        The parameter sets.
-    whole
-        Run from end to end once, whatever the settings say.
+    `OfflineConfig` describes other kinds; with `whole`, there is one run from end to end.
     """
     frames = scans.frames
     kind, repeats = ("whole", 1) if whole else (settings.runs, settings.repeats)
@@ -406,14 +379,7 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """Everything that a process needs to run trials.
-
-    Attributes
-    ----------
-    settings : TrialSettings
-    odometry : OdometryFactory
-    sequences : StudySequences
-    """
+    """Everything that a process needs to run trials."""
 
     settings: TrialSettings
     odometry: OdometryFactory

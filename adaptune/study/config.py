@@ -90,31 +90,10 @@ def _catches_up(scans: int) -> int:
 class SwitchingConfig(StudySection):
     """How the odometry changes its parameters during a replay.
 
-    Attributes
-    ----------
-    mechanism : str
-        `live`: the odometry changes them between scans. `hand_over`: a new instance takes over.
-        `bank`: several instances run side by side, and their motions are averaged. `auto`: the
-        first of bank (given more than one core, and enough memory), live and hand_over that is
-        possible.
-    warm_up : float, optional
-        Seconds of scans that a new instance sees before it takes over. The odometry has its own
-        defaults for this and the next two.
-    full_rate : float, optional
-        The new instance sees every scan of the most recent seconds.
-    stride : int, optional
-        Of the scans before, it sees every n-th.
-    catch_up_scans : int
-        Scans of the past that a new instance sees with every new scan, while the old instance
-        still gives the poses. With 0, it sees all of them at once.
-    size : int
-        Number of members of the bank.
-    sets : list of int or dict, optional
-        Parameter sets of the bank, or their trial numbers; the first one is the fixed one. By
-        default the fixed set, and the sets whose errors cancel each other best.
-    cores, memory : int, float, optional
-        What `auto` may spend on a bank: cores (default: all), and gigabytes, of which each member
-        may take `isolation.memory`.
+    `live`: it changes them between scans. `hand_over`: a new instance takes over. `bank`: several
+    instances run side by side, and their motions are averaged. `auto`: the first of bank (given
+    more than one core, and enough memory), live and hand_over that is possible.
+    ``docs/adapting-live.md`` describes every key.
     """
 
     mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"

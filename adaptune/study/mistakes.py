@@ -23,15 +23,7 @@ class ConfigurationError(AdaptuneError):
 
 
 class Mistake(NamedTuple):
-    """One mistake.
-
-    Attributes
-    ----------
-    key : tuple
-        Leads to it; empty for the study as a whole.
-    message : str
-        What is wrong, and what to do.
-    """
+    """What is wrong with a value, and what to do; the key of the whole study is empty."""
 
     key: Key
     message: str

@@ -103,13 +103,9 @@ class Study(Generic[C_co]):
     @cached_property
     def warm_up(self) -> WarmUp:
         """Which scans a new instance sees before it takes over."""
-        switching = self.config.online.switching
-        usual = self.odometry.description.warm_up
-        return WarmUp(
-            usual.seconds if switching.warm_up is None else switching.warm_up,
-            usual.full_rate if switching.full_rate is None else switching.full_rate,
-            usual.stride if switching.stride is None else switching.stride,
-        )
+        switching, usual = self.config.online.switching, self.odometry.description.warm_up
+        given = (switching.warm_up, switching.full_rate, switching.stride)
+        return WarmUp(*(u if g is None else g for u, g in zip(usual, given, strict=True)))
 
     def switch_cost(self) -> float:
         """Share by which a switch raises the RTE, as `adaptune switching` measured it.
