@@ -44,15 +44,9 @@ class TrialSettings:
     @classmethod
     def of(cls, config: OfflineStudyConfig) -> Self:
         """The settings of a study."""
-        return cls(
-            config.sub_trajectory,
-            config.lost_track,
-            config.health,
-            config.descriptor.names,
-            config.offline.runs,
-            config.offline.repeats,
-            frozenset(config.offline.metrics),
-        )
+        shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor.names)
+        own = (config.offline.runs, config.offline.repeats, frozenset(config.offline.metrics))
+        return cls(*shared, *own)
 
     @property
     def isolated(self) -> bool:
@@ -63,18 +57,7 @@ class TrialSettings:
 class PreparedSequence:
     """A sequence that is read, prepared and described once, for all trials of a worker.
 
-    Parameters
-    ----------
-    name
-        Name of the sequence.
-    scans
-        The sequence.
-    odometry
-        Makes the odometry, which prepares the scans.
-    settings
-        Settings of the trials.
-    memory
-        Bytes that prepared scans may take. Scans beyond are read again on every pass.
+    Prepared scans that exceed `memory` bytes are read again on every pass.
 
     Attributes
     ----------

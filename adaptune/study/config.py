@@ -52,13 +52,7 @@ def _known_descriptor(name: str) -> str:
 class DescriptorConfig(StudySection):
     """How scans are described.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of descriptors, see `adaptune.descriptor`.
-    window : float
-        Seconds over which the descriptors of selections are averaged; with 0, only the newest scan
-        counts.
+    Descriptors are averaged over `window` seconds; with 0, only the newest scan counts.
     """
 
     names: Annotated[
@@ -111,16 +105,7 @@ class SwitchingConfig(StudySection):
 
 
 class OnlineConfig(StudySection):
-    """How to replay.
-
-    Attributes
-    ----------
-    period : float
-        Seconds between selections.
-    rules : list of str
-        Selection rules: `paired`, `paper`.
-    switching : SwitchingConfig
-    """
+    """How to replay: seconds between selections, selection rules, and switching."""
 
     period: float = Field(1.0, gt=0, allow_inf_nan=False)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
@@ -130,24 +115,7 @@ class OnlineConfig(StudySection):
 class StudyConfig(StudySection):
     """The YAML of a study without the settings that only one stage uses.
 
-    Attributes
-    ----------
-    sequences : dict
-        Recordings by name.
-    courses : dict
-        Simulated sequences by name; `adaptune simulate` records them.
-    training, test : list of str
-        Names of sequences and courses.
-    sub_trajectory : float
-        Length in metres over which errors are measured.
-    lost_track : float
-        Metres a second. A trial counts a step that departs from the reference by more as a
-        failure, and restarts the odometry at the reference.
-    health : HealthCheck
-        Bounds on the platform's motion. A replay restarts an odometry that exceeds them, from its
-        last healthy motion.
-    isolation : Limits
-        Limits of an odometry that runs in a process of its own.
+    ``docs/reference-study.md`` describes every key.
     """
 
     odometry: OdometryConfig
