@@ -275,7 +275,7 @@ evalio_bag, run, -c, '{{parameters}}']"
 def test_the_whole_way(make):
     study = make("pretend", "offline.trials=2")
     training = train(study)
-    assert training.model.space.names == ("registration.voxel", "distance")
+    assert training.model.sets.space.names == ("registration.voxel", "distance")
     assert run_replays(study, study.folder / "model.safetensors") == 2
     assert {row["mode"] for row in compare(study)} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
@@ -287,7 +287,7 @@ def test_the_whole_way(make):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("odometry.parameters=", "odometry.parameters: define what is tuned"),
+        ("odometry.parameters=", "odometry.parameters: define the parameters"),
         ("odometry.parameters.distance={low: 1, high: 2, baseline: 1}", "give its type, one of"),
         ("odometry.parameters.distance.type=real", "give its type, one of float, integer"),
         ("odometry.parameters.distance.low=9", "low (9) must be less than high"),
@@ -303,8 +303,8 @@ def test_the_whole_way(make):
         ("odometry.settings.format=tumm", "odometry.settings.format: Input should be"),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
         ("online.rules=[paired]", "online.rules: a command runs whole recordings"),
-        ("online.switching.mechanism=live", "a command runs whole recordings: it cannot change"),
-        ("online.switching.mechanism=bank", "a command runs whole recordings: it cannot change"),
+        ("online.switching.mechanism=live", "a command runs whole recordings and cannot change"),
+        ("online.switching.mechanism=bank", "a command runs whole recordings and cannot change"),
         ("odometry.settings.command=sh", 'settings.command: give a list, not "sh"'),
     ],
 )
