@@ -1,4 +1,4 @@
-"""Trials on disk: what was run, where it went, and how wrong it was at every frame."""
+"""Trials on disk: parameters, poses, and the error at every frame."""
 
 import json
 import os
@@ -19,12 +19,12 @@ from adaptune.space import ParameterSet
 
 
 class ArchiveError(AdaptuneError):
-    """A file of the archive that is not what it should be."""
+    """A file of the archive that is missing or damaged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What all trials on a sequence share.
+    """Data that all trials on a sequence share.
 
     Attributes
     ----------
@@ -59,23 +59,23 @@ class Trial:
         Sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite where the track was
         lost.
     restarted : ndarray of shape (n,)
-        Frames at which the track was lost and the odometry started anew at the reference.
+        Frames at which the odometry lost track and restarted at the reference.
     registered : ndarray of shape (n,)
-        False where the scan was too poor.
+        False where the scan had too few points.
     seconds : ndarray of shape (n,)
-        What the odometry took for each scan, without preparing it.
+        Computing time of the odometry for each scan, without preparing it.
     faults : tuple of str
-        What ended the odometry's process, or was no pose, each with the odometry's last words.
+        Reasons why the odometry's process ended or gave no pose, each with its last output.
     metrics : dict
         Of the whole trajectory by name, see `offline.objective`.
     usage : dict
-        Of CPU time and memory, which differ from run to run.
+        CPU time and memory, which differ from run to run.
     repeats : tuple of dict
-        Where the trial was run several times, RTE and metrics of every run. Poses are then the
-        first run's, and errors the mean of the capped ones of all.
+        If the trial was run several times, RTE and metrics of every run. Poses are then those of
+        the first run, and errors the mean of the capped errors of all runs.
     unhealthy : dict
-        What the health check would have said, and how often, see
-        `adaptune.odometry.health.Guard.check`; of the first run.
+        Faults that the health check would have found in the first run, and how often, see
+        `adaptune.odometry.health.Guard.check`.
     """
 
     parameters: ParameterSet
@@ -98,7 +98,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Summary:
-    """What the driver keeps in memory of a finished trial.
+    """The part of a finished trial that stays in memory.
 
     Attributes
     ----------
@@ -108,9 +108,9 @@ class Summary:
     lost : int
         How often the odometry lost track.
     faults : int
-        How often its process ended, or it gave no pose.
+        How often its process ended or gave no pose.
     ms : float
-        Milliseconds that the odometry took for a scan.
+        Milliseconds of the odometry for a scan.
     others : dict
         Other metrics by name.
     repeats : sequence of dict
@@ -130,12 +130,12 @@ class Summary:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """All that the trial can be judged by, see `offline.objective`."""
+        """All metrics of the trial, see `offline.objective`."""
         return {"rte": self.mean_error, "ms_per_scan": self.ms} | self.others
 
 
 def summarise(trial: Trial) -> Summary:
-    """Summarise a trial; it is the same before it is written and after it is read."""
+    """Summarise a trial. The summary is the same before writing and after reading it."""
     errors = trial.errors.astype(np.float32).astype(np.float64)
     seconds = trial.seconds[1:].astype(np.float32)  # the first scan starts the odometry
     return Summary(
@@ -151,7 +151,7 @@ def summarise(trial: Trial) -> Summary:
 
 
 class _Entry(NamedTuple):
-    """A line of the index: a summary, and by what a change of its file is noticed."""
+    """A line of the index: a summary, and the size and time that reveal a change of its file."""
 
     sequence: str
     trial: int
@@ -180,9 +180,9 @@ _TRIAL = re.compile(r"\d{5,}\.npz")
 class Archive:
     """The trials of a study, a file for each trial and sequence.
 
-    The files are the truth. The index of their summaries, ``index.jsonl``, only spares opening
-    them all: a line whose file has changed since, or is gone, does not count, and what it lacks
-    is read from the file.
+    The files are the truth. The index of their summaries, ``index.jsonl``, only avoids opening
+    all of them. A line does not count if its file has changed or is gone. Trials without a line
+    are read from their files.
 
     Parameters
     ----------
@@ -195,11 +195,11 @@ class Archive:
         self._finished: dict[str, dict[int, Summary]] | None = None
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
-        """File of a trial; of its whole run, without new starts at the reference, if `whole`."""
+        """File of a trial, or of its whole run, which never restarts at the reference."""
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
     def tidy(self) -> None:
-        """Remove what a killed process was writing, and mend the index; none must be writing now.
+        """Remove unfinished files and repair the index. No process may be writing.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class Archive:
         return self._finished.setdefault(sequence, {})
 
     def _entries(self) -> Iterator[_Entry]:
-        """What the index should say."""
+        """Entries that the index should have."""
         indexed = {
             entry[:4]: entry for line in self._index().splitlines() if (entry := _Entry.load(line))
         }
@@ -249,27 +249,27 @@ class Archive:
             return ""
 
     def has_frames(self, sequence: str, names: Sequence[str]) -> bool:
-        """Whether what all trials on a sequence share is there, with these descriptors."""
+        """Whether the data that all trials on a sequence share exists, with these descriptors."""
         try:
             return list(self.read_frames(sequence).blocks) == list(names)
         except ArchiveError:
             return False
 
     def write_frames(self, sequence: str, frames: Frames) -> None:
-        """Keep what all trials on a sequence share."""
+        """Write the data that all trials on a sequence share."""
         path = self.folder / sequence / "frames.npz"
-        with replacing(path) as beside, beside.open("wb") as file:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(
                 file,
                 stamps=frames.stamps,
                 T_ref_sensor=frames.T_ref_sensor,
                 descriptors=compact(frames.descriptors),
-                blocks=np.frombuffer(json.dumps(frames.blocks).encode(), np.uint8),
+                blocks=_packed(frames.blocks),
                 elevations=frames.elevations.astype(np.float32),
             )
 
     def read_frames(self, sequence: str) -> Frames:
-        """Read what all trials on a sequence share.
+        """Read the data that all trials on a sequence share.
 
         Raises
         ------
@@ -291,22 +291,22 @@ class Archive:
             raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error
 
     def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
-        """Keep a trial."""
+        """Write a trial."""
         path = self.trial_path(sequence, number, whole)
-        with replacing(path) as beside, beside.open("wb") as file:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
-                parameters=np.frombuffer(json.dumps(trial.parameters).encode(), np.uint8),
+                parameters=_packed(trial.parameters),
                 T_odom_sensor=trial.T_odom_sensor,
                 errors=trial.errors.astype(np.float32),
                 restarted=trial.restarted,
                 registered=trial.registered,
                 seconds=trial.seconds.astype(np.float32),
-                faults=np.frombuffer(json.dumps(trial.faults).encode(), np.uint8),
-                metrics=np.frombuffer(json.dumps(trial.metrics).encode(), np.uint8),
-                usage=np.frombuffer(json.dumps(trial.usage).encode(), np.uint8),
-                repeats=np.frombuffer(json.dumps(trial.repeats).encode(), np.uint8),
-                unhealthy=np.frombuffer(json.dumps(trial.unhealthy).encode(), np.uint8),
+                faults=_packed(trial.faults),
+                metrics=_packed(trial.metrics),
+                usage=_packed(trial.usage),
+                repeats=_packed(trial.repeats),
+                unhealthy=_packed(trial.unhealthy),
             )
         if whole:
             return
@@ -339,7 +339,7 @@ class Archive:
                 json.loads(data["metrics"].tobytes()),
                 json.loads(data["usage"].tobytes()),
                 tuple(json.loads(data["repeats"].tobytes())),
-                # Older files do not tell.
+                # Older files have none.
                 json.loads(data["unhealthy"].tobytes()) if "unhealthy" in data else {},
             )
         except (KeyError, ValueError) as error:
@@ -348,7 +348,7 @@ class Archive:
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials).
 
-        Those of a trial that was not run on it are NaN.
+        Errors of a trial that was not run on it are NaN.
         """
         read: NDArray[np.float32] | None = None
         for i, number in enumerate(numbers):
@@ -356,7 +356,7 @@ class Archive:
                 continue
             path = self.trial_path(sequence, number)
             try:
-                # Arrays are loaded when they are asked for: poses, most of the file, are not.
+                # Arrays are loaded one by one. Poses, most of the file, are not needed.
                 errors = _read(path, ["errors"])["errors"]
             except KeyError as error:
                 raise ArchiveError(f"{path}: lacks {error}; remove it and run again") from error
@@ -372,10 +372,15 @@ class Archive:
 
 
 def compact(descriptors: NDArray[np.float32]) -> NDArray[Any]:
-    """Descriptors for a file: counts as whole numbers, which take less room, others as they are."""
+    """Descriptors for a file. Counts become whole numbers, which take less room."""
     with np.errstate(invalid="ignore"):
         counts = descriptors.astype(np.uint16)
     return counts if (counts == descriptors).all() else descriptors
+
+
+def _packed(value: Any) -> NDArray[np.uint8]:
+    """Plain data for a file, as the bytes of its JSON."""
+    return np.frombuffer(json.dumps(value).encode(), np.uint8)
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:

@@ -110,7 +110,7 @@ def simulate(
     Each course under `courses:` becomes a bag in the BotanicGarden layout, with a TUM file of its
     ground truth and a picture.
     """
-    from adaptune.simulation import record
+    from adaptune.simulation.recording import record
 
     loaded = _load(study, override, folder)
     if not loaded.config.courses:

@@ -12,11 +12,11 @@ def available() -> int:
 
 
 def pin(core: int) -> Callable[[], None]:
-    """Keep this process on one core, where the system can, and return how to undo it.
+    """Keep this process on one core, if the system can, and return a function that undoes it.
 
-    Open3D sums in an order that depends on its threads: only on one core do its results repeat
-    bit by bit. Threads that run already keep their cores, so this comes before Open3D's first use.
-    Numbers beyond the last core begin anew at the first.
+    Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
+    by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
+    beyond the last core restart at the first.
     """
     if not hasattr(os, "sched_setaffinity"):
         return lambda: None

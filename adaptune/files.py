@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Write files whole or not at all."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ DAMAGED_NPZ = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What numpy and zipfile raise on ``.npz`` files that are not what they say."""
+"""What numpy and zipfile raise on damaged ``.npz`` files."""
 
 
 class FullError(AdaptuneError, OSError):
@@ -29,12 +29,12 @@ class FullError(AdaptuneError, OSError):
 
 @contextmanager
 def needing_room(path: Path) -> Iterator[None]:
-    """Tell which file there is no room for.
+    """Name the file for which there is no room.
 
     Raises
     ------
     FullError
-        If the block finds the disk or a quota full, or the file too large.
+        If the disk or a quota is full in the block, or the file is too large.
     """
     try:
         yield
@@ -49,18 +49,18 @@ def needing_room(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Write a file beside its place and rename it there when all went well.
+    """Write a temporary file and rename it into place when the block ends well.
 
     Parameters
     ----------
     path
-        Where the file shall be; its folder is made when there is none.
+        Where the file belongs. Its folder is made if it does not exist.
 
     Yields
     ------
     Path
         An unused name in the same folder with the same suffix. The file there replaces `path` in
-        one step when the block ends, and is removed when the block raises.
+        one step when the block ends. It is removed if the block raises.
 
     Raises
     ------
@@ -72,43 +72,43 @@ def replacing(path: Path) -> Iterator[Path]:
         stem, suffix = f".{path.stem}.", path.suffix
         handle, name = tempfile.mkstemp(prefix=stem, suffix=suffix, dir=path.parent)
     os.close(handle)
-    beside = Path(name)
+    temporary = Path(name)
     try:
         with needing_room(path):
-            yield beside
-        # mkstemp makes the file private; what a user receives is as readable as any new file.
+            yield temporary
+        # mkstemp makes the file private. Users receive it as readable as any new file.
         umask = os.umask(0)
         os.umask(umask)
-        beside.chmod(0o666 & ~umask)
-        beside.replace(path)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Fill a folder beside its place and rename it there when all went well.
+    """Fill a temporary folder and rename it into place when the block ends well.
 
     Parameters
     ----------
     path
-        Where the folder shall be; one that is there is replaced.
+        Where the folder belongs. An existing one is replaced.
 
     Yields
     ------
     Path
-        An unused name in the same folder, for the block to make a folder of.
+        An unused name. The block makes a folder of this name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:
-        beside = Path(name) / "new"
-        yield beside
+        temporary = Path(name) / "new"
+        yield temporary
         if path.exists():
             path.rename(Path(name) / "old")
-        beside.rename(path)
+        temporary.rename(path)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` in UTF-8, whole or not at all."""
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 Poses = NDArray[np.float64]
 """Homogeneous matrices of shape (..., 4, 4), named ``T_target_source``."""
@@ -32,9 +31,9 @@ def invert(T_target_source: Poses) -> Poses:
 
 
 def rectify(T_target_source: Poses) -> Poses:
-    """Take rounding errors out of rotations, by one Newton step of the polar decomposition.
+    """Remove rounding errors from rotations by one Newton step of the polar decomposition.
 
-    Chained motions amplify them: where each pose is predicted from the two before it, they more
+    Chained motions amplify them. Where each pose is predicted from the two before it, they more
     than double with every scan.
 
     Parameters
@@ -82,22 +81,24 @@ def steps(T_world_sensor: Poses) -> Poses:
 
 
 def scale(T_previous_current: Poses, share: float) -> Poses:
-    """A motion that goes on for another time, at the same velocities.
+    """Scale a motion in time, at the same velocities.
 
     Parameters
     ----------
     T_previous_current
         The motion, of shape (4, 4).
     share
-        Of its time.
+        Share of its time.
 
     Returns
     -------
     ndarray of shape (4, 4)
-        The screw motion through the same: `share` times its logarithm.
+        The exponential of `share` times its logarithm.
     """
     if share == 1.0:
         return T_previous_current
+    from scipy.spatial.transform import RigidTransform
+
     screw = RigidTransform.from_matrix(T_previous_current).as_exp_coords()
     T: Poses = RigidTransform.from_exp_coords(share * screw).as_matrix()
     return T
@@ -118,6 +119,8 @@ def mean_motion(T_previous_current: Poses, weights: NDArray[np.float64]) -> Pose
     ndarray of shape (..., 4, 4)
         Translations and rotation vectors are averaged.
     """
+    from scipy.spatial.transform import Rotation
+
     weights = weights / weights.sum(axis=-1, keepdims=True)
     shape = weights.shape
     R = Rotation.from_matrix(T_previous_current[..., :3, :3].reshape(-1, 3, 3), assume_valid=True)
@@ -160,6 +163,8 @@ def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
     translations = np.asarray(translations, np.float64).reshape(-1, 3)
     T = np.tile(np.eye(4), (len(translations), 1, 1))
     if len(translations):
+        from scipy.spatial.transform import Rotation
+
         T[:, :3, :3] = Rotation.from_quat(np.asarray(quaternions, np.float64)).as_matrix()
         T[:, :3, 3] = translations
     return T
@@ -169,6 +174,8 @@ def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
     """Quaternions x, y, z, w (w >= 0) of poses of shape (n, 4, 4), of shape (n, 4)."""
     if not len(T_target_source):
         return np.empty((0, 4))
+    from scipy.spatial.transform import Rotation
+
     quaternions: NDArray[np.float64] = Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(
         canonical=True
     )
@@ -189,7 +196,7 @@ def interpolate(
     at
         Nanoseconds, of shape (m,).
     max_gap
-        Nanoseconds. Between two poses further apart than this nothing is interpolated.
+        Nanoseconds. Nothing is interpolated between poses further apart than this.
 
     Returns
     -------
@@ -207,6 +214,8 @@ def interpolate(
     between = inside & ~exact
     between[between] = (stamps[after[between]] - stamps[after[between] - 1]) <= max_gap
     if between.any():
+        from scipy.spatial.transform import Rotation, Slerp
+
         # Stamps are exact integers; only differences, which fit a double, become floats.
         seconds = (stamps - stamps[0]) * 1e-9
         query = (at[between] - stamps[0]) * 1e-9

@@ -1,6 +1,5 @@
-"""What a recording holds, what is odd about it, and how to name it in a study."""
+"""Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
-import datetime
 from collections.abc import Iterator
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
@@ -9,20 +8,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console, Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 
 from adaptune import geometry, yaml
 from adaptune.errors import AdaptuneError
-from adaptune.files import replacing
-from adaptune.sequence import Scan, SequenceConfig, SequenceError, cache, open_sequence
-from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, POSES, BagSource, bag_paths
-from adaptune.sequence.pointcloud2 import RING_FIELDS
-from adaptune.sequence.sequence import RecordedSequence
+from adaptune.sequence import Scan, SequenceConfig, SequenceError
+from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, BagSource
+from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.opening import open_sequence
+from adaptune.sequence.pose_messages import POSES
+from adaptune.sequence.recorded import RecordedSequence
 from adaptune.sequence.serialized import header_stamp
-from adaptune.sequence.timing import TIME_FIELDS
 from adaptune.trajectory import Trajectory
+
+Layout = tuple[tuple[str, str, int], ...]
+"""Name, type and offset of the fields of a point."""
 
 _KITTI_FOLDERS = ("velodyne", "velodyne_points")
 
@@ -82,28 +81,28 @@ class ScanSummary:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What is known of a recording.
+    """Content of a recording.
 
     Attributes
     ----------
     path : Path
     topics : tuple of Topic
-    layout : tuple of (name, type, offset)
-        Fields of a point, in the first cloud.
+    layout : Layout
+        Of the first cloud.
     scan : ScanSummary, optional
         None where no scan could be read.
     reference : Trajectory, optional
     problems : tuple of str
-        What is odd or cannot be read.
+        What is odd or unreadable.
     missing : dict
-        What each stage still needs, by stage; nothing where it can run.
+        What each stage still needs, by stage; empty if it can run.
     entry : str
         YAML for the `sequences:` of a study.
     """
 
     path: Path
     topics: tuple[Topic, ...]
-    layout: tuple[tuple[str, str, int], ...]
+    layout: Layout
     scan: ScanSummary | None
     reference: Trajectory | None
     problems: tuple[str, ...]
@@ -112,7 +111,7 @@ class Inspection:
 
 
 def inspect(path: Path) -> Inspection:
-    """Read through a recording and tell what it holds.
+    """Read a whole recording and report what it holds.
 
     Parameters
     ----------
@@ -122,13 +121,13 @@ def inspect(path: Path) -> Inspection:
     Raises
     ------
     SequenceError
-        If it cannot be opened at all. What cannot be read after that is among the problems.
+        If it cannot be opened at all. Later failures are among the problems.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
     given: dict[str, Any] = {}
     topics: tuple[Topic, ...] = ()
-    layout: tuple[tuple[str, str, int], ...] = ()
+    layout: Layout = ()
     problems: list[str] = []
     kind = _kind(path)
     given[kind] = str(path)
@@ -138,7 +137,7 @@ def inspect(path: Path) -> Inspection:
         problems += read
         clouds = [t for t in topics if t.type in POINTS_TYPES and t.count]
         if clouds:
-            # The densest of several: others are its own parts, or filtered.
+            # The densest of several: the others are parts of it, or filtered.
             given["points"] = max(clouds, key=lambda t: (t.count, t.name)).name
         poses = [t for t in topics if t.type in POSES and t.count and "tf" not in t.type.lower()]
         if poses:
@@ -168,7 +167,7 @@ def inspect(path: Path) -> Inspection:
 
 
 def _kind(path: Path) -> str:
-    """Key of a `sequences:` entry that opens it."""
+    """Key of the `sequences:` entry that opens it."""
     if not path.is_dir():
         return "bag"
     if any((path / name).is_dir() for name in _KITTI_FOLDERS):
@@ -178,13 +177,13 @@ def _kind(path: Path) -> str:
 
 
 def _any_bag(path: Path) -> BagSource:
-    """The bag, opened without asking for point clouds."""
+    """Open the bag without looking for point clouds."""
     about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
     return BagSource(bag_paths([str(path)]), about=about)
 
 
 def _topics(source: BagSource) -> tuple[tuple[Topic, ...], list[str]]:
-    """Every topic with its stamps, and what kept them from being read."""
+    """Every topic with its stamps, and the problems of reading them."""
     problems = []
     with source.open() as reader:
         kinds = {c.topic: c.msgtype for c in reader.connections}
@@ -233,7 +232,7 @@ def _topic(
 def _oddities(
     stamps: NDArray[np.int64], recorded: Items[int], gap: float | None, rate: float | None
 ) -> tuple[str, ...]:
-    told = []
+    found = []
     steps = np.diff(stamps)
     if len(stamps) > 1 and stamps.max() == 0:
         return ("all stamps are zero",)
@@ -244,37 +243,28 @@ def _oddities(
         ("stamps are zero", np.count_nonzero(stamps[1:] == 0)),
     ):
         if number:
-            told.append(f"{number} {what}")
+            found.append(f"{number} {what}")
     if gap is not None and rate is not None and gap * rate > 3.5 and gap > 0.2:
         lost = np.count_nonzero(steps * 1e-9 * rate > 3.5)
-        told.append(f"{lost} gaps, the longest of {gap:.2f} s")
+        found.append(f"{lost} gaps, the longest of {gap:.2f} s")
     if len(recorded) == len(stamps):
         late = (np.array(recorded, np.int64) - stamps) * 1e-9
         usual = float(np.median(late))
         if abs(usual) > 5.0:
-            told.append(f"its clock is {abs(usual):.3f} s {_side(usual)} the recorder's")
+            side = "behind" if usual > 0 else "ahead of"
+            found.append(f"its clock is {abs(usual):.3f} s {side} the recorder's")
         if leaps := np.count_nonzero(np.abs(late - usual) > 5.0):
-            told.append(f"{leaps} stamps leap by more than 5 s against the recorder's clock")
-    return tuple(told)
-
-
-def _side(late: float) -> str:
-    return "behind" if late > 0 else "ahead of"
+            found.append(f"{leaps} stamps leap by more than 5 s against the recorder's clock")
+    return tuple(found)
 
 
 def _first_scan(
     given: dict[str, Any],
-) -> tuple[
-    ScanSummary | None,
-    Trajectory | None,
-    tuple[tuple[str, str, int], ...],
-    tuple[Topic, ...],
-    list[str],
-]:
-    """First scan and reference through the very reader that the stages use."""
+) -> tuple[ScanSummary | None, Trajectory | None, Layout, tuple[Topic, ...], list[str]]:
+    """First scan and reference, read as the stages read them."""
     problems = []
     scan, reference = None, None
-    layout: tuple[tuple[str, str, int], ...] = ()
+    layout: Layout = ()
     topics: tuple[Topic, ...] = ()
     options = {key: value for key, value in given.items() if key != "imu"}
     try:
@@ -302,7 +292,7 @@ def _first_scan(
     return scan, reference, layout, topics, problems
 
 
-def _layout(source: BagSource) -> tuple[tuple[tuple[str, str, int], ...], int]:
+def _layout(source: BagSource) -> tuple[Layout, int]:
     """Fields of a point of the first cloud, and how many points it holds."""
     message = next(source.messages(source.points), None)
     if message is None or not hasattr(message, "fields"):
@@ -373,140 +363,3 @@ def _entry(path: Path, given: dict[str, Any], reference: Trajectory | None) -> s
     if "points" in entry and "stamp" not in entry:
         text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
     return text
-
-
-def render_inspection(inspection: Inspection) -> RenderableType:
-    """The inspection for a terminal."""
-    parts: list[RenderableType] = [
-        Text(str(inspection.path), style="bold"),
-        _topic_table(inspection),
-    ]
-    if inspection.layout:
-        parts.append(Text(f"point: {_layout_text(inspection.layout)}"))
-    if inspection.scan is not None:
-        parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
-    if inspection.reference is not None:
-        parts.append(Text(f"reference: {_reference_text(inspection.reference)}"))
-    parts += [Text(f"! {problem}", style="yellow") for problem in inspection.problems]
-    for stage, lacking in inspection.missing.items():
-        state = f"lacks {' and '.join(lacking)}" if lacking else "has all it needs"
-        parts.append(Text(f"{stage}: {state}", style="red" if lacking else "green"))
-    parts.append(Text("\n" + inspection.entry))
-    return Group(*parts)
-
-
-def inspection_text(inspection: Inspection, width: int = 100) -> str:
-    """The inspection as plain text."""
-    console = Console(width=width, color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(render_inspection(inspection))
-    return capture.get()
-
-
-def _topic_table(inspection: Inspection) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for column in ("topic", "type", "count", "rate", "seconds", "max gap"):
-        numeric = column not in ("topic", "type")
-        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
-    for topic in inspection.topics:
-        seconds = None
-        if topic.first is not None and topic.last is not None:
-            seconds = (topic.last - topic.first) * 1e-9
-        table.add_row(
-            topic.name,
-            topic.type.replace("/msg/", "/"),
-            str(topic.count),
-            "" if topic.rate is None else f"{topic.rate:.2f} Hz",
-            "" if seconds is None else f"{seconds:.2f}",
-            "" if topic.gap is None else f"{topic.gap:.3f} s",
-        )
-    return table
-
-
-def _layout_text(layout: Items[tuple[str, str, int]]) -> str:
-    words = []
-    for name, kind, offset in layout:
-        role = " (time)" if name in TIME_FIELDS else " (ring)" if name in RING_FIELDS else ""
-        words.append(f"{name}{role} {kind}@{offset}" if kind else f"{name}{role}")
-    return ", ".join(words)
-
-
-def _scan_text(scan: ScanSummary) -> str:
-    words = [f"{len(scan.scan):,} points"]
-    if scan.recorded > len(scan.scan):
-        words[0] += f" of {scan.recorded:,}"
-    if scan.ranges is not None:
-        near, middle, far = scan.ranges
-        words.append(f"{near:.2f} to {far:.2f} m away, half of them within {middle:.2f} m")
-    words.append("no times" if scan.span is None else f"times spanning {scan.span:.4f} s")
-    words.append("no rings" if scan.rings is None else f"{scan.rings} rings")
-    light = scan.scan.intensities
-    if light is None or not len(light):
-        words.append("no intensities")
-    else:
-        words.append(f"intensities from {light.min():g} to {light.max():g}")
-    return ", ".join(words)
-
-
-def _reference_text(reference: Trajectory) -> str:
-    length = np.linalg.norm(np.diff(reference.T_world_sensor[:, :3, 3], axis=0), axis=1).sum()
-    seconds = (reference.stamps[-1] - reference.stamps[0]) * 1e-9
-    return f"{len(reference):,} poses, {length:.1f} m in {seconds:.1f} s"
-
-
-def write_inspection_png(inspection: Inspection, path: Path) -> None:
-    """Draw the first scan from above and from the side.
-
-    Raises
-    ------
-    SequenceError
-        If no scan could be read.
-    """
-    if inspection.scan is None:
-        raise SequenceError(f"{inspection.path}: no scan can be drawn, none could be read")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    points = inspection.scan.scan.points
-    # Few far points would shrink all others to a dot.
-    reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
-    low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
-    figure = Figure(figsize=(9, 12), layout="constrained")
-    FigureCanvasAgg(figure)
-    above, side = figure.subplots(2, 1, height_ratios=(3, 1))
-    for axes, (i, j), names in ((above, (0, 1), "xy"), (side, (0, 2), "xz")):
-        order = np.argsort(points[:, 2])
-        dots = axes.scatter(
-            points[order, i],
-            points[order, j],
-            c=points[order, 2],
-            s=0.4,
-            cmap="viridis",
-            vmin=low,
-            vmax=high,
-        )
-        axes.set_xlim(-reach, reach)
-        axes.set_aspect("equal")
-        axes.set_xlabel(f"{names[0]} (m)")
-        axes.set_ylabel(f"{names[1]} (m)")
-    above.set_ylim(-reach, reach)
-    above.plot(0, 0, "r+", markersize=10)
-    figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6, extend="both")
-    figure.suptitle(f"{inspection.path.name}: {_scan_text(inspection.scan)}", fontsize=9)
-    with replacing(path) as beside:
-        figure.savefig(beside, format="png", dpi=110)
-
-
-def render_cache() -> RenderableType:
-    """The decoded sequences on disk, for a terminal."""
-    entries = cache.list_cache()
-    table = Table(box=None, pad_edge=False)
-    for column in ("sequence", "scans", "size", "last used"):
-        table.add_column(column, justify="left" if column == "sequence" else "right")
-    for entry in entries:
-        used = datetime.datetime.fromtimestamp(entry.used).strftime("%Y-%m-%d %H:%M")
-        table.add_row(entry.name, str(entry.n_scans), f"{entry.size / 1e6:,.1f} MB", used)
-    total = sum(entry.size for entry in entries) / 1e9
-    return Group(
-        table, Text(f"{cache.folder()}: {total:.2f} GB of at most {cache.cap() / 1e9:g} GB")
-    )

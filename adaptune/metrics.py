@@ -1,4 +1,4 @@
-"""How wrong an odometry is: sub-trajectory errors, and KITTI's error built on them."""
+"""Errors of an odometry: over sub-trajectories, as KITTI's benchmark and as evo define them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert, rotation_angle, steps
 
 RESAMPLES = 2000
-"""Of a bootstrap."""
+"""Resamples of a bootstrap."""
 MIN_BLOCKS = 10
-"""Independent pieces of a drive below which an interval would only seem to say something."""
+"""Least number of blocks of a recording: with fewer, an interval means nothing."""
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
@@ -83,8 +83,7 @@ def sub_trajectory_rte(
     length
         Length of the sub-trajectories in metres.
     restarted
-        Frames at which the odometry lost track and was started anew at the reference, of shape
-        (n,).
+        Frames at which the odometry lost track and restarted at the reference, of shape (n,).
 
     Returns
     -------
@@ -102,7 +101,7 @@ def sub_trajectory_vectors(
     length: float,
     restarted: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """Where each sub-trajectory's end was believed to be, from where it was.
+    """Error vector at the end of each sub-trajectory.
 
     Parameters
     ----------
@@ -121,7 +120,7 @@ def sub_trajectory_vectors(
     with np.errstate(invalid="ignore"):
         d_gt, d_est = _window_motions(T_ref_sensor, T_odom_sensor, starts, ends)
         vectors[starts] = 100.0 / length * (d_est - d_gt)[:, :3, 3]
-    # An odometry whose poses are not finite has lost track; only the reference may be unknown.
+    # Only the reference may be unknown. An odometry whose poses are not finite has lost track.
     vectors[starts[~np.isfinite(vectors[starts]).all(axis=1)]] = np.inf
     if restarted is not None:
         # The step that failed ends at its frame: a window that starts there is sound.
@@ -163,7 +162,7 @@ def kitti_error(
     lengths
         Metres.
     stride
-        Every how many frames a sub-trajectory starts.
+        Frames from one start of a sub-trajectory to the next.
     """
     translations, rotations, used = [], [], []
     for length in lengths:
@@ -189,13 +188,13 @@ def kitti_error(
 def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     """Absolute pose error: root mean square of the distances after alignment, in metres.
 
-    As ``evo_ape -a`` gives it: the translation part, after the rotation and translation that bring
-    the positions together in least squares (Umeyama, PAMI 1991).
+    As ``evo_ape -a`` computes it: the translation part, after the least-squares alignment of the
+    positions (Umeyama, PAMI 1991).
 
     Parameters
     ----------
     T_ref_sensor, T_odom_sensor
-        Reference and estimated poses, of shape (n, 4, 4); those without reference (NaN) do not
+        Reference and estimated poses, of shape (n, 4, 4). Poses without reference (NaN) do not
         count.
     """
     known = ~np.isnan(T_ref_sensor[:, 0, 0])
@@ -209,7 +208,7 @@ def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
 def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     """Relative pose error: root mean square of the steps' translation errors, in metres.
 
-    As ``evo_rpe`` gives it by default: from each frame to the next.
+    As ``evo_rpe`` computes it by default: from each frame to the next.
 
     Parameters
     ----------
@@ -223,13 +222,13 @@ def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
 
 
 FAILURE = 30.0
-"""Percent. A lost track and any error beyond count as this much."""
+"""Percent. A lost track and every larger error count as this."""
 
 
 def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Bound errors in percent by `FAILURE`, so that one lost track does not drown all others.
+    """Bound errors in percent by `FAILURE`, so that one lost track does not hide all others.
 
-    NaN, for what is not known, stays.
+    NaN stays NaN.
     """
     return np.minimum(errors.astype(np.float64), FAILURE)
 
@@ -240,8 +239,8 @@ def bootstrap(
     """95 % intervals of the mean error, and of its ratio to the fixed set's.
 
     A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
-    share most of their sub-trajectories and are drawn together. It speaks of one drive, not of
-    other places. With few blocks it is too narrow, the more so the more skewed the errors are.
+    share most of their sub-trajectories and are drawn together. The interval holds for this
+    recording, not for other places. With few blocks it is too narrow, above all for skewed errors.
 
     Parameters
     ----------
@@ -255,7 +254,7 @@ def bootstrap(
     Returns
     -------
     tuple, or None
-        The ends of both; None if there are fewer than `MIN_BLOCKS` blocks, which tell nothing.
+        The ends of both intervals; None with fewer than `MIN_BLOCKS` blocks.
     """
     n = len(errors)
     if n < MIN_BLOCKS * block:
@@ -273,14 +272,14 @@ def bootstrap(
 
 
 def span(T_ref_sensor: Poses, length: float) -> int:
-    """Frames that a sub-trajectory takes, within which errors share their windows.
+    """Median number of frames in a sub-trajectory.
 
     Parameters
     ----------
     T_ref_sensor
         Reference poses of shape (n, 4, 4); NaN where there is none.
     length
-        Metres. Of a shorter path, all of it.
+        Metres. A shorter path counts whole.
     """
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)

@@ -9,13 +9,13 @@ from typing import Any
 def load() -> Any:
     """Import Open3D.
 
-    Its compiled part wants ``libusb-1.0.so.0``, which a fresh machine does not have, and takes
-    about a second to import.
+    Its compiled part needs ``libusb-1.0.so.0``, which a fresh machine does not have. The import
+    takes about a second.
 
     Returns
     -------
     module
-        ``open3d``, silent but for errors.
+        ``open3d``, which reports errors only.
     """
     import libusb_package
 

@@ -1,4 +1,4 @@
-"""What users add under a name: of ours, of another package's, or as ``module:attribute``."""
+"""Load what a name stands for: ours, another package's, or ``module:attribute``."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -10,7 +10,7 @@ from adaptune.space import nearest
 
 
 class PluginError(AdaptuneError):
-    """A name that leads to nothing."""
+    """A name that stands for nothing."""
 
 
 def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> Any:
@@ -22,9 +22,9 @@ def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -
         One of `ours`, one that an installed package announces in the entry-point group, or
         ``module:attribute``.
     kind
-        What it is, for the message: an odometry, say.
+        What it is, for messages, as "odometry".
     ours
-        By name, where each is, as ``module:attribute``.
+        Ours by name, as ``module:attribute``.
     group
         Of entry points.
     sort
@@ -33,7 +33,7 @@ def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -
     Raises
     ------
     PluginError
-        Naming the nearest name there is, or telling what cannot be imported.
+        Naming the nearest valid name, or the module that cannot be imported.
     """
     path = ours.get(name) or (name if ":" in name else None)
     if path is None:

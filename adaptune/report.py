@@ -1,4 +1,4 @@
-"""What people look at: tables on the terminal, CSV and JSON beside them, and pictures."""
+"""Show results: tables on the terminal, CSV and JSON files, and pictures."""
 
 import csv
 import io
@@ -22,12 +22,12 @@ COLOURS = {
     "bank": "#d62728",
 }
 STYLES: dict[str, dict[str, Any]] = {"fixed": {"lw": 4.0, "alpha": 0.35}}
-"""Adaptive modes often take the fixed set, and must not hide it."""
+"""Adaptive modes often select the fixed set. Its line must stay visible below theirs."""
 _FEW = 10
 
 
 class Track(NamedTuple):
-    """One mode's way through a sequence, for the picture.
+    """Errors and selections of one mode along a sequence.
 
     Attributes
     ----------
@@ -51,8 +51,8 @@ class Track(NamedTuple):
 def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
     """Rows of equal keys as a table that fits 80 columns where it can.
 
-    Numbers stand to the right, and a gap where the first column changes. Keys that start with an
-    underscore are for files only.
+    Numbers are aligned to the right. A gap separates groups of equal first columns. Keys that
+    start with an underscore are for files only.
     """
     made = Table(
         title=title,
@@ -69,15 +69,12 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
         made.add_column(
             key, justify="right" if numbers else "left", no_wrap=key == keys[0], overflow="fold"
         )
+    grouped = bool(rows) and len({row[keys[0]] for row in rows}) < len(rows)
     for i, row in enumerate(rows):
-        if i and len(rows) > 1 and rows[i - 1][keys[0]] != row[keys[0]] and _grouped(rows, keys[0]):
+        if i and grouped and rows[i - 1][keys[0]] != row[keys[0]]:
             made.add_row()
         made.add_row(*(_cell(row[key]) for key in keys))
     return made
-
-
-def _grouped(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    return len({row[key] for row in rows}) < len(rows)
 
 
 def _cell(value: Any) -> str:
@@ -116,7 +113,7 @@ def draw_tracks(
     tracks: Mapping[str, Track],
     logarithmic: Collection[str] = (),
 ) -> None:
-    """Draw errors and chosen parameters over time, as PNG.
+    """Draw errors and selected parameters over time, as PNG.
 
     Parameters
     ----------
@@ -140,22 +137,8 @@ def draw_tracks(
         1 + len(names), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
     )[:, 0]
     for mode, track in tracks.items():
-        colour = COLOURS.get(mode, "#9467bd")
-        known = np.isfinite(track.errors)
-        mean = f"{track.errors[known].mean():.2f} %" if known.any() else "no reference"
-        style = {"color": colour} | STYLES.get(mode, {"lw": 1.3})
-        axes[0].plot(track.seconds, track.errors, label=f"{mode} ({mean})", **style)
-        restarts = track.seconds[track.restarted]
-        if len(restarts):
-            axes[0].plot(
-                restarts,
-                np.full(len(restarts), 1.02),
-                "v",
-                color=colour,
-                ms=4,
-                clip_on=False,
-                transform=axes[0].get_xaxis_transform(),
-            )
+        style = {"color": COLOURS.get(mode, "#9467bd")} | STYLES.get(mode, {"lw": 1.3})
+        _draw_errors(axes[0], mode, track, style)
         for axis, name in zip(axes[1:], names, strict=True):
             values = list(track.choices[name])
             # The last choice holds until the end.
@@ -169,17 +152,27 @@ def draw_tracks(
         axes[0].set_yscale("log")
     axes[0].set_title(title, loc="left")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
-    axes[-1].set_xlabel("time [s]      (triangles: the health check started the odometry anew)")
+    axes[-1].set_xlabel("time [s]      (triangles: the health check restarted the odometry)")
     for axis in axes:
         axis.grid(alpha=0.3)
-    with replacing(path) as beside:
-        figure.savefig(beside, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def _draw_errors(axis: Any, mode: str, track: Track, style: Mapping[str, Any]) -> None:
+    known = np.isfinite(track.errors)
+    mean = f"{track.errors[known].mean():.2f} %" if known.any() else "no reference"
+    axis.plot(track.seconds, track.errors, label=f"{mode} ({mean})", **style)
+    restarts = track.seconds[track.restarted]
+    if len(restarts):
+        top = {"clip_on": False, "transform": axis.get_xaxis_transform()}
+        axis.plot(restarts, np.full(len(restarts), 1.02), "v", color=style["color"], ms=4, **top)
 
 
 def draw_front(
     path: Path, names: Sequence[str], values: NDArray[np.float64], front: NDArray[np.float64]
 ) -> None:
-    """Draw a Pareto front among all that was tried, as PNG: every two objectives that follow.
+    """Draw the Pareto front and all sets, one panel for each two consecutive objectives, as PNG.
 
     Parameters
     ----------
@@ -190,7 +183,7 @@ def draw_front(
     values
         Of all sets, of shape (n, n_objectives).
     front
-        Of those on the front, of shape (m, n_objectives).
+        Of the sets on the front, of shape (m, n_objectives).
     """
     from matplotlib.figure import Figure
 
@@ -203,110 +196,104 @@ def draw_front(
         axis.set_ylabel(names[i + 1])
         axis.grid(alpha=0.3)
     axis.legend(frameon=False)
-    with replacing(path) as beside:
-        figure.savefig(beside, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
-def draw_validation(
-    path: Path,
-    title: str,
-    ratios: Mapping[str, NDArray[np.float64]],
-    sequences: Sequence[str],
-    familiarity: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    portfolio: NDArray[np.float64],
-    learning: Sequence[Mapping[str, Any]],
-    banks: Sequence[Mapping[str, Any]],
-) -> None:
-    """Draw what was found on the sequences left out, as PNG.
+class LeftOutResults(NamedTuple):
+    """Results on the sequences that were left out of training.
 
-    Parameters
+    Attributes
     ----------
-    path
-        The picture.
-    title
-        What it shows.
-    ratios
+    ratios : dict
         By mode, the ratio to the fixed set's error on each sequence.
-    sequences
+    sequences : sequence of str
         Their names.
-    familiarity, gain
-        Of every frame; the ratio to the fixed set's error, of shape (n,).
-    portfolio
+    familiarity, gain : ndarray of shape (n,)
+        Of every frame; the gain is the ratio to the fixed set's error.
+    portfolio : ndarray
         Ratio if the best of 1, 2, ... sets were known.
-    learning
+    learning : sequence of dict
         Rows of a learning curve, or none.
-    banks
+    banks : sequence of dict
         Rows of banks of several sizes, or none.
     """
+
+    ratios: Mapping[str, NDArray[np.float64]]
+    sequences: Sequence[str]
+    familiarity: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    portfolio: NDArray[np.float64]
+    learning: Sequence[Mapping[str, Any]]
+    banks: Sequence[Mapping[str, Any]]
+
+
+def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
+    """Draw results on the sequences left out, as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
 
     figure = Figure(figsize=(13, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(f"{title}: error over the fixed set's on sequences left out")
     by_sequence, by_novelty, by_size = figure.subplots(1, 3, width_ratios=(2, 1, 1))
-    at = np.arange(len(sequences))
-    for mode, of_mode in ratios.items():
+    default = "bank" if "bank" in found.ratios else "paired"
+    _draw_sequences(by_sequence, found)
+    _draw_novelty(by_novelty, found, default)
+    _draw_sizes(by_size, found, default)
+    for axes in (by_sequence, by_novelty, by_size):
+        axes.axhline(1.0, color=COLOURS["fixed"], lw=1.0)
+        axes.grid(alpha=0.3)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def _draw_sequences(axes: Any, found: LeftOutResults) -> None:
+    """Ratios of every mode on each sequence."""
+    from matplotlib.ticker import LogLocator
+
+    at = np.arange(len(found.sequences))
+    for mode, of_mode in found.ratios.items():
         if mode != "fixed":
-            by_sequence.plot(
-                at,
-                of_mode,
-                {"oracle, sequence": "_", "oracle, period": "x"}.get(mode, "o"),
-                color=COLOURS.get(mode, "#999999"),
-                label=mode,
-                alpha=0.6 if mode == "baseline" else 1.0,
-            )
-    by_sequence.set_xticks(at, sequences, rotation=60, ha="right")
-    by_sequence.set_yscale("log")
-    by_sequence.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    by_sequence.yaxis.set_major_formatter("{x:g}")
-    by_sequence.yaxis.set_minor_formatter("")
-    by_sequence.legend(fontsize="small", ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    default = "bank" if "bank" in ratios else "paired"
-    known = ~np.isnan(familiarity)
+            marker = {"oracle, sequence": "_", "oracle, period": "x"}.get(mode, "o")
+            colour, alpha = COLOURS.get(mode, "#999999"), 0.6 if mode == "baseline" else 1.0
+            axes.plot(at, of_mode, marker, color=colour, label=mode, alpha=alpha)
+    axes.set_xticks(at, found.sequences, rotation=60, ha="right")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")
+    axes.legend(fontsize="small", ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+
+
+def _draw_novelty(axes: Any, found: LeftOutResults, default: str) -> None:
+    """Gain of the default rule over familiarity."""
+    known = ~np.isnan(found.familiarity)
     if known.any():
-        order = np.argsort(familiarity[known], kind="stable")
-        parts = [p for p in np.array_split(order, 10) if len(p)]
-        by_novelty.plot(
-            [familiarity[known][p].mean() for p in parts],
-            [np.exp(np.log(gain[known][p]).mean()) for p in parts],
-            "o-",
-            color=COLOURS[default],
-        )
-    by_novelty.set_xlabel("familiarity (0: unlike all training)")
-    by_novelty.set_title(f"{default}, tenths of the frames", fontsize="medium")
-    by_size.plot(
-        np.arange(1, len(portfolio) + 1),
-        portfolio,
-        "s--",
-        color="#bbbbbb",
-        label="of so many sets the best, if known",
-    )
+        familiarity, gain = found.familiarity[known], found.gain[known]
+        parts = [p for p in np.array_split(np.argsort(familiarity, kind="stable"), 10) if len(p)]
+        means = [np.exp(np.log(gain[p]).mean()) for p in parts]
+        axes.plot([familiarity[p].mean() for p in parts], means, "o-", color=COLOURS[default])
+    axes.set_xlabel("familiarity (0: unlike all training)")
+    axes.set_title(f"{default}, tenths of the frames", fontsize="medium")
+
+
+def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
+    """Ratio over the number of sets, of instances and of training sequences."""
+    label = "of so many sets the best, if known"
+    sizes = np.arange(1, len(found.portfolio) + 1)
+    axes.plot(sizes, found.portfolio, "s--", color="#bbbbbb", label=label)
     counted = ["sets"]
     for rows, column, colour, what, label in (
-        (banks, "instances", COLOURS["bank"], "instances", "bank, by its instances"),
-        (learning, "sequences", "#555555", "training sequences", f"{default}, by sequences"),
+        (found.banks, "instances", COLOURS["bank"], "instances", "bank, by its instances"),
+        (found.learning, "sequences", "#555555", "training sequences", f"{default}, by sequences"),
     ):
         if not rows:
             continue
         counted.append(what)
         middle = np.array([row["geometric"] for row in rows])
-        bounds = [[row[key] for row in rows] for key in ("low", "high")]
-        by_size.errorbar(
-            [row[column] for row in rows],
-            middle,
-            np.abs(bounds - middle),
-            fmt="o-",
-            color=colour,
-            capsize=3,
-            label=label,
-        )
-    by_size.set_xlabel("; ".join(counted))
-    by_size.legend(fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    for axes in (by_sequence, by_novelty, by_size):
-        axes.axhline(1.0, color=COLOURS["fixed"], lw=1.0)
-        axes.grid(alpha=0.3)
-    with replacing(path) as beside:
-        figure.savefig(beside, format="png", dpi=110)
+        error = np.abs([[row[key] for row in rows] for key in ("low", "high")] - middle)
+        x = [row[column] for row in rows]
+        axes.errorbar(x, middle, error, fmt="o-", color=colour, capsize=3, label=label)
+    axes.set_xlabel("; ".join(counted))
+    axes.legend(fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))

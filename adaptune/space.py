@@ -1,9 +1,9 @@
-"""The parameters of an odometry: their types, their ranges, and the unit cube they map to."""
+"""The parameters of an odometry: their types, their ranges, and their map to the unit cube."""
 
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,11 @@ ParameterSet = dict[str, Value]
 
 
 class SpaceError(AdaptuneError):
-    """A parameter set that is not of its space."""
+    """A parameter set that does not fit its space."""
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Half a sentence that helps with a wrong name: the nearest valid one, else all."""
+    """The nearest valid name as half a sentence, or all valid names."""
     names = sorted(names)
     close = difflib.get_close_matches(name, names, n=1)
     if close:
@@ -34,7 +34,9 @@ class _Parameter(BaseModel):
 
 
 class _Range(_Parameter):
-    """What real and whole numbers share: bounds, and a scale between them."""
+    """Bounds and scale of a real or whole number."""
+
+    _types: ClassVar[tuple[type, ...]] = (int,)
 
     low: float
     high: float
@@ -54,6 +56,12 @@ class _Range(_Parameter):
             raise ValueError(f"a log scale needs low ({self.low:g}) above 0")
         return self
 
+    def contains(self, value: object) -> bool:
+        """Whether `value` is a number of the type and in the range."""
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            return False
+        return isinstance(value, self._types) and self.low <= value <= self.high
+
     def to_unit(self, value: Any) -> float:
         """Map a value to [0, 1], a whole number to the middle of its share."""
         low, high = self._bounds()
@@ -70,19 +78,13 @@ class _Range(_Parameter):
 class Float(_Range):
     """A real number from `low` to `high`, both included; `log` spaces it evenly in ratio."""
 
+    _types: ClassVar[tuple[type, ...]] = (int, float)
+
     type: Literal["float"] = "float"
     low: float = Field(allow_inf_nan=False)
     high: float = Field(allow_inf_nan=False)
     baseline: float
     log: bool = False
-
-    def contains(self, value: object) -> bool:
-        """Whether `value` is a number in the range."""
-        return (
-            isinstance(value, int | float)
-            and not isinstance(value, bool)
-            and self.low <= value <= self.high
-        )
 
     def from_unit(self, unit: float) -> float:
         """Map from [0, 1] to a value."""
@@ -100,14 +102,6 @@ class Integer(_Range):
     high: int
     baseline: int
     log: bool = False
-
-    def contains(self, value: object) -> bool:
-        """Whether `value` is a whole number in the range."""
-        return (
-            isinstance(value, int)
-            and not isinstance(value, bool)
-            and self.low <= value <= self.high
-        )
 
     def from_unit(self, unit: float) -> int:
         """Map from [0, 1] to the value whose share it falls in."""
@@ -141,8 +135,8 @@ class Categorical(_Parameter):
         return any(type(value) is type(choice) and value == choice for choice in self.choices)
 
     def index(self, value: object) -> int:
-        """Which of the choices it is."""
-        # Not by the tuple's own: True is equal to 1.
+        """Index of a choice."""
+        # Not the index of the tuple: True is equal to 1.
         alike = [type(value) is type(choice) and value == choice for choice in self.choices]
         return alike.index(True)
 
@@ -161,7 +155,7 @@ _adapter: TypeAdapter[Float | Integer | Categorical] = TypeAdapter(Parameter)
 
 
 class ParameterSpace:
-    """The parameters that are tuned, in their order.
+    """The tuned parameters in their order.
 
     Parameters
     ----------
@@ -189,7 +183,7 @@ class ParameterSpace:
 
     @property
     def baseline(self) -> ParameterSet:
-        """The odometry's own choice of every parameter."""
+        """The odometry's own value of every parameter."""
         return {name: parameter.baseline for name, parameter in self.parameters.items()}
 
     def check(self, parameters: Mapping[str, object]) -> None:
@@ -228,7 +222,7 @@ class ParameterSpace:
 
     @classmethod
     def load(cls, data: Mapping[str, Any]) -> Self:
-        """Make a space from what `dump` gave.
+        """Make a space from the result of `dump`.
 
         Raises
         ------

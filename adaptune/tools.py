@@ -22,7 +22,7 @@ def inspect(
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study."""
     from adaptune.inspect import inspect as inspect_file
-    from adaptune.inspect import render_inspection, write_inspection_png
+    from adaptune.rendering import render_inspection, write_inspection_png
 
     found = inspect_file(file)
     console.print(render_inspection(found))
@@ -46,7 +46,7 @@ def cache(
     adaptune decodes a bag once, and then maps it into memory. `ADAPTUNE_CACHE` names another
     folder; `ADAPTUNE_CACHE_GB` limits its size (50), and 0 turns it off.
     """
-    from adaptune.inspect import render_cache
+    from adaptune.rendering import render_cache
     from adaptune.sequence.cache import clear_cache
 
     if action is CacheAction.CLEAR:

@@ -1,12 +1,12 @@
 """Trajectories, and their files in the TUM, KITTI, EuRoC and OXTS formats."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
@@ -29,7 +29,7 @@ class Trajectory:
     T_world_sensor : ndarray of shape (n, 4, 4)
         The pose at each stamp, in metres.
     max_gap : float
-        Seconds; between poses further apart nothing is known.
+        Seconds. Between poses further apart the trajectory is unknown.
     """
 
     stamps: NDArray[np.int64]
@@ -61,27 +61,33 @@ class Trajectory:
         Returns
         -------
         ndarray of shape (m, 4, 4)
-            NaN where the trajectory says nothing.
+            NaN where the trajectory has no pose.
         """
         gap = self.max_gap if max_gap is None else max_gap
         return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
 
 
-def _rows(
-    path: Path, columns: int, kind: str, or_more: bool = False
-) -> list[tuple[int, list[str]]]:
-    """Split the lines that are neither empty nor a comment, with their numbers."""
+Row = tuple[int, list[str]]
+"""Number of a line, and its fields."""
+
+
+def _lines(path: Path) -> Iterator[Row]:
+    """Lines that are neither empty nor a comment."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise TrajectoryError(f"{path}: there is no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(f"{path}: cannot be read as text ({error})") from error
-    rows = []
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#"):
-            continue
+        if fields and not fields[0].startswith("#"):
+            yield number, fields
+
+
+def _rows(path: Path, columns: int, kind: str, or_more: bool = False) -> list[Row]:
+    rows = []
+    for number, fields in _lines(path):
         if len(fields) != columns and not (or_more and len(fields) > columns):
             raise TrajectoryError(
                 f"{path}, line {number}: a {kind} line has {columns} numbers, this has "
@@ -93,7 +99,7 @@ def _rows(
     return rows
 
 
-def _numbers(path: Path, rows: list[tuple[int, list[str]]]) -> NDArray[np.float64]:
+def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
     values = np.empty((len(rows), len(rows[0][1])))
     for i, (number, fields) in enumerate(rows):
         try:
@@ -103,6 +109,25 @@ def _numbers(path: Path, rows: list[tuple[int, list[str]]]) -> NDArray[np.float6
         if not np.isfinite(values[i]).all():
             raise TrajectoryError(f"{path}, line {number}: a number is not finite")
     return values
+
+
+def _stamps(
+    path: Path, rows: list[Row], parse: Callable[[str], int], unit: str
+) -> NDArray[np.int64]:
+    """Strictly increasing nanoseconds of the rows' first fields."""
+    stamps = np.empty(len(rows), np.int64)
+    for i, (number, fields) in enumerate(rows):
+        try:
+            stamps[i] = parse(fields[0])
+        except (InvalidOperation, ValueError, OverflowError) as error:
+            raise TrajectoryError(
+                f"{path}, line {number}: {fields[0]!r} is not a time in {unit}"
+            ) from error
+        if i and stamps[i] <= stamps[i - 1]:
+            raise TrajectoryError(
+                f"{path}, line {number}: its stamp does not come after the line before"
+            )
+    return stamps
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -115,26 +140,15 @@ def read_tum(path: Path) -> Trajectory:
     """
     rows = _rows(path, 8, "TUM")
     values = _numbers(path, [(number, fields[1:]) for number, fields in rows])
-    stamps = np.empty(len(rows), np.int64)
-    for i, (number, fields) in enumerate(rows):
-        # A double holds seconds since 1970 to 0.2 microseconds only.
-        try:
-            stamps[i] = int(Decimal(fields[0]).scaleb(9).to_integral_value())
-        except (InvalidOperation, ValueError, OverflowError) as error:
-            raise TrajectoryError(
-                f"{path}, line {number}: {fields[0]!r} is not a time in seconds"
-            ) from error
-        if i and stamps[i] <= stamps[i - 1]:
-            raise TrajectoryError(
-                f"{path}, line {number}: its stamp does not come after the line before"
-            )
+    # A double holds seconds since 1970 to 0.2 microseconds only.
+    stamps = _stamps(
+        path, rows, lambda text: int(Decimal(text).scaleb(9).to_integral_value()), "seconds"
+    )
     _check_quaternions(path, rows, values[:, 3:])
     return Trajectory(stamps, geometry.from_quaternions(values[:, :3], values[:, 3:]))
 
 
-def _check_quaternions(
-    path: Path, rows: list[tuple[int, list[str]]], quaternions: NDArray[np.float64]
-) -> None:
+def _check_quaternions(path: Path, rows: list[Row], quaternions: NDArray[np.float64]) -> None:
     norms = np.linalg.norm(quaternions, axis=1)
     worst = int(np.argmax(np.abs(norms - 1.0)))
     if abs(norms[worst] - 1.0) > 1e-2:
@@ -181,14 +195,14 @@ def write_kitti(path: Path, T_world_sensor: Poses) -> None:
 
 
 def is_kitti(path: Path) -> bool:
-    """Whether a file's first pose is one of 12 numbers, without a stamp.
+    """Whether a file's first pose has 12 numbers, and no stamp.
 
     Raises
     ------
     TrajectoryError
         If the file cannot be read.
     """
-    return path.suffix != ".csv" and _columns(path) == 12
+    return path.suffix != ".csv" and len(next(_lines(path), (0, []))[1]) == 12
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -202,25 +216,10 @@ def read_trajectory(path: Path) -> Trajectory:
     return read_euroc(path) if path.suffix == ".csv" else read_tum(path)
 
 
-def _columns(path: Path) -> int:
-    """Numbers in the first line that is neither empty nor a comment."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            for line in file:
-                fields = line.replace(",", " ").split()
-                if fields and not fields[0].startswith("#"):
-                    return len(fields)
-    except FileNotFoundError as error:
-        raise TrajectoryError(f"{path}: there is no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: cannot be read as text ({error})") from error
-    return 0
-
-
 def read_euroc(path: Path) -> Trajectory:
     """Read ``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...`` lines, nanoseconds and metres.
 
-    What follows the pose (velocities, biases) is left aside.
+    Numbers after the pose (velocities, biases) are ignored.
 
     Raises
     ------
@@ -229,18 +228,7 @@ def read_euroc(path: Path) -> Trajectory:
     """
     rows = _rows(path, 8, "EuRoC", or_more=True)
     values = _numbers(path, [(number, fields[1:]) for number, fields in rows])
-    stamps = np.empty(len(rows), np.int64)
-    for i, (number, fields) in enumerate(rows):
-        try:
-            stamps[i] = int(fields[0])
-        except (ValueError, OverflowError) as error:
-            raise TrajectoryError(
-                f"{path}, line {number}: {fields[0]!r} is not a time in nanoseconds"
-            ) from error
-        if i and stamps[i] <= stamps[i - 1]:
-            raise TrajectoryError(
-                f"{path}, line {number}: its stamp does not come after the line before"
-            )
+    stamps = _stamps(path, rows, int, "nanoseconds")
     quaternions = values[:, [4, 5, 6, 3]]
     _check_quaternions(path, rows, quaternions)
     return Trajectory(stamps, geometry.from_quaternions(values[:, :3], quaternions))
@@ -265,6 +253,8 @@ def read_oxts(files: list[Path]) -> Poses:
     TrajectoryError
         Naming the file that cannot be read.
     """
+    from scipy.spatial.transform import Rotation
+
     values = np.empty((len(files), 6))
     for i, path in enumerate(files):
         rows = _rows(path, 6, "OXTS", or_more=True)

@@ -1,4 +1,4 @@
-"""A table of the trials in a study's archive: sorted, filtered, and exported."""
+"""The table of the trials in a study's archive: sort, filter and export it."""
 
 import operator
 import re
@@ -25,16 +25,16 @@ _OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
     ">": operator.gt,
 }
 _COLUMN = {"rte": "mean"}
-"""What is called otherwise in a study's objectives than here."""
+"""Columns that have another name in a study's objectives."""
 _CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
 
 
 class TrialsError(AdaptuneError):
-    """A condition or a column that makes no sense."""
+    """A condition or a column that is not valid."""
 
 
 def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
-    """A row for every trial that is finished on any of the sequences.
+    """A row for every trial that is finished on at least one of the sequences.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     -------
     list of dict
         Number, parameters, mean error in percent (None before the trial is finished on all
-        sequences), the mean on each sequence, how often it lost track, how often its process
-        ended and how often the health check would have spoken on all of them, and its other
-        metrics (None where a sequence is too short for one).
+        sequences), mean error on each sequence, then over all sequences how often it lost track,
+        how often its process ended and how often the health check would have found a fault, and
+        its other metrics (None if a sequence is too short for one).
     """
     finished = {name: archive.finished(name) for name in names}
     # A dictionary keeps their order.
@@ -90,7 +90,7 @@ def select(
     where
         Conditions, as ``mean < 1``: a column, one of ``< <= > >= == !=``, and a value in YAML.
     sort
-        A column; with ``-`` before it, the largest first. What is not known comes last.
+        A column; with ``-`` before it, the largest first. Unknown values come last.
     top
         How many rows at most.
 
@@ -149,9 +149,9 @@ def export(archive: Archive, names: Sequence[str], numbers: Sequence[int], folde
     archive
         The trials.
     names, numbers
-        Which of them; those that are not finished are left out.
+        Sequences and trials to export. Unfinished trials are left out.
     folder
-        Where to.
+        Where to write.
 
     Returns
     -------

@@ -33,7 +33,7 @@ import drives
 
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
-from adaptune.simulation import record
+from adaptune.simulation.recording import record
 from offline import train as training
 from offline.offline_study import OfflineStudy, load_study
 from offline.workers import Task, TaskResult

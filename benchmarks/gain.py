@@ -41,7 +41,7 @@ from offline.validation import (
 from adaptune.archive import Frames
 from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
 from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
-from adaptune.descriptor.ndt import N_FEATURES, ndt_histogram
+from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
 from adaptune.metrics import cap
 from adaptune.model import (
@@ -58,7 +58,8 @@ from adaptune.model.base import complementary
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.isolation import Limits
 from adaptune.odometry.registry import odometry_class
-from adaptune.simulation import Course, simulate
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
 from offline.config import OfflineConfig
 from offline.samplers import make_sampler
 from offline.trial import TrialSettings, run_trials

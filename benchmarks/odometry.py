@@ -30,9 +30,11 @@ from adaptune.odometry.hand_over import HandOver
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.selection import Selection
-from adaptune.sequence import Scan, SequenceError, open_sequence
+from adaptune.sequence import Scan, SequenceError
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.views import WithImu
-from adaptune.simulation import Course, as_sequence
+from adaptune.simulation import Course
+from adaptune.simulation.rig import as_sequence
 
 LENGTH = 25.0
 WARM_UPS = (

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from adaptune import yaml
 from adaptune.archive import Archive
-from adaptune.simulation import record
+from adaptune.simulation.recording import record
 from offline.campaign import run_batches
 from offline.objective import choose_fixed
 from offline.offline_study import OfflineStudy, load_study

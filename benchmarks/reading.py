@@ -21,7 +21,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from adaptune.sequence import SequenceConfig, open_sequence
+from adaptune.sequence import SequenceConfig
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.pointcloud2 import decode
 
 POINTS = 29_000
@@ -154,7 +155,8 @@ def streaming(path: Path, gigabytes: float) -> None:
     """Memory of one pass over a large bag, in a process of its own."""
     write(path, round(gigabytes * 1e9 / (POINTS * STEP)))
     code = (
-        "import resource, sys; from adaptune.sequence import *\n"
+        "import resource, sys; from adaptune.sequence import SequenceConfig\n"
+        "from adaptune.sequence.opening import open_sequence\n"
         "n = sum(1 for _ in open_sequence(SequenceConfig(bag=sys.argv[1], cache=False)))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     )

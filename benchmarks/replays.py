@@ -23,7 +23,7 @@ from gain import ODOMETRIES, WINDOW, factory_of, labelled, training_courses, tri
 from numpy.typing import NDArray
 from offline.validation import choose_bank, training_data, tune, tune_bank
 
-from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
@@ -32,7 +32,8 @@ from adaptune.odometry import OdometryInstance, WarmUp
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.health import HealthCheck
 from adaptune.sequence import Scan
-from adaptune.simulation import Course, simulate
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
 from adaptune.space import ParameterSet
 from online.replay import Policy, replay
 

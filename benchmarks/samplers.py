@@ -30,7 +30,7 @@ from rich.console import Console
 from scipy.stats import wilcoxon
 
 from adaptune import cores, report
-from adaptune.simulation import record
+from adaptune.simulation.recording import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
 from offline.offline_study import load_study

@@ -10,7 +10,8 @@ import argparse
 import resource
 import time
 
-from adaptune.simulation import SCENES, Course, SceneLeg, simulate
+from adaptune.simulation import SCENES, Course, SceneLeg
+from adaptune.simulation.simulate import simulate
 
 
 def speed(course: Course) -> tuple[int, float]:

@@ -17,13 +17,14 @@ import numpy as np
 import small_gicp
 
 from adaptune import cores
-from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel, Selection
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import crop
-from adaptune.sequence import Scan, SequenceConfig, open_sequence
+from adaptune.sequence import Scan, SequenceConfig
+from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import read_kitti
 from offline.offline_study import OfflineStudy, load_study
 from offline.train import train

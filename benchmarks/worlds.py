@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry import Odometry
 from adaptune.odometry.registry import odometry_class
-from adaptune.simulation import SCENES, Course, simulate
+from adaptune.simulation import SCENES, Course
+from adaptune.simulation.simulate import simulate
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
 WINDOW, CAP, SIDE, GOOD = 25.0, 30.0, 7, 1.0

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptune.sequence.views import origin
+from adaptune.sequence.names import origin
 from offline.labelled import LabelledData
 from offline.leave_one_out import (
     BANK,

@@ -15,7 +15,7 @@ from adaptune.model import ModelError, TrainingData
 from adaptune.model.bank_weights import POOL
 from adaptune.model.base import mean_errors
 from adaptune.parameter_sets import ParameterSets
-from adaptune.sequence.views import origin, places
+from adaptune.sequence.names import origin, places
 from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
 from offline.config import Metric, OfflineStudyConfig
 from offline.objective import margin, repeated, weighted

@@ -88,12 +88,14 @@ def validate(
     report.draw_validation(
         study.folder / "validation.png",
         study.name,
-        validation.ratios,
-        [s.name for s in validation.left_out],
-        *_by_familiarity(validation),
-        validation.portfolio(),
-        learning,
-        banks,
+        report.LeftOutResults(
+            validation.ratios,
+            [s.name for s in validation.left_out],
+            *_by_familiarity(validation),
+            validation.portfolio(),
+            learning,
+            banks,
+        ),
     )
     found = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=found).save(study.model_path)

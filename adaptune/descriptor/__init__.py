@@ -1,4 +1,4 @@
-"""What a scan's surroundings look like, in numbers."""
+"""Environment descriptors of scans."""
 
 from adaptune.descriptor.base import (
     DESCRIPTORS,
@@ -6,6 +6,7 @@ from adaptune.descriptor.base import (
     Descriptor,
     DescriptorError,
     averaged,
+    check_descriptor,
     descriptor,
     lowest_elevation,
 )
@@ -16,6 +17,7 @@ __all__ = [
     "Descriptor",
     "DescriptorError",
     "averaged",
+    "check_descriptor",
     "descriptor",
     "lowest_elevation",
 ]

@@ -18,7 +18,7 @@ ENTRY_POINTS = "adaptune.descriptors"
 """Group in which other packages announce their descriptors, each by its name."""
 
 DESCRIPTORS = {
-    "ndt": "adaptune.descriptor.ndt:describe",
+    "ndt": "adaptune.descriptor.ndt_histogram:describe",
     "ring_heights": "adaptune.descriptor.polar:ring_heights",
     "range_image": "adaptune.descriptor.polar:range_image",
     "fpfh": "adaptune.descriptor.fpfh:fpfh",
@@ -28,7 +28,7 @@ DESCRIPTORS = {
 
 
 class DescriptorError(AdaptuneError):
-    """A descriptor that there is not, or that describes nothing."""
+    """A descriptor that does not exist or does not describe a scan."""
 
 
 def descriptor(name: str) -> Descriptor:
@@ -54,10 +54,21 @@ def descriptor(name: str) -> Descriptor:
     return describe
 
 
+def check_descriptor(name: str) -> None:
+    """Refuse a name that leads to no descriptor, without importing one of `DESCRIPTORS`.
+
+    Raises
+    ------
+    DescriptorError
+    """
+    if name not in DESCRIPTORS:
+        descriptor(name)
+
+
 class Describer:
     """Describes scans by one or several descriptors.
 
-    What `adaptune.descriptor.motion` tells is left zero, and filled in by those who know the poses.
+    The motion descriptor stays zero. `adaptune.descriptor.motion.fill_in` fills it in.
 
     Parameters
     ----------
@@ -77,7 +88,7 @@ class Describer:
     def __init__(self, names: Iterable[str]):
         self._functions = {name: descriptor(name) for name in names}
         self.blocks: dict[str, int] = {}
-        # This loads compiled code, too, which a robot should not wait for.
+        # This also loads compiled code before the first scan.
         nothing = Scan(0, np.empty((0, 3), np.float32))
         self.blocks = {name: len(self._describe(name, nothing)) for name in self._functions}
 
@@ -87,7 +98,7 @@ class Describer:
         Raises
         ------
         DescriptorError
-            If one of them is not what it was for other scans.
+            If one of them is not finite or has another shape than for other scans.
         """
         return np.concatenate([self._describe(name, scan) for name in self._functions])
 
@@ -107,8 +118,8 @@ class Describer:
 def lowest_elevation(scan: Scan) -> float:
     """Elevation below which one point in a hundred lies.
 
-    It is that of the lowest beam, which ends on the ground almost everywhere, and so tells the
-    sensor and its mount, and not the place.
+    The lowest beam ends on the ground almost everywhere. Its elevation thus identifies the sensor
+    and its mount, not the place.
 
     Returns
     -------
@@ -124,9 +135,9 @@ def lowest_elevation(scan: Scan) -> float:
 def averaged(
     descriptors: NDArray[np.float32], stamps: NDArray[np.int64], n: int, period: float
 ) -> NDArray[np.float32]:
-    """Mean of each frame's descriptor and of those a period before, two periods before, and so on.
+    """Mean of each frame's descriptor and of those one period before, two before, and so on.
 
-    It is what a selector has seen that describes one scan each period, and remembers the last `n`.
+    A selector that describes one scan each period and remembers the last `n` has the same mean.
 
     Parameters
     ----------

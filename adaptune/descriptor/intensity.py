@@ -1,4 +1,4 @@
-"""What comes back of the light: what the surroundings are made of, rather than their shape."""
+"""Intensities of a scan: the material of the surroundings rather than their shape."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ N_QUANTILES = 9
 def intensity(scan: Scan) -> NDArray[np.float64]:
     """Deciles of all intensities, and their mean and standard deviation in each ring.
 
-    On the scale of the sensor, which must be the one that was trained with.
+    They are on the scale of the sensor: train and run with the same one.
 
     Returns
     -------

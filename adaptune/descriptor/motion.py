@@ -1,4 +1,4 @@
-"""How the sensor moves: no scan tells it, but the poses of those before do."""
+"""The motion of the sensor, computed from the poses of the scans before."""
 
 from collections.abc import Mapping
 
@@ -14,8 +14,8 @@ SECOND = 10**9
 """Nanoseconds over which motion is measured."""
 
 
-def unknown(scan: Scan) -> NDArray[np.float64]:  # noqa: ARG001 - it is told by poses
-    """What stands for the motion before it is known, of shape (2,)."""
+def unknown(scan: Scan) -> NDArray[np.float64]:  # noqa: ARG001 - poses give it
+    """Zeros in place of the motion until the poses are known, of shape (2,)."""
     return np.zeros(2)
 
 
@@ -27,8 +27,7 @@ def speed_and_turn_rate(stamps: NDArray[np.int64], T_odom_sensor: Poses) -> NDAr
     stamps
         Nanoseconds, rising, of shape (n,).
     T_odom_sensor
-        Of shape (n, 4, 4); NaN where a pose is not known, which takes the motion of the last that
-        is.
+        Of shape (n, 4, 4); NaN for unknown poses, which take the motion of the last known one.
 
     Returns
     -------
@@ -51,7 +50,7 @@ def speed_and_turn_rate(stamps: NDArray[np.int64], T_odom_sensor: Poses) -> NDAr
 def fill_in(
     descriptors: NDArray[np.float32], blocks: Mapping[str, int], motion: NDArray[np.float64]
 ) -> None:
-    """Write the motion to where descriptors leave room for it, if they do.
+    """Write the motion into the block of the motion descriptor, if there is one.
 
     Parameters
     ----------

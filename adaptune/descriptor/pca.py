@@ -1,4 +1,4 @@
-"""What is learnt to compare descriptors by."""
+"""Principal components by which descriptors are compared."""
 
 from collections.abc import Sequence
 from typing import Any, Self

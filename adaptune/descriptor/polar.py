@@ -1,8 +1,8 @@
 """Descriptors of a scan laid out around the sensor, which turning about z does not change.
 
-Points are sorted into rows and, by azimuth, into columns; each row is told by how much of it is
-filled, by the mean and the standard deviation of its cells, and by the mean step from a cell to
-the next. After the ring key of Kim and Kim, *Scan Context*, IROS 2018, and statistics of range
+Points are sorted into rows and, by azimuth, into columns; each row is described by the share of
+its cells that are filled, by their mean and standard deviation, and by the mean step from a cell
+to the next. After the ring key of Kim and Kim, *Scan Context*, IROS 2018, and statistics of range
 images as in Cop, Borges and Dubé, *DELIGHT*, ICRA 2018.
 """
 
@@ -17,11 +17,11 @@ RING = 3.0
 N_RINGS = 10
 N_SECTORS = 60
 ELEVATIONS = (-0.5, 0.5)
-"""Radians; what is beyond is left out."""
+"""Radians; points beyond are left out."""
 N_ELEVATIONS = 16
 N_COLUMNS = 180
 MIN_RANGE = 0.1
-"""Metres; nearer points are the sensor's own, and have no logarithm to speak of."""
+"""Metres; nearer points are on the sensor itself."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -31,7 +31,7 @@ def _greatest(
     values: NDArray[np.float64],
     shape: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Greatest value in each cell, NaN where there is none; what is outside is left out."""
+    """Greatest value in each cell, NaN in empty ones; values outside are left out."""
     grid = np.full(shape, np.nan)
     for i in range(len(values)):
         r, c = rows[i], columns[i] % shape[1]

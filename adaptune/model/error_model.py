@@ -23,7 +23,7 @@ from adaptune.model.model_file import (
 )
 from adaptune.model.paired import PairedSettings
 from adaptune.parameter_sets import ParameterSets
-from adaptune.sequence.views import places
+from adaptune.sequence.names import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
 SAME_SENSOR = 3.0

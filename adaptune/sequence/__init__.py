@@ -1,8 +1,8 @@
 """Recorded sequences: scans from a sensor, and the reference trajectory they are judged by."""
 
-from adaptune.sequence.config import SequenceConfig, open_sequence
+from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence, SequenceError
 
-__all__ = ["Imu", "Scan", "Sequence", "SequenceConfig", "SequenceError", "open_sequence"]
+__all__ = ["Imu", "Scan", "Sequence", "SequenceConfig", "SequenceError"]

@@ -14,13 +14,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune import geometry
 from adaptune.sequence import livox, pointcloud2, velodyne
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloudError
+from adaptune.sequence.pose_messages import PATH, POSES, TRANSFORMS, message_stamp, of_frame, usable
 from adaptune.sequence.scan import Scan
-from adaptune.sequence.sequence import Frame, Repairs, SequenceError
+from adaptune.sequence.sequence import SequenceError
 from adaptune.sequence.serialized import header_stamp
+from adaptune.sequence.source import Frame, Repairs
 from adaptune.sequence.timing import AUTO, Timing
 from adaptune.space import nearest
 from adaptune.trajectory import Trajectory
@@ -28,81 +29,10 @@ from adaptune.trajectory import Trajectory
 POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *livox.TYPES, *velodyne.TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
-_Pose = tuple[int, str, Any, Any]
-"""Stamp, frame, translation, quaternion."""
-
-
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
-
-
-def _header_pose(message: Any, pose: Any) -> list[_Pose]:
-    return [(_stamp(message), message.header.frame_id, pose.position, pose.orientation)]
-
-
-def _transforms(transforms: Iterable[Any]) -> list[_Pose]:
-    return [
-        (_stamp(t), t.child_frame_id, t.transform.translation, t.transform.rotation)
-        for t in transforms
-    ]
-
-
-POSES: dict[str, Callable[[Any], list[_Pose]]] = {
-    "geometry_msgs/msg/PoseStamped": lambda m: _header_pose(m, m.pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _header_pose(m, m.pose.pose),
-    "nav_msgs/msg/Odometry": lambda m: _header_pose(m, m.pose.pose),
-    "nav_msgs/msg/Path": lambda m: [pose for p in m.poses for pose in _header_pose(p, p.pose)],
-    "geometry_msgs/msg/TransformStamped": lambda m: _transforms([m]),
-    "tf2_msgs/msg/TFMessage": lambda m: _transforms(m.transforms),
-    "tf/msg/tfMessage": lambda m: _transforms(m.transforms),
-}
-"""Poses in a message, by its type."""
-# Each repeats all of the one before.
-_PATH = "nav_msgs/msg/Path"
-_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-
-
-def bag_paths(given: Sequence[str]) -> list[Path]:
-    """What to open for the paths, folders and patterns that a user gives.
-
-    Raises
-    ------
-    SequenceError
-        Naming what is not there or holds no bag.
-    """
-    paths: list[Path] = []
-    for text in given:
-        path = Path(text)
-        if path.is_dir():
-            paths += _in_folder(path)
-        elif path.exists():
-            if path.suffix not in (".bag", ".mcap", ".db3"):
-                raise SequenceError(
-                    f"{path}: not a bag; there are .bag, .mcap and .db3 files and ROS 2 folders"
-                )
-            paths.append(path)
-        elif found := sorted(path.parent.glob(path.name)):
-            paths += bag_paths([str(match) for match in found])
-        else:
-            raise SequenceError(f"{path}: there is no such bag")
-    if len({path.suffix == ".bag" for path in paths}) > 1:
-        raise SequenceError(f"{paths[0]} and {paths[-1]} are of ROS 1 and ROS 2: they do not mix")
-    return paths
-
-
-def _in_folder(folder: Path) -> list[Path]:
-    if (folder / "metadata.yaml").exists():
-        return [folder]
-    # A recorder that was killed leaves its files without the metadata.
-    for suffix in (".mcap", ".db3", ".bag"):
-        if found := sorted(folder.glob(f"*{suffix}")):
-            return found
-    raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
-
 
 @cache
 def _typestore() -> Any:
-    """What messages of ROS 2 bags are when the bags themselves do not tell."""
+    """Message definitions for ROS 2 bags that contain none."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     types: Any = {}
     for name, text in livox.DEFINITIONS.items():
@@ -121,9 +51,9 @@ class BagSource:
     points
         Topic of the point clouds; may be left out where there is only one.
     timing
-        What the stamps mean.
+        Meaning of the stamps.
     about
-        What `about` told when they were opened before; the bags are then not opened now.
+        Result of `about` when they were opened before; the bags are then not opened now.
 
     Raises
     ------
@@ -165,7 +95,7 @@ class BagSource:
         self._ready = reader
 
     def about(self) -> dict[str, Any]:
-        """What opening the bags has told, as plain data."""
+        """Everything that opening the bags has shown, as plain data."""
         return {
             "name": self.name,
             "topics": self.topics,
@@ -202,7 +132,7 @@ class BagSource:
                 yield Frame(stamp, recorded, partial(self._load, decode, data, number))
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
-        """Stamp of the first message, none where it tells none; reading it on tells why."""
+        """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
         try:
             connection, _, data = next(self.read(reader, topic))
             if topic == self.points:
@@ -240,28 +170,21 @@ class BagSource:
         if name is None:
             return None
         name = self.topic(name, POSES, "poses")
-        messages = self.messages(name, last=self.topics[name] == _PATH)
+        messages = self.messages(name, last=self.topics[name] == PATH)
         found = [pose for message in messages for pose in POSES[message.__msgtype__](message)]
-        if self.topics[name] in _TRANSFORMS:
-            found = self._of_frame(name, found, child_frame)
+        if self.topics[name] in TRANSFORMS:
+            found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
             raise SequenceError(f"{self.name}: no pose on {name}")
-        stamps = np.array([stamp for stamp, *_ in found], np.int64)
-        values = np.array([(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for _, _, p, q in found])
-        with np.errstate(invalid="ignore", over="ignore"):
-            norms = np.linalg.norm(values[:, 3:], axis=1)
-        usable = np.isfinite(values).all(axis=1) & np.isfinite(norms) & (norms > 0.1)
-        if not usable.any():
+        trajectory, unusable = usable(found)
+        if trajectory is None:
             raise SequenceError(
                 f"{self.name}: every pose on {name} is not finite or has no rotation"
             )
         repairs = Repairs()
-        for _ in range(int(np.count_nonzero(~usable))):
-            repairs.add(f"poses on {name} that are not finite or have no rotation")
+        repairs.add(f"poses on {name} that are not finite or have no rotation", unusable)
         repairs.report(self.name)
-        unique, index = np.unique(stamps[usable], return_index=True)
-        poses = values[usable][index]
-        return Trajectory(unique, geometry.from_quaternions(poses[:, :3], poses[:, 3:]))
+        return trajectory
 
     def imu(self, name: str | None) -> Imu | None:
         """Measurements on a topic, as they were recorded.
@@ -275,7 +198,7 @@ class BagSource:
         stamps, values = [], []
         for message in self.messages(name):
             w, a = message.angular_velocity, message.linear_acceleration
-            stamps.append(_stamp(message))
+            stamps.append(message_stamp(message))
             values.append((w.x, w.y, w.z, a.x, a.y, a.z))
         if not stamps:
             raise SequenceError(f"{self.name}: no measurement on {name}")
@@ -291,12 +214,12 @@ class BagSource:
         Raises
         ------
         SequenceError
-            Naming what there is.
+            Naming the topics in the bags.
         """
         types = tuple(types)
         fitting = sorted(t for t, kind in self.topics.items() if kind in types)
         if name is None:
-            # Packets are often recorded beside the points that were made of them.
+            # Packets are often recorded together with the points that were made of them.
             fitting = [t for t in fitting if self.topics[t] not in velodyne.TYPES] or fitting
             if len(fitting) != 1:
                 raise SequenceError(
@@ -318,7 +241,7 @@ class BagSource:
         Raises
         ------
         SequenceError
-            Naming what there is, or what to install.
+            Naming the topics in the bags, or the package to install.
         """
         if self.topics[self.points] in velodyne.TYPES and find_spec("velodyne_decoder") is None:
             raise SequenceError(
@@ -433,21 +356,12 @@ class BagSource:
         try:
             return decode(data)
         except Exception as error:
-            told = str(error) if isinstance(error, PointCloudError) else f"damaged ({_say(error)})"
-            raise SequenceError(
-                f"{self.name}: message {number} on {self.points}: {told}"
-            ) from error
-
-    def _of_frame(self, topic: str, found: list[_Pose], frame: str | None) -> list[_Pose]:
-        frames = sorted({name for _, name, *_ in found})
-        if frame is None and len(frames) > 1:
-            raise SequenceError(
-                f"{self.name}: {topic} has the transforms of several frames, name one of them as "
-                f"`child_frame`: {', '.join(frames)}"
+            reason = (
+                str(error) if isinstance(error, PointCloudError) else f"damaged ({_say(error)})"
             )
-        if frame is not None and frame not in frames:
-            raise SequenceError(f"{self.name}: {topic}: no frame {frame}; {nearest(frame, frames)}")
-        return [pose for pose in found if frame in (None, pose[1])]
+            raise SequenceError(
+                f"{self.name}: message {number} on {self.points}: {reason}"
+            ) from error
 
 
 def _close(reader: AnyReader) -> None:

@@ -1,8 +1,8 @@
 """Decoded sequences on disk, shared by all processes.
 
-An entry is a folder of arrays that are mapped into memory, named by a digest of what was decoded
-and how. It is written beside its place and renamed there when whole: a writer that is killed
-leaves a folder whose name begins with a dot, which the next one removes.
+An entry is a folder of arrays that are mapped into memory. Its name is a digest of the files and
+settings. It is written to a temporary folder and renamed when whole. A killed writer leaves a
+folder whose name begins with a dot, which the next writer removes.
 """
 
 import hashlib
@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,6 +19,7 @@ from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 import numpy as np
+import platformdirs
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
@@ -30,9 +30,9 @@ _log = logging.getLogger(__name__)
 _VERSION = 3
 _SAMPLE = 1 << 16
 _CAP_GB = 50.0
-# A writer that has not written for this long is taken for dead.
+# Seconds. A writer that has not written for this long is dead.
 _DEAD = 3600.0
-# What a scan may be without.
+# Fields that a scan may lack.
 _OPTIONAL = ("times", "rings", "intensities")
 _INDEX = np.dtype([("stamp", "<i8"), ("end", "<i8"), *((name, "?") for name in _OPTIONAL)])
 _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -47,13 +47,7 @@ def folder() -> Path:
     """Where decoded sequences are kept: ``$ADAPTUNE_CACHE``, or in the user's cache folder."""
     if given := os.environ.get("ADAPTUNE_CACHE"):
         return Path(given).expanduser()
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "adaptune"
+    return platformdirs.user_cache_path("adaptune", appauthor=False)
 
 
 def cap() -> int:
@@ -67,8 +61,8 @@ def cap() -> int:
 def key(paths: Sequence[Path], settings: Any) -> str:
     """Digest of files and settings.
 
-    Of a file count its size, its time of change, its beginning and its end; its name does not. Of
-    a folder count its files.
+    A file counts by its size, its time of change, its beginning and its end, not by its name. A
+    folder counts by its files.
 
     Raises
     ------
@@ -99,7 +93,7 @@ class CachedScans:
     Attributes
     ----------
     about : dict
-        What was noted of the sequence when it was decoded.
+        Notes on the sequence from when it was decoded.
     """
 
     def __init__(self, path: Path):
@@ -107,10 +101,10 @@ class CachedScans:
         self.about: dict[str, Any] = json.loads((path / "about.json").read_text("utf-8"))
         self._index = np.load(path / "index.npy")
         self._ends: list[int] = self._index["end"].tolist()
-        # All at once: what is mapped stays even if another process removes the entry.
+        # All at once: mapped arrays stay even if another process removes the entry.
         self._points = self._map("points")
         self._optional = [self._map(name) for name in _OPTIONAL]
-        # Says when the entry was last of use.
+        # Records when the entry was last used.
         os.utime(path / "about.json")
 
     def __len__(self) -> int:
@@ -192,7 +186,7 @@ class Writer:
     key
         Digest of the entry.
     about
-        What to note of the sequence; plain data.
+        Notes on the sequence; plain data.
     """
 
     def __init__(self, key: str, about: dict[str, Any]):
@@ -201,9 +195,9 @@ class Writer:
         root = folder()
         root.mkdir(parents=True, exist_ok=True)
         _sweep(root)
-        self._beside = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
+        self._temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
         self._arrays = {
-            name: _Growing(self._beside / f"{name}.npy", np.dtype(kind), shape)
+            name: _Growing(self._temporary / f"{name}.npy", np.dtype(kind), shape)
             for name, (kind, shape) in _ARRAYS.items()
         }
         self._index: list[tuple[int | bool, ...]] = []
@@ -219,14 +213,14 @@ class Writer:
         for name, values in zip(_OPTIONAL, given, strict=True):
             array = self._arrays[name]
             if values is not None:
-                # Those before had none: their share is left empty.
+                # Scans before had none: their share stays empty.
                 array.append(np.zeros(self._arrays["points"].length - n - array.length))
                 array.append(values)
         there = (values is not None for values in given)
         self._index.append((scan.stamp, self._arrays["points"].length, *there))
 
     def done(self, **about: Any) -> None:
-        """Say that the last scan was added, and note more of the sequence."""
+        """Mark the entry as complete, and note more of the sequence."""
         self._about |= about
         self._done = True
 
@@ -240,21 +234,21 @@ class Writer:
             for array in self._arrays.values():
                 array.close()
             if self._done and error is None:
-                np.save(self._beside / "index.npy", np.array(self._index, _INDEX))
+                np.save(self._temporary / "index.npy", np.array(self._index, _INDEX))
                 about = json.dumps(self._about, indent=1)
-                (self._beside / "about.json").write_text(about, "utf-8")
-                _make_room(_size(self._beside))
+                (self._temporary / "about.json").write_text(about, "utf-8")
+                _make_room(_size(self._temporary))
                 # Another process may have been first; its arrays are the same.
                 if not (folder() / self._key).exists():
-                    self._beside.rename(folder() / self._key)
+                    self._temporary.rename(folder() / self._key)
         except OSError as problem:
             _log.warning("%s: not kept in the cache (%s)", self._about.get("name"), problem)
         finally:
-            shutil.rmtree(self._beside, ignore_errors=True)
+            shutil.rmtree(self._temporary, ignore_errors=True)
 
 
 def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan]:
-    """Pass scans on and keep them; nothing is kept unless all of them were asked for."""
+    """Pass scans on and keep them. Nothing is kept unless all of them are read."""
     try:
         writer = Writer(key, about)
     except OSError as error:
@@ -322,17 +316,17 @@ def list_cache() -> list[CacheEntry]:
 
 
 def clear_cache() -> int:
-    """Remove all entries and what dead writers left.
+    """Remove all entries and the remains of dead writers.
 
     Returns
     -------
     int
-        Bytes that are free again.
+        Freed bytes.
     """
     freed = 0
     root = folder()
     for path in root.iterdir() if root.is_dir() else ():
-        # Nothing is removed that was not written here, should the folder be shared.
+        # Other files in a shared folder stay.
         if path.name.startswith(".writing-") or (path / "index.npy").exists():
             freed += _size(path)
             shutil.rmtree(path, ignore_errors=True)
@@ -345,7 +339,7 @@ def _make_room(size: int) -> None:
     for entry in reversed(entries):
         if total <= cap():
             return
-        # Processes that have it mapped keep what they mapped.
+        # Processes that have mapped it keep their arrays.
         shutil.rmtree(entry.path, ignore_errors=True)
         total -= entry.size
 

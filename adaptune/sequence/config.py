@@ -1,8 +1,7 @@
-"""How a study describes a sequence."""
+"""Configuration of a sequence in a study."""
 
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -16,33 +15,19 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.geometry import Poses
-from adaptune.sequence import cache, views
-from adaptune.sequence.bag import IMU_TYPES, BagSource, bag_paths
-from adaptune.sequence.folder import kitti, scan_folder
-from adaptune.sequence.imu import USUAL, ImuNoise
-from adaptune.sequence.sequence import (
-    ImuSettings,
-    RecordedSequence,
-    ReferenceSettings,
-    Section,
-    Sequence,
-    SequenceError,
-    Source,
-)
-from adaptune.sequence.timing import Timing, Unit
+from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.imu import USUAL
+from adaptune.sequence.timing import Unit
 
-_REFERENCE_FILES = (".tum", ".txt", ".csv")
+REFERENCE_FILES = (".tum", ".txt", ".csv")
 _SOURCES = ("bag", "kitti", "folder", "evalio")
-# Livox IMUs measure acceleration in multiples of this.
-_STANDARD_GRAVITY = 9.80665
 
 
 def expand(text: str) -> str:
-    """Replace ``${VARIABLE}`` by what the environment says.
+    """Replace ``${VARIABLE}`` by the value of the environment variable.
 
     Raises
     ------
@@ -77,7 +62,7 @@ def _resolve_bags(given: Any, info: ValidationInfo) -> Any:
 
 
 def _resolve_file(reference: str, info: ValidationInfo) -> str:
-    return resolve(reference, info) if reference.endswith(_REFERENCE_FILES) else reference
+    return resolve(reference, info) if reference.endswith(REFERENCE_FILES) else reference
 
 
 _Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
@@ -107,6 +92,8 @@ def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
     R = values[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError("its first three columns and rows are not a rotation")
+    from scipy.spatial.transform import Rotation
+
     T = np.eye(4)
     # Written with a few digits, it is a rotation only nearly.
     T[:3, :3] = Rotation.from_matrix(R).as_matrix()
@@ -136,7 +123,7 @@ class _Part(_Section):
 
 
 class DropConfig(_Part):
-    """Which share of the scans from `start` to `stop` is lost."""
+    """The share of the scans from `start` to `stop` that is lost."""
 
     share: float = Field(gt=0, lt=1)
     seed: int = Field(0, ge=0)
@@ -166,7 +153,7 @@ class ViewConfig(_Section):
     speed : SpeedConfig
     reverse : true
     rings : int
-        Every how many rings one is kept.
+        Keep one ring in so many.
     noise : NoiseConfig
     transform : Transform
         Pose of the LiDAR in the frame from which to see it.
@@ -196,23 +183,8 @@ class ViewConfig(_Section):
         """Which view it is."""
         return self._given()[0]
 
-    def of(self, sequence: views.Reversible) -> views.Reversible:
-        """The sequence as this view shows it."""
-        return _VIEWS[self.name](sequence, getattr(self, self.name))
-
     def _given(self) -> list[str]:
         return [name for name in type(self).model_fields if getattr(self, name) is not None]
-
-
-_VIEWS: dict[str, Callable[[views.Reversible, Any], views.Reversible]] = {
-    "cut": views.cut,
-    "drop": lambda of, v: views.drop(of, v.share, (v.start, v.stop), v.seed),
-    "speed": lambda of, v: views.speed(of, v.factor, (v.start, v.stop)),
-    "reverse": lambda of, _: views.Reversed(of),
-    "rings": views.thin_rings,
-    "noise": lambda of, v: views.add_noise(of, v.sigma, v.seed),
-    "transform": lambda of, v: views.transform(of, to_pose(v)),
-}
 
 
 _Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -265,15 +237,15 @@ class SequenceConfig(_Part):
     points : str, optional
         Topic of the point clouds.
     stamp : {"auto", "start", "end"}
-        What of a scan its stamp marks.
+        Whether a stamp marks the start or the end of its scan.
     time_unit : {"s", "ms", "us", "ns"}, optional
         Unit of the points' times.
     period : float
-        Seconds a scan takes, where neither points nor files tell.
+        Seconds a scan takes; used if neither points nor files have times.
     start, stop : float
         Seconds since the first scan.
     stride : int
-        Every how many scans to use.
+        Use every stride-th scan.
     reference : str, optional
         Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
     child_frame : str, optional
@@ -283,17 +255,17 @@ class SequenceConfig(_Part):
     clock_offset : float
         Seconds to add to the reference's stamps.
     max_gap : float
-        Seconds; nothing is known between reference poses further apart.
+        Seconds. The reference is unknown between poses further apart.
     imu : ImuConfig, optional
     elevation : float, optional
         Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
         benchmark and the raw drives when left out.
     compensate : {"constant_velocity", "gyro"}, optional
-        Take out of every scan the motion since the scan before, or the rotation that the IMU
-        measured.
+        Compensate every scan for the motion since the scan before, or for the rotation that the
+        IMU measured.
     views : list of ViewConfig
     cache : bool
-        Whether to keep decoded bags on disk.
+        Whether to keep decoded bags in the cache.
     """
 
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
@@ -341,99 +313,6 @@ class SequenceConfig(_Part):
         """
         paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
         paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
-        if self.reference is not None and self.reference.endswith(_REFERENCE_FILES):
+        if self.reference is not None and self.reference.endswith(REFERENCE_FILES):
             paths.append(Path(self.reference))
         return paths
-
-
-def open_sequence(config: SequenceConfig) -> Sequence:
-    """Open what a study describes; scans are not read before they are asked for.
-
-    Raises
-    ------
-    SequenceError
-        If it cannot be opened as described.
-    """
-    sequence: views.Reversible = _recorded(config)
-    if config.compensate == "constant_velocity":
-        sequence = views.WithoutMotion(sequence)
-    elif config.compensate == "gyro":
-        sequence = views.without_rotation(sequence)
-    for view in config.views:
-        sequence = view.of(sequence)
-    return sequence
-
-
-def check_sequence(config: SequenceConfig) -> None:
-    """Find what would fail while it is read, without reading its scans.
-
-    Raises
-    ------
-    SequenceError
-        If it cannot be opened as described, ends before its `start`, or its reference is of
-        another time.
-    """
-    _recorded(config).check()
-
-
-def _recorded(config: SequenceConfig) -> RecordedSequence:
-    reference: str | Path | None = config.reference
-    if isinstance(reference, str) and reference.endswith(_REFERENCE_FILES):
-        reference = Path(reference)
-        if not reference.is_file():
-            raise SequenceError(f"{reference}: there is no such file")
-    source, key = _source(config)
-    if isinstance(source, BagSource):
-        topic = reference if isinstance(reference, str) else None
-        source.check(topic, None if config.imu is None else config.imu.topic)
-        if config.imu is not None and config.bag is not None:
-            source.topic(config.imu.topic, IMU_TYPES, "an IMU's measurements")
-    return RecordedSequence(
-        source,
-        _section(config),
-        ReferenceSettings(
-            reference,
-            config.child_frame,
-            None if config.extrinsic is None else to_pose(config.extrinsic),
-            config.clock_offset,
-            config.max_gap,
-        ),
-        _imu(config.imu),
-        key,
-    )
-
-
-def _source(config: SequenceConfig) -> tuple[Source, str | None]:
-    """What reads the recording, and under which key its decoded scans are kept."""
-    timing = Timing(config.stamp, config.time_unit, config.period)
-    if config.kitti is not None:
-        return kitti(Path(config.kitti), config.elevation), None
-    if config.folder is not None:
-        return scan_folder(Path(config.folder), timing), None
-    if config.evalio is not None:
-        from adaptune.sequence.evalio import evalio_source
-
-        return evalio_source(config.evalio), None
-    bags = (config.bag,) if isinstance(config.bag, str) else config.bag or ()
-    paths = bag_paths(bags)
-    if not config.cache or not cache.cap():
-        return BagSource(paths, config.points, timing), None
-    try:
-        key = cache.key(paths, (config.points, timing, _section(config)))
-    except OSError as error:
-        raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
-    entry = cache.find(key)
-    about = None if entry is None else entry.about
-    return BagSource(paths, config.points, timing, about), key
-
-
-def _section(config: SequenceConfig) -> Section:
-    return Section(config.start, config.stop, config.stride)
-
-
-def _imu(config: ImuConfig | None) -> ImuSettings | None:
-    if config is None:
-        return None
-    T = None if config.extrinsic is None else to_pose(config.extrinsic)
-    scale = _STANDARD_GRAVITY if config.unit == "g" else 1.0
-    return ImuSettings(config.topic, T, scale, ImuNoise(**config.noise.model_dump()))

@@ -1,4 +1,4 @@
-"""Recordings kept as a folder with one file a scan."""
+"""Recordings with one file for each scan."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -16,12 +16,13 @@ from adaptune.geometry import Poses
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloudError, from_fields
 from adaptune.sequence.scan import Scan
-from adaptune.sequence.sequence import Frame, SequenceError
+from adaptune.sequence.sequence import SequenceError
+from adaptune.sequence.source import Frame
 from adaptune.sequence.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
-# Degrees by which the rays of KITTI's LiDAR are told too low.
+# KITTI's LiDAR reports its rays too low by so many degrees.
 _ELEVATION = 0.205
 
 
@@ -39,7 +40,7 @@ class FileSource:
     timing : Timing
         What the stamps mean.
     own_poses : callable, optional
-        Reads the poses of the LiDAR that lie beside the files.
+        Reads the LiDAR's poses stored with the files.
     elevation : float
         Degrees by which every ray is to be turned up.
     """
@@ -54,7 +55,7 @@ class FileSource:
     random_access: ClassVar[bool] = True
 
     def about(self) -> dict[str, Any]:
-        """Its name is all there is to note."""
+        """Its name."""
         return {"name": self.name}
 
     @property
@@ -78,7 +79,7 @@ class FileSource:
         return (int(self.stamps[0]), int(self.stamps[-1])) if len(self.stamps) else None
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Poses of the LiDAR that lie beside the files.
+        """The LiDAR's poses stored with the files.
 
         Raises
         ------
@@ -164,7 +165,7 @@ def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
 
 def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
     cloud = open3d.load().t.io.read_point_cloud(str(path))
-    # What it cannot read it gives back without points, without a word.
+    # Open3D returns an empty cloud for files that it cannot read.
     if "positions" not in cloud.point or not len(cloud.point.positions):
         raise ValueError("it is damaged or holds no point")
     fields = {name: tensor.numpy() for name, tensor in cloud.point.items()}
@@ -223,7 +224,7 @@ def _named_stamps(files: Sequence[Path]) -> NDArray[np.int64] | None:
 def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     """Scans of a KITTI odometry sequence, a KITTI raw drive or a KITTI-360 drive.
 
-    The kind is told by what the folder holds: ``velodyne/`` with ``times.txt`` and ``calib.txt``
+    The content of the folder shows the kind: ``velodyne/`` with ``times.txt`` and ``calib.txt``
     (poses in ``poses.txt``, or ``poses/`` two folders up), or ``velodyne_points/data/`` (poses
     from ``oxts/``, or from ``data_poses/`` two folders up).
 
@@ -267,7 +268,7 @@ def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
         T = geometry.invert(T_camera_sensor) @ T_world_camera @ T_camera_sensor
         return Trajectory(stamps, T)
 
-    # Files may be missing from the front or the middle: each is told by its number.
+    # Files may be missing from the front or the middle: their numbers give the stamps.
     return FileSource(
         str(folder),
         files,
@@ -289,7 +290,7 @@ def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
     elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
         poses = partial(_kitti_360_poses, record, _dates(path))
     if elevation is None:
-        # Only the raw drives tell when a turn started; KITTI-360 has another LiDAR.
+        # Only the raw drives record the start of each turn; KITTI-360 has another LiDAR.
         elevation = _ELEVATION if started.exists() else 0.0
     return FileSource(str(folder), files, stamps, own_poses=poses, elevation=elevation)
 

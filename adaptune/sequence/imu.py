@@ -112,7 +112,7 @@ def clock_offset(
     Returns
     -------
     float or None
-        None where the two do not tell the same motion.
+        None if the two do not show the same motion.
     """
     if len(trajectory) < 3 or len(stamps) < 3:
         return None

@@ -51,18 +51,18 @@ def decode(
     cdr
         Whether it is serialised as in ROS 2.
     timing
-        What its stamps mean; the points' offsets count from the time base, and the stamp marks
-        the same moment, unless it is said to mark the scan's end.
+        Meaning of its stamps. The points' offsets count from the time base. The stamp marks the
+        same moment, unless it is set to mark the scan's end.
 
     Raises
     ------
     PointCloudError
-        If the message is not as its definition says.
+        If the message does not match its definition.
     """
     try:
         stamp, raw = _parse(Serialized(data, cdr), tuple(message), tuple(point), cdr)
     except (struct.error, KeyError, ValueError, IndexError) as error:
-        raise PointCloudError(f"not a Livox message as its definition says ({error})") from error
+        raise PointCloudError(f"a Livox message unlike its definition ({error})") from error
     return from_fields(raw, stamp, timing)
 
 

@@ -29,7 +29,7 @@ Field = tuple[str, int, int, int]
 
 
 class PointCloud2(NamedTuple):
-    """What a message tells of its points, and their bytes."""
+    """Layout of the points of a message, and their bytes."""
 
     stamp: int
     height: int
@@ -148,7 +148,7 @@ def decode(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
     cdr
         Whether it is serialised as in ROS 2.
     timing
-        What its stamps mean.
+        Meaning of its stamps.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     stamp
         The header's, in nanoseconds.
     timing
-        What the stamps mean.
+        Meaning of the stamps.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
     time = next((name for name in TIME_FIELDS if name in names), None)
     ring = next((name for name in RING_FIELDS if name in names), None)
-    # What nothing needs is no reason to refuse a cloud.
+    # An odd intensity field is ignored: nothing needs it.
     numbers = (n for n in INTENSITY_FIELDS if n in names and raw[n].ndim == 1)
     intensity = next((name for name in numbers if raw[name].dtype.kind in "iuf"), None)
     columns = {name: raw[name] for name in (*"xyz", time, ring, intensity) if name}
@@ -188,24 +188,20 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
             raise PointCloudError(f"field {name!r} is not one number for each point")
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = (np.asarray(columns[axis], np.float32) for axis in "xyz")
-        given_rings = _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16)
-        given_intensities = (
-            _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32)
+        given = (
+            _NO_TIMES if time is None else _native(columns[time]),
+            _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16),
+            _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32),
         )
-    given_times = _NO_TIMES if time is None else _native(columns[time])
     n = len(x)
-    points = np.empty((n, 3), np.float32)
-    times = np.empty(len(given_times), given_times.dtype)
-    rings = np.empty(len(given_rings), np.uint16)
-    intensities = np.empty(len(given_intensities), np.float32)
-    gather, compact = _kernels(times.dtype.str)
-    made = (points, times, rings, intensities)
-    valid, low, high = gather(x, y, z, given_times, given_rings, given_intensities, *made)
+    made = (np.empty((n, 3), np.float32), *(np.empty(len(v), v.dtype) for v in given))
+    gather, compact = _kernels(given[0].dtype.str)
+    valid, low, high = gather(x, y, z, given, made)
     if valid < n:
         _, low, high = compact(*made)
-        # Others are not to be kept in memory with them.
-        points, times = points[:valid].copy(), times[:valid].copy()
-        rings, intensities = rings[:valid].copy(), intensities[:valid].copy()
+        # A copy, so that the other points are not kept in memory with them.
+        made = tuple(values[:valid].copy() for values in made)
+    points, times, rings, intensities = made
     try:
         start, seconds = timing.resolve(stamp, None if time is None else times, (low, high))
     except TimingError as error:
@@ -236,15 +232,12 @@ def _gather(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
     z: NDArray[np.float32],
-    given_times: NDArray[Any],
-    given_rings: NDArray[np.uint16],
-    given_intensities: NDArray[np.float32],
-    points: NDArray[np.float32],
-    times: NDArray[Any],
-    rings: NDArray[np.uint16],
-    intensities: NDArray[np.float32],
+    given: tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
+    made: tuple[NDArray[np.float32], NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
 ) -> tuple[int, Any, Any]:
     """Put each field side by side; count the valid points, and find the extent of times."""
+    given_times, given_rings, given_intensities = given
+    points, times, rings, intensities = made
     timed, ringed, lit = len(given_times) > 0, len(given_rings) > 0, len(given_intensities) > 0
     low = high = given_times[0] if timed else times.dtype.type(0)
     valid = 0
@@ -306,10 +299,10 @@ def _compact(
 @cache
 def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Gather and compact clouds whose times are of this type."""
-    # Importing numba takes a while, and a bag may never be read.
+    # Importing numba takes time, and a bag may never be read.
     import numba
 
-    # Fields lie at any offset; what is aligned may be taken for what is not.
+    # Fields lie at any offset. Unaligned types accept aligned arrays, too.
     def column(scalar: Any) -> Any:
         return types.Array(scalar, 1, "A", readonly=True, aligned=False)
 
@@ -321,7 +314,8 @@ def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
         types.Array(whole, 1, "C"),
         types.Array(real, 1, "C"),
     )
-    told = types.Tuple((numba.int64, time, time))
+    result = types.Tuple((numba.int64, time, time))
     compiled = partial(numba.njit, nogil=True, cache=True)
-    given = (*3 * (column(real),), column(time), column(whole), column(real))
-    return compiled(told(*given, *scan))(_gather), compiled(told(*scan))(_compact)
+    given = types.Tuple((column(time), column(whole), column(real)))
+    gather = result(*3 * (column(real),), given, types.Tuple(scan))
+    return compiled(gather)(_gather), compiled(result(*scan))(_compact)

@@ -21,22 +21,21 @@ _SAME_CLOCK = 10.0
 
 
 class TimingError(AdaptuneError):
-    """Times of points that cannot be what they are taken for."""
+    """Times of points that are not plausible."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What the time stamps of a recording mean.
+    """Meaning of the time stamps of a recording.
 
     Attributes
     ----------
     stamp : {"auto", "start", "end"}
-        What of a scan its header's stamp marks. `auto` believes the points: they come before the
-        stamp, or they come after it. Scans whose points have no time are taken as stamped at
-        their start.
+        Moment of the scan that the header's stamp marks. `auto` follows the points: they come
+        before the stamp or after it. Scans whose points have no time are stamped at their start.
     unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the points' times. Where it is left out, floating-point numbers are seconds and
-        whole ones nanoseconds; absolute times tell their unit by their size.
+        Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
+        nanoseconds; the size of absolute times reveals their unit.
     period : float
         Seconds a scan takes; only for scans stamped at their end whose points have no time.
     """
@@ -88,20 +87,7 @@ class Timing:
                 f"the times of the points reach {high * scale:g} s from the scan's stamp; if they "
                 f"are in another unit, name it with `time_unit: s|ms|us|ns`"
             )
-        # From the header's stamp to the scan's start, in seconds.
-        if absolute:
-            zero = low
-            nanoseconds = low if scale == 1e-9 else low * scale * 1e9
-            before = (int(nanoseconds) - stamp) * 1e-9
-            same_clock = abs(before) <= _SAME_CLOCK
-            begin = {"start": 0.0, "end": -span}.get(self.stamp, before if same_clock else 0.0)
-        elif low < 0:
-            zero = low
-            begin = {"start": 0.0, "end": (low - max(high, 0)) * scale}.get(self.stamp, low * scale)
-        else:
-            # Counted from the scan's start, which is before the first ray that came back.
-            zero = 0
-            begin = -high * scale if self.stamp == "end" else 0.0
+        zero, begin = self._start(stamp, extent, scale, absolute)
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:
             times = np.ascontiguousarray(values)
         else:
@@ -110,6 +96,24 @@ class Timing:
             wide = values.astype(np.int64) if small else values
             times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
         return stamp + round(begin * 1e9), times
+
+    def _start(
+        self, stamp: int, extent: tuple[float, float], scale: float, absolute: bool
+    ) -> tuple[float, float]:
+        """The points' time at the scan's start, and seconds from the header's stamp to it."""
+        low, high = extent
+        span = (high - low) * scale
+        if absolute:
+            nanoseconds = low if scale == 1e-9 else low * scale * 1e9
+            before = (int(nanoseconds) - stamp) * 1e-9
+            same_clock = abs(before) <= _SAME_CLOCK
+            known = {"start": 0.0, "end": -span}
+            return low, known.get(self.stamp, before if same_clock else 0.0)
+        if low < 0:
+            known = {"start": 0.0, "end": (low - max(high, 0)) * scale}
+            return low, known.get(self.stamp, low * scale)
+        # Counted from the scan's start, which is before the first ray that came back.
+        return 0, -high * scale if self.stamp == "end" else 0.0
 
     def _scale(self, dtype: np.dtype[Any], high: float) -> tuple[float, bool]:
         """Seconds per unit, and whether the times are absolute."""
@@ -127,4 +131,4 @@ class Timing:
 
 
 AUTO = Timing()
-"""Believe the points."""
+"""Follow the points."""

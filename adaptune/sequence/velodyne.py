@@ -13,7 +13,7 @@ _PACKET = 1206
 
 
 def decoder(cdr: bool) -> Callable[[bytes], Scan]:
-    """What decodes the messages of one LiDAR, whose model its packets tell.
+    """Make a decoder for the messages of one LiDAR. Its packets contain its model.
 
     A scan starts when its first packet was received, whatever the header's stamp marks.
 
@@ -50,7 +50,7 @@ def decoder(cdr: bool) -> Callable[[bytes], Scan]:
             body.end()
         except (struct.error, ValueError, IndexError) as error:
             raise PointCloudError(f"not a whole VelodyneScan ({error})") from error
-        if not packets:  # would crash it
+        if not packets:  # velodyne_decoder would crash
             raise PointCloudError("holds no packet")
         raw = [velodyne_decoder.VelodynePacket(at * 1e-9, packet) for at, packet in packets]
         try:

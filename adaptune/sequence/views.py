@@ -1,7 +1,7 @@
 """Views of a sequence: parts, losses, speeds and disturbances, without a copy of its clouds.
 
-What a view does to a scan depends on the scan and the view's seed alone, so the same scans are
-lost and the same noise is added in every process, in either direction, whatever was cut before.
+A view changes a scan depending on the scan and the view's seed alone. The same scans are lost and
+the same noise is added in every process, in either direction, whatever was cut before.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.geometry import Poses
+from adaptune.sequence.compensation import compensate_neighbours, compensate_rotation
 from adaptune.sequence.imu import Imu
-from adaptune.sequence.motion import compensate_neighbours, compensate_rotation
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence, SequenceError
 from adaptune.trajectory import Trajectory
-
-OF_VIEW = "+"
-"""Between the name of a sequence and that of a view of it; in no name that a user gives."""
 
 # Nanoseconds after the first scan at which an IMU that is on the same clock has begun.
 _LATE = 10 * 10**9
@@ -32,23 +29,11 @@ Part = tuple[float, float | None]
 """Seconds since the first scan: [start, stop), to the end where stop is None."""
 
 
-def origin(name: str) -> str:
-    """Name of the sequence that a training sequence is, or is a view of."""
-    return name.partition(OF_VIEW)[0]
-
-
-def places(names: Items[str]) -> NDArray[np.intp]:
-    """Number the places that sequences are of, of shape (n,): a view is of its origin's."""
-    number = {place: i for i, place in enumerate(dict.fromkeys(map(origin, names)))}
-    return np.array([number[origin(name)] for name in names], np.intp)
-
-
 class Reversible(Sequence, Protocol):
     """A sequence that can be read from its end."""
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +101,7 @@ class View:
         return None if imu is None else self.of_imu(imu)
 
     def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """When what was measured at `stamps` arrives."""
+        """When measurements of `stamps` arrive."""
         return self.of_clock(self.inner.played_at(stamps))
 
 
@@ -179,7 +164,7 @@ def cut(sequence: Reversible, parts: Items[Part]) -> View:
 
 
 def drop(sequence: Reversible, share: float, part: Part, seed: int) -> View:
-    """Lose a share of the scans of a part; each is lost by its own luck."""
+    """Lose a share of the scans of a part, each at random by itself."""
     first = _First(sequence)
 
     def lose(scan: Scan) -> Scan | None:
@@ -192,14 +177,14 @@ def drop(sequence: Reversible, share: float, part: Part, seed: int) -> View:
 def speed(sequence: Reversible, factor: float, part: Part) -> View:
     """A part of it arrives `factor` times faster.
 
-    Scans, stamps and poses are as they were: only `played_at` tells of it, for odometries that
-    run against the clock.
+    Scans, stamps and poses stay the same. Only `played_at` changes, for odometries that run
+    against the clock.
     """
     first = _First(sequence)
 
     def arrival(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
         start = first.stamp + round(part[0] * 1e9)
-        # What is later than any stamp can still be subtracted from.
+        # Later than any stamp, and small enough to subtract from.
         stop = 2**62 if part[1] is None else first.stamp + round(part[1] * 1e9)
         inside = np.clip(stamps, start, stop) - start
         saved: NDArray[np.int64] = np.rint(inside * (1.0 - 1.0 / factor)).astype(np.int64)
@@ -255,27 +240,9 @@ def transform(sequence: Reversible, T_seen_sensor: Poses) -> View:
     )
 
 
-class Reversed:
-    """A sequence played backwards: what was last comes first, and time still goes forward.
-
-    Parameters
-    ----------
-    inner
-        What to reverse.
-    """
-
-    def __init__(self, inner: Reversible):
-        self.inner = inner
-
-    @property
-    def name(self) -> str:
-        """The recording's file."""
-        return self.inner.name
-
-    @property
-    def n_messages(self) -> int:
-        """At least as many as there are scans."""
-        return self.inner.n_messages
+@dataclass(frozen=True, eq=False)
+class Reversed(View):
+    """A sequence played backwards: the last scan comes first, and time still goes forward."""
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans."""
@@ -287,7 +254,7 @@ class Reversed:
 
     @cached_property
     def _sum(self) -> int:
-        """What a moment and its mirror image add up to."""
+        """Sum of a moment and its mirror image."""
         first, last = next(iter(self.inner)), next(self.inner.backward())
         return first.stamp + last.stamp + last.span
 
@@ -321,13 +288,13 @@ class Reversed:
         )
 
     def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """When what was measured at `stamps` arrives."""
+        """When measurements of `stamps` arrive."""
         mirrored: NDArray[np.int64] = self._sum - self.inner.played_at(self._sum - stamps)
         return mirrored
 
 
 class WithImu:
-    """A sequence whose scans bring along what the IMU measured.
+    """A sequence whose scans carry the IMU's measurements.
 
     Parameters
     ----------
@@ -357,7 +324,7 @@ class WithImu:
             if first is None:
                 if not imu.stamps[0] - _LATE < scan.stamp < imu.stamps[-1]:
                     raise SequenceError(
-                        f"{self.name}: the IMU tells of {imu.stamps[0] * 1e-9:.3f} s to "
+                        f"{self.name}: the IMU covers {imu.stamps[0] * 1e-9:.3f} s to "
                         f"{imu.stamps[-1] * 1e-9:.3f} s, the first scan is of "
                         f"{scan.stamp * 1e-9:.3f} s: they are not on the same clock"
                     )

@@ -1,27 +1,27 @@
-"""What a simulated recording shall be."""
+"""Configuration of a simulated recording."""
 
+from collections.abc import Collection
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from adaptune.errors import AdaptuneError
-from adaptune.simulation.motion import MOTIONS
+from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import SENSORS
 from adaptune.simulation.weather import WEATHERS
 
 LONGEST = 20_000.0
-"""Metres; a longer course is a mistake more often than a wish."""
+"""Metres; a longer course is most likely a mistake."""
 
 
 class SimulationError(AdaptuneError):
     """A recording that cannot be made."""
 
 
-def _known(kind: str, name: str, names: object) -> str:
-    known = sorted(names)  # type: ignore[call-overload]
-    if name not in known:
-        raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(known)}")
+def _known(kind: str, name: str, names: Collection[str]) -> str:
+    if name not in names:
+        raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(sorted(names))}")
     return name
 
 
@@ -33,7 +33,7 @@ class SceneLeg(BaseModel):
     scene
         A name from `SCENES`.
     length
-        Metres driven in it; the course's own `length` when not given.
+        Metres driven in it; the course's `length` if not given.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -48,7 +48,7 @@ class SceneLeg(BaseModel):
 
 
 class Course(BaseModel):
-    """A simulated recording: where it leads, what is carried and how.
+    """A simulated recording: its scenes, its sensor and its motion.
 
     Attributes
     ----------
@@ -63,11 +63,11 @@ class Course(BaseModel):
     seed
         Another seed is another world, another drive and other noise.
     rate
-        Turns of the sensor in a second; the sensor's own when not given.
+        Turns of the sensor in a second; the sensor's own if not given.
     columns
-        Firings in a turn; the sensor's own when not given.
+        Firings in a turn; the sensor's own if not given.
     imu
-        Hz of the inertial measurements; none are made when not given.
+        Hz of the inertial measurements; none are made if not given.
     moving_objects
         Whether cars and walkers move about.
     weather
@@ -98,20 +98,11 @@ class Course(BaseModel):
                 _known("scene", scene, SCENES)
         return scenes
 
-    @field_validator("sensor")
+    @field_validator("sensor", "motion", "weather")
     @classmethod
-    def _sensor(cls, name: str) -> str:
-        return _known("sensor", name, SENSORS)
-
-    @field_validator("motion")
-    @classmethod
-    def _motion(cls, name: str) -> str:
-        return _known("motion", name, MOTIONS)
-
-    @field_validator("weather")
-    @classmethod
-    def _weather(cls, name: str) -> str:
-        return _known("weather", name, WEATHERS)
+    def _names(cls, name: str, info: ValidationInfo) -> str:
+        kind = str(info.field_name)
+        return _known(kind, name, {"sensor": SENSORS, "motion": MOTIONS, "weather": WEATHERS}[kind])
 
     @model_validator(mode="after")
     def _rate_follows_motion(self) -> Self:

@@ -1,4 +1,4 @@
-"""Triangle meshes with materials, and the solids that scenes are built of."""
+"""Triangle meshes with materials, and the solids that scenes consist of."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from adaptune.simulation.noise import fractal
 
 
 class Material(IntEnum):
-    """What a triangle is made of."""
+    """Material of a triangle."""
 
     SOIL = 0
     GRASS = 1
@@ -160,7 +160,7 @@ def tube(rings: ArrayLike, material: Material, sides: int = 8) -> Mesh:
         Centre and radius x, y, z, r of each ring, of shape (n, 4), from one end to the other;
         a radius of zero closes the end in a point.
     material
-        What it is made of.
+        Its material.
     sides
         Corners of each ring.
     """
@@ -180,7 +180,7 @@ def blob(material: Material, seed: int, roughness: float = 0.35, detail: int = 1
         ),
         axis=-1,
     )
-    # Noise of place rather than of angle: the seam and the poles close.
+    # Noise over positions, not angles: the seam and the poles close.
     radius = 1.0 + roughness * fractal(unit.reshape(-1, 3), 0.8, seed, 2).reshape(unit.shape[:2])
     lump = unit * radius[..., None]
     lump[..., 2] = np.maximum(lump[..., 2] * 0.8 + 0.35, -0.2)

@@ -26,7 +26,7 @@ def model(kind: str) -> Mesh:
 
 @dataclass(frozen=True)
 class Mover:
-    """Something that goes to and fro along the road, slowing down where it turns back.
+    """A car or walker that goes to and fro along the road and slows down to turn back.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Mover:
 
 
 def populate(road: Road) -> list[Mover]:
-    """Let movers loose on every leg that has some."""
+    """Place the movers of every leg."""
     rng = np.random.default_rng([road.seed, 4])
     movers = []
     for leg in road.legs:
@@ -68,14 +68,6 @@ def populate(road: Road) -> list[Mover]:
                 swing = min(rng.uniform(15.0, 40.0), (leg.stop - leg.start) / 3.0)
                 middle = rng.uniform(leg.start + swing + 3.0, leg.stop - swing - 3.0)
                 speed = _SPEED[kind] * rng.uniform(0.7, 1.3)
-                movers.append(
-                    Mover(
-                        kind,
-                        float(middle),
-                        swing,
-                        offset + rng.uniform(-0.3, 0.3),
-                        speed / swing,
-                        rng.uniform(0.0, 2.0 * np.pi),
-                    )
-                )
+                aside, phase = offset + rng.uniform(-0.3, 0.3), rng.uniform(0.0, 2.0 * np.pi)
+                movers.append(Mover(kind, float(middle), swing, aside, speed / swing, phase))
     return movers

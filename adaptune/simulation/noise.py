@@ -1,4 +1,4 @@
-"""Fractal noise: the same value at the same place, whatever tile asks for it."""
+"""Fractal noise: the same value at the same place in every tile."""
 
 import numba
 import numpy as np

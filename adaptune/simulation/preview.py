@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from adaptune.simulation.simulate import Drive, SimulatedScan
 
 _MAP_SCANS, _MAP_POINTS = 150, 4000
-"""Scans in the map and points of each, whatever the recording's length."""
+"""Number of scans in the map, and points of each."""
 
 
 class Preview:
-    """Gathers what a picture shows while the scans go by.
+    """Collects the content of the picture scan by scan.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Preview:
         self._scan: SimulatedScan | None = None
 
     def add(self, scan: SimulatedScan) -> None:
-        """Take note of the next scan."""
+        """Add the next scan."""
         if self._count % self._every == 0 and len(scan):
             T = scan.T_world_sensor
             points = scan.points[:: max(len(scan) // _MAP_POINTS, 1)]
@@ -80,16 +80,8 @@ class Preview:
     def _draw_map(self, axes: Any) -> None:
         points = np.concatenate(self._map) if self._map else np.empty((0, 3))
         points = points[np.argsort(points[:, 2], kind="stable")]
-        axes.scatter(
-            points[:, 0],
-            points[:, 1],
-            c=points[:, 2],
-            s=0.5,
-            linewidths=0,
-            cmap="viridis",
-            vmin=-1.5,
-            vmax=4.0,
-        )
+        x, y, z = points.T
+        axes.scatter(x, y, c=z, s=0.5, linewidths=0, cmap="viridis", vmin=-1.5, vmax=4.0)
         T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
         axes.plot(T[:, 0, 3], T[:, 1, 3], color="red", linewidth=1.2)
         axes.set(aspect="equal", facecolor="black", xlabel="x (m)", ylabel="y (m)")

@@ -1,11 +1,41 @@
 """From rays to echoes: compiled loops over all rays of a scan."""
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+
+class Cast(NamedTuple):
+    """Rays, and what they hit.
+
+    Attributes
+    ----------
+    rays : ndarray of shape (n, 6)
+        Origins and directions.
+    hits : ndarray of shape (n,)
+        Metres to what each ray hit, infinite where nothing.
+    normals : ndarray of shape (n, 3)
+    reflectivity : ndarray of shape (n,)
+    """
+
+    rays: F32
+    hits: F32
+    normals: F32
+    reflectivity: F32
+
+
+class Receiver(NamedTuple):
+    """A sensor's range in metres, its standard deviation, and the share of echoes lost."""
+
+    nearest: float
+    farthest: float
+    noise: float
+    dropout: float
 
 
 @numba.njit(cache=True)
@@ -19,8 +49,7 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
     T_world_sensor
         Pose at each column, of shape (n_columns, 4, 4).
     origin
-        What to take as the world's origin, of shape (3,): single precision is a tenth of a
-        millimetre a kilometre away.
+        Origin of the rays' coordinates, of shape (3,). Near it, single precision is exact enough.
 
     Returns
     -------
@@ -46,7 +75,7 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
 def towards(
     rays: F32, rings: int, centres: F64, yaw: F64, radius: float
 ) -> tuple[NDArray[np.int64], F32]:
-    """Pick the rays that pass a moving thing, seen from that thing.
+    """Pick the rays that pass a moving object, in the frame of the object.
 
     Parameters
     ----------
@@ -55,7 +84,7 @@ def towards(
     rings
         Rays in a column.
     centres
-        The thing's origin at each column, of shape (n_columns, 3).
+        The object's origin at each column, of shape (n_columns, 3).
     yaw
         Its heading at each column in radians, of shape (n_columns,).
     radius
@@ -66,7 +95,7 @@ def towards(
     picked : ndarray of shape (m,)
         Indices of the rays.
     local : ndarray of shape (m, 6)
-        The rays in the thing's frame.
+        The rays in the object's frame.
     """
     picked = np.empty(len(rays), np.int64)
     local = np.empty((len(rays), 6), np.float32)
@@ -90,13 +119,8 @@ def towards(
 @numba.njit(cache=True)
 def receive(
     directions: F32,
-    rays: F32,
-    hits: F32,
-    normals: F32,
-    reflectivity: F32,
-    reach: tuple[float, float],
-    noise: float,
-    dropout: float,
+    cast: Cast,
+    sensor: Receiver,
     air: tuple[float, float, float],
     chance: F32,
     normal: F32,
@@ -107,21 +131,12 @@ def receive(
     ----------
     directions
         Unit vectors in the sensor's frame, of shape (n, 3).
-    rays, hits, normals, reflectivity
-        The rays cast, of shape (n, 6); metres to what each hit, infinite where nothing, (n,); its
-        normal, (n, 3); its reflectivity, (n,).
-    reach
-        Least and greatest range in metres.
-    noise
-        Standard deviation of a range in metres.
-    dropout
-        Share of echoes lost.
+    cast, sensor
+        The rays with their hits, and the receiver.
     air
         Extinction, backscatter and its reach: see `adaptune.simulation.weather.Weather`.
-    chance
-        Uniform random numbers of shape (2, n).
-    normal
-        Normal random numbers of shape (n,).
+    chance, normal
+        Uniform random numbers of shape (2, n), and normal ones of shape (n,).
 
     Returns
     -------
@@ -132,20 +147,20 @@ def receive(
     kept : ndarray of shape (m,)
         Which rays came back.
     """
+    rays, hits, normals, reflectivity = cast
+    nearest, farthest, noise, dropout = sensor
     n = len(rays)
-    points = np.empty((n, 3), np.float32)
-    intensities = np.empty(n, np.float32)
+    points, intensities = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     kept = np.empty(n, np.int64)
     extinction, backscatter, air_reach = air
     m = 0
     for i in range(n):
-        distance = float(hits[i])
-        power = 0.0
+        distance, power = float(hits[i]), 0.0
         if backscatter > 0.0:
             echo = -np.log(1.0 - chance[1, i]) / backscatter
             if echo < min(distance, air_reach):
                 distance, power = echo, 0.01
-        if not reach[0] <= distance <= reach[1] or chance[0, i] < dropout:
+        if not nearest <= distance <= farthest or chance[0, i] < dropout:
             continue
         if power == 0.0:
             cosine = abs(
@@ -153,7 +168,7 @@ def receive(
             )
             power = reflectivity[i] * cosine * np.exp(-2.0 * extinction * distance)
             # The echo weakens with the square of the distance; a tenth is seen to the full range.
-            if distance * distance > reach[1] * reach[1] * power * 10.0:
+            if distance * distance > farthest * farthest * power * 10.0:
                 continue
         distance += noise * normal[i]
         for j in range(3):

@@ -12,10 +12,10 @@ from rosbags.rosbag2 import StoragePlugin
 
 from adaptune import geometry
 from adaptune.files import replacing, replacing_folder
-from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.export import Message, Messages, write_kitti_times
-from adaptune.simulation import imu
 from adaptune.simulation.course import Course, SimulationError
+from adaptune.simulation.inertial import Inertial, measure
+from adaptune.simulation.rig import IMU, POINTS, POSES
 from adaptune.simulation.simulate import Drive, SimulatedScan
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
 
@@ -27,9 +27,6 @@ Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 
 Progress = Callable[[int, int], None]
 
-POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"
-"""Topics, named as BotanicGarden names them."""
-
 CLOUD = np.dtype(
     [
         *((name, "<f4") for name in ("x", "y", "z", "intensity")),
@@ -40,7 +37,7 @@ CLOUD = np.dtype(
 """A point as Velodyne's driver writes it: 22 bytes, time in seconds from the header's stamp."""
 
 _MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
-"""What tells a folder that was recorded here, and may be overwritten, from any other."""
+"""Marks of a recording's folder, which may be overwritten."""
 
 
 def record(
@@ -51,31 +48,31 @@ def record(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Simulate a course and write it down, with its truth and a preview beside it.
+    """Simulate a course and write its recording, its ground truth and a preview.
 
     The truth, in the TUM format, and the preview, a PNG, are named after the recording. All three
-    are there whole or not at all.
+    are written whole or not at all.
 
     Parameters
     ----------
     course
-        What to simulate.
+        The course to simulate.
     path
-        Where the recording shall be.
+        Where to write the recording.
     layout
-        What to write. When not given, the name decides: ``.bag`` is ROS 1, ``.mcap`` a ROS 2 file,
+        Format. If not given, the name decides: ``.bag`` is ROS 1, ``.mcap`` a ROS 2 file,
         anything else a ROS 2 folder.
     overwrite
-        Whether a recording that is there already is replaced.
+        Whether to replace an existing recording.
     progress
-        Called after every scan with the number of scans done and of all.
+        Called after every scan with the numbers of finished and of all scans.
 
     Raises
     ------
     SimulationError
-        If there is something at `path` or beside it that is not to be replaced.
+        If a file of the same name exists that must not be replaced.
     """
-    # matplotlib takes a second to import, which who only describes a course need not spend.
+    # matplotlib takes a second to import.
     from adaptune.simulation.preview import Preview
 
     path = Path(path)
@@ -88,8 +85,8 @@ def record(
     if not len(drive):
         raise SimulationError("the course is over before its first scan is: make it longer")
     with ExitStack() as stack:
-        truth_beside = stack.enter_context(replacing(truth))
-        preview_beside = stack.enter_context(replacing(preview))
+        temporary_truth = stack.enter_context(replacing(truth))
+        temporary_preview = stack.enter_context(replacing(preview))
         scans = _watched(drive, picture := Preview(drive), progress)
         if layout == "kitti":
             _write_kitti(drive, scans, stack.enter_context(replacing_folder(path)))
@@ -101,28 +98,8 @@ def record(
             folder = stack.enter_context(replacing_folder(path))
             _write_ros2(drive, scans, folder, StoragePlugin.SQLITE3)
         stamps = drive.stamps()
-        write_tum(truth_beside, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        picture.save(preview_beside)
-
-
-def as_sequence(course: Course, path: Path) -> SequenceConfig:
-    """How a study names what was recorded of a course.
-
-    Parameters
-    ----------
-    course
-        What was simulated.
-    path
-        The bag.
-    """
-    measured: dict[str, Any] | None = None
-    if course.imu is not None:
-        measured = {
-            "topic": IMU,
-            "extrinsic": geometry.invert(imu.T_IMU_LIDAR).tolist(),
-            "noise": imu.NOISE._asdict(),
-        }
-    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=measured)
+        write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
+        picture.save(temporary_preview)
 
 
 def _layout(path: Path) -> Layout:
@@ -130,15 +107,17 @@ def _layout(path: Path) -> Layout:
 
 
 def _check(path: Path, overwrite: bool, mark: str | None) -> None:
-    """Refuse to touch what is there unless told to, and whatever is not a recording."""
+    """Refuse to replace a recording without `overwrite`, and anything else."""
     if not path.exists():
         return
     if not overwrite:
         raise SimulationError(f"{path} exists already; give --overwrite to replace it")
     if path.is_dir() and (mark is None or not (path / mark).exists()):
-        raise SimulationError(f"{path} is a folder, and no recording of this kind: it stays")
+        raise SimulationError(f"{path} is a folder, but no recording of this kind: not replaced")
     if mark is not None and not path.is_dir():
-        raise SimulationError(f"{path} is a file where a folder shall be written: it stays")
+        raise SimulationError(
+            f"{path} is a file, the recording would be a folder: it is not replaced"
+        )
 
 
 def _watched(
@@ -152,7 +131,7 @@ def _watched(
 
 
 class _Composer(Messages):
-    """Makes ROS messages of what a drive yields."""
+    """Makes the ROS messages of a drive."""
 
     def __init__(self, drive: Drive, version: Literal[1, 2]) -> None:
         super().__init__(version)
@@ -185,14 +164,13 @@ class _Composer(Messages):
             yield POSES, end, self._pose(end, T_world_sensor[i + 1], quaternions[i + 1])
             yield POINTS, end, self._cloud(scan, end)
 
-    def _inertial(self, end: int) -> tuple[imu.Inertial, NDArray[np.int64]]:
+    def _inertial(self, end: int) -> tuple[Inertial, NDArray[np.int64]]:
         drive, rate = self._drive, self._drive.course.imu
         if rate is None:
-            empty = np.empty((0, 3))
-            return imu.Inertial(np.empty(0), empty, empty), np.empty(0, np.int64)
+            return Inertial(np.empty((0, 3)), np.empty((0, 3))), np.empty(0, np.int64)
         start = int(drive.stamps()[0])
         stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
-        return imu.measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
+        return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
 
     def _pose(self, stamp: int, T: geometry.Poses, quaternion: NDArray[np.float64]) -> Any:
         t = self.types
@@ -217,7 +195,7 @@ class _Composer(Messages):
 
 def _write_ros1(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
     composer = _Composer(drive, 1)
-    # The writer wants to make the file itself.
+    # The writer makes the file itself.
     path.unlink()
     composer.write(path, composer.topics, composer.messages(scans))
 
@@ -259,7 +237,7 @@ def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> 
 
 
 def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:
-    """Points as if all had been measured at the scan's start, by the truth.
+    """Points as if all had been measured at the scan's start, by the true motion.
 
     Returns
     -------

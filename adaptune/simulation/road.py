@@ -34,8 +34,8 @@ class Road:
     """A smooth line through all scenes of a course.
 
     Stations are metres along the line, 0 where the drive starts; offsets are metres to its left.
-    It always leads ahead, within 70 degrees of the x axis, and so never meets itself: each x
-    belongs to one station.
+    It stays within 70 degrees of the x axis and so never meets itself: each x belongs to one
+    station.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Road:
             [(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs], stations, rng
         )
         slope = _bends([(leg, leg.scene.slope, 35.0) for leg in self.legs], stations, rng)
-        # Bends of a metre or two are rounded off, which no vehicle drives sharper.
+        # No vehicle drives sharper: bends of a metre or two are rounded off.
         heading = gaussian_filter1d(heading, 2.0 / _STEP, mode="nearest")
         slope = gaussian_filter1d(slope, 4.0 / _STEP, mode="nearest")
         zero = int(np.searchsorted(stations, 0.0))
@@ -94,7 +94,7 @@ class Road:
         return np.asarray(np.interp(x, self._x, self._stations), np.float64)
 
     def shares(self, s: Floats) -> list[tuple[Leg, Floats]]:
-        """How much each leg's scene has to say at each station: weights that sum to one."""
+        """Weight of each leg's scene at each station; the weights sum to one."""
         shares = []
         for leg in self.legs:
             first, last = leg is self.legs[0], leg is self.legs[-1]

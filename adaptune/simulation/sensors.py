@@ -1,4 +1,4 @@
-"""LiDARs: where they look, how often and how well."""
+"""LiDARs: their rays, rates and noise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Sensor:
 
 
 def _hdl64e() -> NDArray[np.float64]:
-    """Give the two blocks of 32 lasers: a third of a degree apart above, half a degree below."""
+    """Two blocks of 32 lasers: a third of a degree apart above, half a degree below."""
     upper = 2.0 - np.arange(32) / 3.0
     lower = -8.83 - 0.5 * np.arange(32)
     elevations: NDArray[np.float64] = np.radians(np.concatenate([upper, lower])[::-1])

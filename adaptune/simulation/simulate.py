@@ -13,10 +13,11 @@ from adaptune.sequence.scan import Scan
 from adaptune.simulation import rays as kernels
 from adaptune.simulation.course import Course
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
-from adaptune.simulation.motion import MOTIONS, Ride
+from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.movers import RADIUS, model, populate
+from adaptune.simulation.ride import Ride
 from adaptune.simulation.road import Road
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.scenes import scene
 from adaptune.simulation.scenes.base import TILE
 from adaptune.simulation.sensors import SENSORS, directions
 from adaptune.simulation.weather import WEATHERS
@@ -26,12 +27,12 @@ EPOCH = 1_600_000_000_000_000_000
 """Nanoseconds at which every recording starts."""
 
 _DETOUR = 1.2
-"""Metres of road for a metre of sight, where it winds."""
+"""Metres of road in a metre of sight, where it winds."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedScan(Scan):
-    """A scan with what else the sensor and the truth say.
+    """A scan with intensities, rings and its true pose.
 
     Attributes
     ----------
@@ -49,12 +50,12 @@ class SimulatedScan(Scan):
 
 
 class Drive:
-    """A course made ready: its road and the sensor's ride along it.
+    """A course with its road and the sensor's ride along it.
 
     Parameters
     ----------
     course
-        What to simulate.
+        The course to simulate.
 
     Attributes
     ----------
@@ -66,7 +67,7 @@ class Drive:
 
     def __init__(self, course: Course) -> None:
         self.course = course
-        self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
+        self.road = Road([(scene(name), length) for name, length in course.legs], course.seed)
         self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
 
     def __len__(self) -> int:
@@ -90,25 +91,21 @@ class Drive:
         rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
         offsets = np.arange(columns) / (columns * course.turns)
         times = np.repeat(offsets, sensor.rings).astype(np.float32)
+        receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
             start = (stamp - EPOCH) * 1e-9
             T_world_sensor = self.ride.poses(start + offsets)
             looks = directions(course.sensor, columns, start, course.turns)
-            rays, hits, normals, reflectivity = caster.cast(looks, T_world_sensor, start + offsets)
+            cast = caster.cast(looks, T_world_sensor, start + offsets)
             rng = np.random.default_rng([course.seed, 6, number])
             points, intensities, kept = kernels.receive(
                 looks.reshape(-1, 3),
-                rays,
-                hits,
-                normals,
-                reflectivity,
-                sensor.range,
-                sensor.noise,
-                sensor.dropout,
+                cast,
+                receiver,
                 (air.extinction, air.backscatter, air.reach),
-                rng.random((2, len(rays)), np.float32),
-                rng.standard_normal(len(rays), np.float32),
+                rng.random((2, len(cast.rays)), np.float32),
+                rng.standard_normal(len(cast.rays), np.float32),
             )
             yield SimulatedScan(
                 stamp=stamp,
@@ -121,7 +118,7 @@ class Drive:
 
 
 class _Caster:
-    """Casts rays into what is near, and builds it anew every tile."""
+    """Casts rays into the world nearby, which it builds again for every tile."""
 
     def __init__(self, drive: Drive, sight: float) -> None:
         self._road, self._sight = drive.road, sight
@@ -134,8 +131,8 @@ class _Caster:
 
     def cast(
         self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Cast rays from each column's pose: the rays, and what `_Target.cast` gives for them."""
+    ) -> kernels.Cast:
+        """Cast rays from each column's pose."""
         station = float(self._road.station(T_world_sensor[0, 0, 3]))
         tile = int(station // TILE)
         if tile != self._here:
@@ -162,7 +159,7 @@ class _Caster:
             normals[picked, 0] = cos * turned[:, 0] - sin * turned[:, 1]
             normals[picked, 1] = sin * turned[:, 0] + cos * turned[:, 1]
             normals[picked, 2] = turned[:, 2]
-        return rays, hits, normals, reflectivity
+        return kernels.Cast(rays, hits, normals, reflectivity)
 
 
 class _Target:
@@ -175,7 +172,7 @@ class _Target:
         vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)
         triangles = np.ascontiguousarray(mesh.triangles, np.uint32)
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
-        # One more for the rays that hit nothing.
+        # The last one is for rays that hit nothing.
         self._reflectivity = np.append(REFLECTIVITY[mesh.materials], np.float32(0.0))
 
     def cast(
@@ -197,11 +194,11 @@ def simulate(course: Course) -> Iterator[SimulatedScan]:
     Parameters
     ----------
     course
-        What to simulate.
+        The course to simulate.
 
     Yields
     ------
     SimulatedScan
-        In order; its stamp marks its start, whatever the course wants of recordings.
+        In order; the stamp always marks the scan's start.
     """
     return Drive(course).scans()

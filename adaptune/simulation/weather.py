@@ -1,4 +1,4 @@
-"""Weather, as a LiDAR sees it."""
+"""Effect of weather on a LiDAR."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Weather:
-    """What the air does to rays.
+    """Effect of the air on rays.
 
     Attributes
     ----------
     extinction : float
         Share of the light lost in a metre, each way (1/m).
     backscatter : float
-        Chance in a metre that drops send back an echo of their own before the target does (1/m).
+        Chance in a metre that drops send back an echo before the target does (1/m).
     reach : float
         Metres within which such an echo is strong enough to be seen.
     """

@@ -1,4 +1,4 @@
-"""The world around a road, in tiles that come and go as the drive goes on."""
+"""The world around a road, in tiles that are built and dropped along the drive."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,31 +23,36 @@ def _offsets() -> NDArray[np.float64]:
 
 
 class World:
-    """Everything that rays can hit and that does not move.
+    """All static objects that rays can hit.
 
     Parameters
     ----------
     road
         The road along which it is built.
 
+    Attributes
+    ----------
+    tiles : dict
+        Meshes of the tiles in reach, by index.
+
     Notes
     -----
-    Every tile has its own source of randomness, so that it looks the same whenever it is built.
-    Only those in reach are kept.
+    Every tile has its own random numbers and is always built the same. Only tiles in reach are
+    kept.
     """
 
     def __init__(self, road: Road) -> None:
         self._road = road
-        self._tiles: dict[int, Mesh] = {}
+        self.tiles: dict[int, Mesh] = {}
         self._last = int(np.floor((road.length + APRON) / TILE))
 
     def around(self, station: float, reach: float) -> Mesh:
-        """Build what lies within `reach` metres of a station, and forget the rest."""
+        """Build the world within `reach` metres of a station, and drop the rest."""
         first = max(int(np.floor((station - reach) / TILE)), int(-APRON // TILE))
         last = min(int(np.floor((station + reach) / TILE)), self._last)
         wanted = range(first, last + 1)
-        self._tiles = {i: self._tiles[i] if i in self._tiles else self.tile(i) for i in wanted}
-        return merge(list(self._tiles.values()))
+        self.tiles = {i: self.tiles[i] if i in self.tiles else self.tile(i) for i in wanted}
+        return merge(list(self.tiles.values()))
 
     def tile(self, index: int) -> Mesh:
         """Build the tile that begins at station ``index * TILE``."""
@@ -78,7 +83,7 @@ class World:
         x = np.linspace(ends[0], ends[1], max(int((ends[1] - ends[0]) / _CELL), 1) + 1)
         s = road.station(x)
         _, middle = road.plane(s, np.zeros_like(s))
-        # Sheared along y rather than swept along the road, lest it fold in bends.
+        # Sheared along y, not swept along the road: that would fold in bends.
         y = middle[:, None] + _offsets()
         x_grid = np.broadcast_to(x[:, None], y.shape)
         vertices = np.stack([x_grid, y, road.ground(x_grid, y)], axis=-1)

@@ -40,10 +40,10 @@ class OdometryConfig(StudySection):
 
 
 def _known_descriptor(name: str) -> str:
-    from adaptune.descriptor import DescriptorError, descriptor
+    from adaptune.descriptor import DescriptorError, check_descriptor
 
     try:
-        descriptor(name)
+        check_descriptor(name)
     except DescriptorError as error:
         raise ValueError(str(error)) from error
     return name

@@ -11,7 +11,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import Description, Odometry, OdometryError
 from adaptune.odometry.command import Command
 from adaptune.odometry.registry import odometry_class
-from adaptune.sequence.config import SequenceConfig, check_sequence
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated

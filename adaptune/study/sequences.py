@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.program_input import ProgramInput, program_input
-from adaptune.sequence.bag import bag_paths
-from adaptune.sequence.config import SequenceConfig, ViewConfig, open_sequence
+from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.config import SequenceConfig, ViewConfig
 from adaptune.sequence.export import Layout
+from adaptune.sequence.names import OF_VIEW, origin
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.sequence import Sequence
-from adaptune.sequence.views import OF_VIEW, WithImu, origin
+from adaptune.sequence.views import WithImu
 from adaptune.simulation.course import Course
 from adaptune.study.mistakes import ConfigurationError
 
@@ -56,7 +58,7 @@ class StudySequences:
             return config.model_copy(update={"views": (*config.views, self.views[view])})
         if name in self.recordings:
             return self.recordings[name]
-        from adaptune.simulation import as_sequence
+        from adaptune.simulation.rig import as_sequence
 
         return as_sequence(self.courses[name], self.recording(name))
 

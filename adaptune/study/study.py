@@ -15,7 +15,7 @@ from adaptune.cores import available
 from adaptune.odometry.base import Description, WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.registry import odometry_class
-from adaptune.sequence.views import OF_VIEW
+from adaptune.sequence.names import OF_VIEW
 from adaptune.space import ParameterSpace
 from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.mistakes import ConfigurationError

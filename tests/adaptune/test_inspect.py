@@ -6,20 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
-from rosbags import rosbag1
-from rosbags.typesys import Stores, get_typestore
+from rich.console import Console
+from small_bag import START, cloud, drive, pose, write
 
 from adaptune import yaml
-from adaptune.inspect import (
-    inspect,
-    inspection_text,
-    render_cache,
-    write_inspection_png,
-)
-from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
-
-STORE = get_typestore(Stores.ROS1_NOETIC)
-START = 1_700_000_000_000_000_000
+from adaptune.inspect import inspect
+from adaptune.rendering import render_inspection, write_inspection_png
+from adaptune.sequence import SequenceConfig, SequenceError
+from adaptune.sequence.opening import open_sequence
 
 
 @pytest.fixture(autouse=True)
@@ -27,52 +21,11 @@ def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ADAPTUNE_CACHE", str(tmp_path / "cache"))
 
 
-def header(stamp: int) -> Any:
-    time = STORE.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
-    return STORE.types["std_msgs/msg/Header"](0, time, "lidar")
-
-
-def cloud(stamp: int, n: int = 200) -> Any:
-    raw = np.zeros((n, 4), "<f4")
-    raw[:, :3] = np.random.default_rng(0).normal(0, 10, (n, 3))
-    raw[:5] = np.nan
-    raw[5:, 3] = np.linspace(0, 0.1, n - 5)
-    field = STORE.types["sensor_msgs/msg/PointField"]
-    fields = [field(name, 4 * i, 7, 1) for i, name in enumerate(("x", "y", "z", "time"))]
-    data = raw.view(np.uint8).ravel()
-    return STORE.types["sensor_msgs/msg/PointCloud2"](
-        header(stamp), 1, n, fields, False, 16, 16 * n, data, True
-    )
-
-
-def pose(stamp: int, x: float) -> Any:
-    types = STORE.types
-    return types["geometry_msgs/msg/PoseStamped"](
-        header(stamp),
-        types["geometry_msgs/msg/Pose"](
-            types["geometry_msgs/msg/Point"](x, 0, 0),
-            types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1),
-        ),
-    )
-
-
-def write(path: Path, messages: list[tuple[str, int, Any]]) -> Path:
-    with rosbag1.Writer(path) as writer:
-        topics: dict[str, Any] = {}
-        for topic, recorded, message in messages:
-            kind = message.__msgtype__
-            if topic not in topics:
-                topics[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(topics[topic], recorded, STORE.serialize_ros1(message, kind))
-    return path
-
-
-def drive(path: Path, stamps: list[float], poses: list[tuple[float, float]]) -> Path:
-    messages: list[tuple[str, int, Any]] = [
-        ("/points", START + i * 10**8, cloud(START + round(s * 1e9))) for i, s in enumerate(stamps)
-    ]
-    messages += [("/poses", START, pose(START + round(s * 1e9), x)) for s, x in poses]
-    return write(path, messages)
+def inspection_text(inspection: Any, width: int = 100) -> str:
+    console = Console(width=width, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(render_inspection(inspection))
+    return capture.get()
 
 
 def entry(inspection: Any) -> dict[str, SequenceConfig]:
@@ -108,7 +61,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("stamps", "poses", "told"),
+    ("stamps", "poses", "expected"),
     [
         ([0, 0.1, 0.1, 0.3], [], "/points: 1 stamps repeat the one before"),
         ([0, 0.2, 0.1, 0.3], [], "/points: 1 stamps go back in time"),
@@ -122,15 +75,15 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path: Path) ->
         ([0, 0.1], [(50, 0), (60, 0)], "set `clock_offset`"),
     ],
 )
-def test_oddities_are_told(
-    tmp_path: Path, stamps: list[float], poses: list[tuple[float, float]], told: str
+def test_oddities_are_reported(
+    tmp_path: Path, stamps: list[float], poses: list[tuple[float, float]], expected: str
 ) -> None:
     inspection = inspect(drive(tmp_path / "a.bag", stamps, poses))
-    assert any(told in problem for problem in inspection.problems), inspection.problems
-    assert told[:20] in inspection_text(inspection, width=1000)
+    assert any(expected in problem for problem in inspection.problems), inspection.problems
+    assert expected[:20] in inspection_text(inspection, width=1000)
 
 
-def test_what_is_missing_is_told(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     inspection = inspect(write(tmp_path / "a.bag", [("/poses", START, pose(START, 0))]))
     assert inspection.missing["online"] == ("point clouds that can be read",)
     assert inspection.scan is None
@@ -166,24 +119,6 @@ def test_folders_are_inspected_too(tmp_path: Path) -> None:
     assert inspection.topics[0].rate == pytest.approx(10)
     assert not inspection.problems
     assert len(list(open_sequence(next(iter(entry(inspection).values()))))) == 4
-
-
-def test_the_picture_is_one(tmp_path: Path) -> None:
-    write_inspection_png(inspect(drive(tmp_path / "a.bag", [0, 0.1], [])), tmp_path / "a.png")
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag", ".png"]
-
-
-def test_the_cache_is_told(tmp_path: Path) -> None:
-    from rich.console import Console
-
-    bag = drive(tmp_path / "a.bag", [0, 0.1], [])
-    list(open_sequence(SequenceConfig(bag=str(bag))))
-    console = Console(width=500)
-    with console.capture() as capture:
-        console.print(render_cache())
-    assert str(bag) in capture.get()
-    assert "GB of at most" in capture.get()
 
 
 @pytest.mark.parametrize(

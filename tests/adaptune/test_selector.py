@@ -7,14 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.descriptor.motion import speed_and_turn_rate
-from adaptune.descriptor.ndt import describe
+from adaptune.descriptor.ndt_histogram import describe
 from adaptune.model import BankRule, BankSettings, ErrorModel
 from adaptune.odometry.base import Motions
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
 from adaptune.selector import Selector
 from adaptune.sequence.scan import Scan
-from adaptune.simulation import Course, simulate
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
 from adaptune.space import Float, ParameterSpace
 
 SPACE = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})

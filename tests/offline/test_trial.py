@@ -213,7 +213,7 @@ def test_whole_runs_as_trials(study):
 
 def test_a_reference_of_another_time_is_refused(study, tmp_path):
     drives.write_bag(tmp_path / "late.bag", drives.scans(0, 12), reference_delay=10**12)
-    with pytest.raises(AdaptuneError, match=r"late\.bag: the reference tells of .*clock_offset"):
+    with pytest.raises(AdaptuneError, match=r"late\.bag: the reference covers .*clock_offset"):
         prepare(study, tmp_path / "late.bag")
 
 

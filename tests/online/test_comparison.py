@@ -231,7 +231,7 @@ def test_a_reference_of_another_time_is_refused(trained, study_file, tmp_path):
     truth = read_tum_of(trained, study_file)
     write_tum(tmp_path / "late.tum", Trajectory(truth.stamps + 10**12, truth.T_world_sensor))
     late = f"sequences.three.reference={tmp_path / 'late.tum'}"
-    with pytest.raises(ConfigurationError, match=r"the reference tells of .* set `clock_offset`"):
+    with pytest.raises(ConfigurationError, match=r"the reference covers .* set `clock_offset`"):
         load_study(study_file, [late], trained.folder)
 
 

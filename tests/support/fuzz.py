@@ -23,8 +23,9 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import get_types_from_msg
 
 from adaptune.errors import AdaptuneError
-from adaptune.sequence import Scan, SequenceConfig, livox, open_sequence, pointcloud2
+from adaptune.sequence import Scan, SequenceConfig, livox, pointcloud2
 from adaptune.sequence.export import Messages
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.pointcloud2 import PointCloudError
 from adaptune.sequence.timing import AUTO
 

@@ -1,26 +1,28 @@
 """The kinds of place a course can lead through."""
 
 from collections.abc import Mapping
+from importlib import import_module
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
-from adaptune.simulation.scenes.base import Scene
-from adaptune.simulation.scenes.cave import CAVE
-from adaptune.simulation.scenes.corridor import CORRIDOR
-from adaptune.simulation.scenes.field import FIELD
-from adaptune.simulation.scenes.garden import GARDEN
-from adaptune.simulation.scenes.open_ground import OPEN
-from adaptune.simulation.scenes.street import STREET
+if TYPE_CHECKING:
+    from adaptune.simulation.scenes.base import Scene
 
-SCENES: Mapping[str, Scene] = MappingProxyType(
+SCENES: Mapping[str, str] = MappingProxyType(
     {
-        "cave": CAVE,
-        "open": OPEN,
-        "street": STREET,
-        "garden": GARDEN,
-        "corridor": CORRIDOR,
-        "field": FIELD,
+        "cave": "cave:CAVE",
+        "open": "open_ground:OPEN",
+        "street": "street:STREET",
+        "garden": "garden:GARDEN",
+        "corridor": "corridor:CORRIDOR",
+        "field": "field:FIELD",
     }
 )
-"""Scenes by name."""
+"""Scenes by name: module of this package and attribute. `scene` imports them."""
 
-__all__ = ["SCENES", "Scene"]
+
+def scene(name: str) -> "Scene":
+    """Import the scene of a name."""
+    module, _, attribute = SCENES[name].partition(":")
+    found: Scene = getattr(import_module(f"{__name__}.{module}"), attribute)
+    return found

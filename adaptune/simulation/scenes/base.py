@@ -1,4 +1,4 @@
-"""What a scene is."""
+"""Scenes, and the tiles in which they are built."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ class Spots:
 
 
 class Line(Protocol):
-    """The line along which a scene is built: what `Road` offers to scenes."""
+    """The line along which a scene is built: the part of `Road` that scenes use."""
 
     def heading(self, s: Floats) -> Floats:
         """Radians from the x axis at each station."""
@@ -48,7 +48,7 @@ class Line(Protocol):
 
 @dataclass(frozen=True)
 class Tile:
-    """A piece of a scene, some twenty metres of road and what stands beside it.
+    """A piece of a scene: up to twenty metres of road and its surroundings.
 
     Attributes
     ----------
@@ -61,9 +61,9 @@ class Tile:
     opens, closes
         Whether it is the leg's first or last tile with another scene next to it.
     rng
-        Its own source of randomness.
+        Its own random numbers.
     seed
-        One seed for the whole world, for what must continue from tile to tile.
+        Seed of the whole world, for shapes that continue from tile to tile.
     """
 
     line: Line
@@ -88,7 +88,7 @@ class Tile:
     def scatter(
         self, density: float, near: float, far: float, margin: float = 0.0
     ) -> tuple[Floats, Floats]:
-        """Stations and offsets of things strewn on both sides of the road.
+        """Stations and offsets of objects strewn on both sides of the road.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class Scene:
 
 
 def paved(*bands: tuple[float, Material]) -> Callable[[Floats], NDArray[np.uint8]]:
-    """Ground in bands beside the road: each material reaches to a distance from its middle."""
+    """Ground in bands along the road: each material reaches to a distance from its middle."""
     edges = np.array([edge for edge, _ in bands[:-1]])
     codes = np.array([material for _, material in bands], np.uint8)
 

@@ -17,7 +17,7 @@ def _relief(spots: Spots, seed: int) -> Floats:
 
 
 def _chambers(s: Floats, angle: Floats, seed: int) -> Floats:
-    """Give the depth of the side chambers in metres."""
+    """Depth of the side chambers in metres."""
     depth = np.zeros(np.broadcast_shapes(s.shape, angle.shape))
     for number in np.unique(np.floor(s / _CHAMBERS)).astype(int).tolist():
         for n in (number - 1, number, number + 1):
@@ -31,7 +31,7 @@ def _chambers(s: Floats, angle: Floats, seed: int) -> Floats:
 
 
 def _rooms(s: Floats, seed: int) -> Floats:
-    """Say how far each station is from a narrow: 0 in the middle of one, 1 in a room."""
+    """Distance of each station from a narrow: 0 in the middle of one, 1 in a room."""
     share = np.ones_like(s)
     for n in range(int(np.floor(s.min() / _ROOMS)) - 1, int(np.floor(s.max() / _ROOMS)) + 2):
         rng = np.random.default_rng([seed, 32, n + 1000])
@@ -43,7 +43,7 @@ def _rooms(s: Floats, seed: int) -> Floats:
 
 
 def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
-    """Give offset and height of the rock at stations and angles from the left, over the top."""
+    """Offset and height of the rock at stations and angles from the left, over the top."""
     along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
     room = _rooms(s, seed)
     half = 1.0 + room * (2.4 + 0.8 * fractal(along, 9.0, seed + 21).reshape(s.shape))
@@ -51,7 +51,7 @@ def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     lean = 0.9 * room * fractal(along, 7.0, seed + 23).reshape(s.shape)
     chamber = room * _chambers(s, angle, seed)
     d, z = (half + chamber) * np.cos(angle), roof * np.sin(angle)
-    # Metre-scale bumps, which tell one stretch of wall from the next; a robot fits through.
+    # Metre-scale bumps make each stretch of wall distinct; a robot fits through.
     places = np.stack(np.broadcast_arrays(s, d, z), axis=-1).reshape(-1, 3)
     bumps = fractal(places, 2.6, seed + 24, 2).reshape(d.shape) * (0.12 + 0.68 * room)
     return lean + d + bumps * np.cos(angle), z + bumps * np.sin(angle)
@@ -62,7 +62,7 @@ def _build(tile: Tile) -> list[Mesh]:
     angle = np.linspace(-0.35, np.pi + 0.35, 56)[None]
     d, z = _section(s, angle, tile.seed)
     rock = tile.at(s, d)
-    # Above one line, lest the roof follow the rubble below it.
+    # Above one line, so that the roof does not follow the rubble below it.
     rock[..., 2] = tile.at(s, 0.0)[..., 2] + z
     meshes = [grid(rock, Material.ROCK)]
     meshes.extend(
@@ -122,14 +122,9 @@ def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
     s, d = tile.scatter(0.12, 1.6, 3.8, margin=2.0)
     at, n = tile.at(s, d), len(s)
     radius = tile.rng.uniform(0.25, 0.6, n)
-    lower = place(cone, at, 0.0, np.column_stack([radius, radius, np.full(n, 2.6)]))
-    upper = place(
-        cone,
-        at + np.array([0.0, 0.0, 3.6]),
-        1.0,
-        np.column_stack([radius, radius, np.full(n, -2.6)]),
-    )
-    return [lower, upper]
+    size = np.column_stack([radius, radius, np.full(n, 2.6)])
+    hanging = place(cone, at + np.array([0.0, 0.0, 3.6]), 1.0, size * np.array([1.0, 1.0, -1.0]))
+    return [place(cone, at, 0.0, size), hanging]
 
 
 CAVE = Scene(

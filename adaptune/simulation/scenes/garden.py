@@ -17,7 +17,7 @@ def _kind(index: int, seed: int) -> str:
 
 
 def _channel(spots: Spots, seed: int) -> Floats:
-    """Give the depth of the brooks under bridges, as a share."""
+    """Depth of the brooks under bridges, as a share."""
     depth = np.zeros_like(spots.s)
     index = np.floor(spots.s / TILE)
     for i in np.unique(index).astype(int).tolist():
@@ -72,9 +72,8 @@ def _build(tile: Tile) -> list[Mesh]:
     elif kind == "clearing":
         for side in (-1.0, 1.0):
             at = tile.at(middle + 4.0 * side, 2.6 * side)
-            meshes.append(
-                place(parts.bench(), at, tile.heading(middle) + (np.pi if side < 0 else 0.0))
-            )
+            yaw = tile.heading(middle) + (np.pi if side < 0 else 0.0)
+            meshes.append(place(parts.bench(), at, yaw))
     elif kind == "bridge":
         meshes.extend(_railings(tile, (tile.index + 0.5) * TILE))
     return meshes
@@ -94,9 +93,8 @@ def _hedges(tile: Tile) -> list[Mesh]:
             leaves = foliage(
                 spread + np.array([0.0, 0.0, height / 2.0]), 0.15, 0.16, int(rng.integers(2**31))
             )
-            meshes.append(
-                place(merge([heart, leaves]), tile.at(middle, side * 2.3), tile.heading(middle))
-            )
+            at = tile.at(middle, side * 2.3)
+            meshes.append(place(merge([heart, leaves]), at, tile.heading(middle)))
             s += length + rng.uniform(1.2, 3.0)
     return meshes
 
@@ -109,10 +107,8 @@ def _railings(tile: Tile, middle: float) -> list[Mesh]:
         post = box((0.12, 0.12, 1.15), Material.WOOD)
         meshes.append(place(post, tile.at(posts, side * 1.55), tile.heading(posts)))
         for lift in (0.55, 1.05):
-            rail = np.stack(
-                [tile.at(posts, side * 1.55, lift), tile.at(posts, side * 1.55, lift + 0.1)]
-            )
-            meshes.append(grid(rail, Material.WOOD))
+            rail = [tile.at(posts, side * 1.55, height) for height in (lift, lift + 0.1)]
+            meshes.append(grid(np.stack(rail), Material.WOOD))
     return meshes
 
 

@@ -1,4 +1,4 @@
-"""Things that stand about in more than one scene, each with its origin on the ground."""
+"""Objects of several scenes, each with its origin on the ground."""
 
 from functools import cache
 

@@ -65,12 +65,10 @@ def _build(tile: Tile) -> list[Mesh]:
                 house = _house(width, rng.uniform(8.0, 12.0), int(rng.integers(2, 6)), rng)
                 at = tile.at(middle, side * (_KERB + rng.uniform(4.0, 10.0)))
                 meshes.append(place(house, at, tile.heading(middle) + turn))
-            elif width >= 4.0 and rng.random() < 0.5:
+            elif width >= 4.0 and rng.random() < 0.5 and not crossing:
                 hedge = box((width, 0.8, 1.6), Material.LEAVES)
-                if not crossing:
-                    meshes.append(
-                        place(hedge, tile.at(middle, side * (_KERB + 4.0)), tile.heading(middle))
-                    )
+                at = tile.at(middle, side * (_KERB + 4.0))
+                meshes.append(place(hedge, at, tile.heading(middle)))
             s += width + gap
         if crossing:
             meshes.extend(_side_street(tile, side))
@@ -111,11 +109,8 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
         stations = stations[np.abs(stations - (tile.index + 0.5) * 20.0) > 6.0]
     for s in stations:
         if round(s / 10.0) % 3 == (0 if side > 0 else 1):
-            meshes.append(
-                place(
-                    parts.lamp(), tile.at(s, side * (_KERB + 0.5)), tile.heading(s) + turn + np.pi
-                )
-            )
+            at = tile.at(s, side * (_KERB + 0.5))
+            meshes.append(place(parts.lamp(), at, tile.heading(s) + turn + np.pi))
         elif rng.random() < 0.45:
             model = parts.tree(int(rng.integers(parts.VARIANTS)))
             at = tile.at(s + rng.uniform(-1.5, 1.5), side * (_KERB + 1.2))

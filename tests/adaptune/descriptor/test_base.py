@@ -16,7 +16,7 @@ from adaptune.descriptor import (
     lowest_elevation,
 )
 from adaptune.descriptor.motion import MOTION
-from adaptune.descriptor.ndt import ndt_histogram
+from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.sequence import Scan
 
 EMPTY = Scan(0, np.empty((0, 3), np.float32))

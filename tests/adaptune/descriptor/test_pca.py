@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from sklearn.base import clone
 from sklearn.decomposition import PCA
+from sklearn.pipeline import make_pipeline
 
 from adaptune.descriptor.pca import ScaledPCA
 
@@ -60,3 +62,9 @@ def test_each_block_has_components_of_its_own():
         np.hstack([want[0].transform(fresh[:, :20]), want[1].transform(fresh[:, 20:])]),
         atol=1e-9,
     )
+
+
+def test_it_is_an_sklearn_estimator():
+    pca = clone(ScaledPCA(n_components=4))
+    assert pca.get_params() == {"n_components": 4, "blocks": None}
+    assert make_pipeline(pca).fit_transform(counts(3, 8)).shape == (8, 4)

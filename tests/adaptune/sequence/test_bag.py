@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence import SequenceConfig, SequenceError
 from adaptune.sequence.livox import TYPES
+from adaptune.sequence.opening import open_sequence
 
 
 def opened(path: Path | list[Path], **options: Any) -> Any:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptune.sequence import SequenceConfig, cache, open_sequence
+from adaptune.sequence import SequenceConfig, cache
 from adaptune.sequence.bag import BagSource
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.scan import Scan
 
 

@@ -7,8 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from adaptune import yaml
-from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
-from adaptune.sequence.config import check_sequence, to_pose
+from adaptune.sequence import SequenceConfig, SequenceError
+from adaptune.sequence.config import to_pose
+from adaptune.sequence.opening import check_sequence, open_sequence
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
 from offline.offline_study import load_study

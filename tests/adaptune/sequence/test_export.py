@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import turns
 
-from adaptune.sequence import Imu, Scan, SequenceConfig, open_sequence
+from adaptune.sequence import Imu, Scan, SequenceConfig
 from adaptune.sequence.export import export
+from adaptune.sequence.opening import open_sequence
 
 FIRST = 1_700_000_000_123_456_000
 

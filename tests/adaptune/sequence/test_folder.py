@@ -6,8 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adaptune import geometry, open3d
-from adaptune.sequence import SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence import SequenceConfig, SequenceError
 from adaptune.sequence.folder import turn_up
+from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import write_kitti
 
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from adaptune.sequence import SequenceConfig, SequenceError, bag, open_sequence, velodyne
+from adaptune.sequence import SequenceConfig, SequenceError, bag, velodyne
+from adaptune.sequence.opening import open_sequence
 
 DEFINITIONS = {
     "velodyne_msgs/msg/VelodynePacket": "time stamp\nuint8[1206] data\n",

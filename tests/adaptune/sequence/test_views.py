@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError
+from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.views import WithImu
 
 

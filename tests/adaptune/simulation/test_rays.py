@@ -13,13 +13,13 @@ def receive(distance, *, cosine=1.0, reflectivity=0.5, air=CLEAR, dropout=0.0, n
     normals = np.repeat([[-cosine, (1.0 - cosine**2) ** 0.5, 0.0]], n, axis=0).astype(np.float32)
     return kernels.receive(
         looks,
-        np.column_stack([np.zeros((n, 3), np.float32), looks]),
-        np.full(n, distance, np.float32),
-        normals,
-        np.full(n, reflectivity, np.float32),
-        (1.0, 100.0),
-        noise,
-        dropout,
+        kernels.Cast(
+            np.column_stack([np.zeros((n, 3), np.float32), looks]),
+            np.full(n, distance, np.float32),
+            normals,
+            np.full(n, reflectivity, np.float32),
+        ),
+        kernels.Receiver(1.0, 100.0, noise, dropout),
         air,
         rng.random((2, n), np.float32),
         rng.standard_normal(n, np.float32),

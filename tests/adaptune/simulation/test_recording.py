@@ -5,10 +5,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert, rotation_angle, steps
-from adaptune.sequence.config import SequenceConfig, open_sequence
-from adaptune.simulation import Course, SimulationError, record, simulate
-from adaptune.simulation.recording import CLOUD, undistort
-from adaptune.simulation.simulate import Drive
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import open_sequence
+from adaptune.simulation import Course, SimulationError
+from adaptune.simulation.recording import CLOUD, record, undistort
+from adaptune.simulation.simulate import Drive, simulate
 from adaptune.trajectory import read_kitti, read_tum
 
 COURSE = Course(
@@ -166,7 +167,7 @@ def test_a_folder_of_something_else_stays(tmp_path):
     folder = tmp_path / "thesis"
     folder.mkdir()
     (folder / "chapter.tex").write_text("mine")
-    with pytest.raises(SimulationError, match="no recording of this kind: it stays"):
+    with pytest.raises(SimulationError, match="no recording of this kind: not replaced"):
         record(COURSE, folder, overwrite=True)
     for _ in range(2):
         record(COURSE, tmp_path / "run", overwrite=True)

@@ -3,7 +3,8 @@ import pytest
 
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
-from adaptune.simulation import SCENES, Course, simulate
+from adaptune.simulation import SCENES, Course
+from adaptune.simulation.simulate import simulate
 
 
 @pytest.mark.parametrize("scene", SCENES)

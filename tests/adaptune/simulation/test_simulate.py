@@ -5,9 +5,9 @@ import pytest
 
 from adaptune import open3d
 from adaptune.geometry import invert
-from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg, simulate
+from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg
 from adaptune.simulation.movers import populate
-from adaptune.simulation.simulate import EPOCH, Drive
+from adaptune.simulation.simulate import EPOCH, Drive, simulate
 from adaptune.simulation.world import World
 
 
@@ -115,7 +115,7 @@ def test_only_what_is_near_is_kept():
     world = World(drive.road)
     sizes = [len(world.around(s, 100.0).triangles) for s in (100.0, 200.0, 300.0)]
     assert max(sizes) < 1.5 * min(sizes)
-    assert len(world._tiles) <= 11
+    assert len(world.tiles) <= 11
 
 
 def test_a_tile_looks_the_same_whenever_it_is_built():

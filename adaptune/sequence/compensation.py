@@ -1,4 +1,4 @@
-"""Motion compensation: all points of a scan as seen from where the sensor was at its start."""
+"""Motion compensation: all points of a scan as seen from the sensor's pose at its start."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -19,7 +19,7 @@ _MOMENTS = 64
 _CELL, _REACH = 0.5, 2.0
 # small_gicp crashes on an empty target.
 _FEWEST = 20
-# Seconds; the velocity between scans further apart says little about either.
+# Seconds; the mean velocity between scans further apart is not that of either.
 _FAR = 1.0
 
 
@@ -29,7 +29,7 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     Parameters
     ----------
     scan
-        A scan whose points have times; one without is given back as it is.
+        A scan whose points have times; one without is returned as it is.
     T_start_end
         Pose of the sensor `duration` after the scan's stamp, seen from where it was at the stamp;
         of shape (4, 4).
@@ -53,7 +53,7 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
 def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | None, float]]:
     """Register each scan with the one read before it (GICP).
 
-    Both were measured in the same motion, so that what it did to their points hardly matters.
+    Both were measured in the same motion, so that its distortion hardly matters.
 
     Yields
     ------
@@ -95,7 +95,7 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
 def compensate_neighbours(scans: Iterable[Scan]) -> Iterator[Scan]:
     """Undo the motion within each scan, as fast as it was since the one read before.
 
-    A scan of which that is not known, such as the first, is given on as it is.
+    Scans without a known motion, such as the first, pass as they are.
     """
     for scan, T_before_scan, seconds in neighbour_motions(scans):
         if T_before_scan is None:
@@ -119,8 +119,8 @@ def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.flo
 def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
     """Undo the rotation that a gyroscope measured during the scan.
 
-    Translation is left in. A scan whose points have no times, or of which the IMU tells nothing,
-    is given back as it is.
+    Translation stays. A scan without times, or without measurements around it, is returned as it
+    is.
 
     Parameters
     ----------

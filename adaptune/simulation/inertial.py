@@ -1,46 +1,24 @@
-"""An inertial measurement unit beside the LiDAR."""
+"""Simulated measurements of an inertial measurement unit."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert
-from adaptune.sequence.imu import ImuNoise
-from adaptune.simulation.motion import Ride
+from adaptune.geometry import invert
+from adaptune.simulation.ride import Ride
+from adaptune.simulation.rig import NOISE, T_IMU_LIDAR
 
 GRAVITY = 9.80665
 """m/s^2, downwards along the world's z axis."""
 
-T_IMU_LIDAR: Poses = np.array(
-    [
-        [0.9996789, 0.0252866, 0.0015042, 0.058487],
-        [-0.0252723, 0.9996494, -0.0078025, 0.008404],
-        [-0.0017010, 0.0077630, 0.9999700, 0.168916],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
-"""Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
 
-NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
-"""Of an Xsens MTi-680G."""
+class Inertial(NamedTuple):
+    """Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
 
-
-@dataclass(frozen=True, eq=False)
-class Inertial:
-    """Inertial measurements in the IMU's frame.
-
-    Attributes
-    ----------
-    times : ndarray of shape (n,)
-        Seconds since the recording's start.
-    gyro : ndarray of shape (n, 3)
-        Angular velocities in rad/s.
-    accel : ndarray of shape (n, 3)
-        Specific forces in m/s^2: at rest they point up.
+    The specific force points up at rest.
     """
 
-    times: NDArray[np.float64]
     gyro: NDArray[np.float64]
     accel: NDArray[np.float64]
 
@@ -60,11 +38,11 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
     R_world_lidar = ride.poses(times)[:, :3, :3]
     _, turn = ride.velocities(times)
     acceleration, turn_rate = ride.accelerations(times)
-    # The IMU goes round the LiDAR as both turn.
+    # Rotation accelerates the IMU, which is not at the LiDAR's origin.
     round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
     force = acceleration + np.array([0.0, 0.0, GRAVITY])
     force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_
-    return Inertial(times, turn @ R_lidar_imu, force @ R_lidar_imu)
+    return Inertial(turn @ R_lidar_imu, force @ R_lidar_imu)
 
 
 def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
@@ -92,4 +70,4 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
             rng.normal(0.0, walk / np.sqrt(rate), (len(times), 3)), axis=0
         )
         errors.append(bias + rng.normal(0.0, noise * np.sqrt(rate), (len(times), 3)))
-    return Inertial(times, truth.gyro + errors[0], truth.accel + errors[1])
+    return Inertial(truth.gyro + errors[0], truth.accel + errors[1])

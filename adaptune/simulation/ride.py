@@ -1,8 +1,4 @@
-"""How the sensor is carried, and its truth in continuous time."""
-
-from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
+"""The sensor's true trajectory in continuous time."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +6,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
 from adaptune.geometry import Poses
+from adaptune.simulation.motions import Motion
 from adaptune.simulation.road import Road
 
 Floats = NDArray[np.float64]
@@ -20,98 +17,11 @@ _KNOTS = 50.0
 _STEP = 0.25
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A way of carrying a sensor.
-
-    Attributes
-    ----------
-    speed : float
-        Usual speed in m/s.
-    acceleration : float
-        Greatest acceleration and braking in m/s^2.
-    turning : float
-        Greatest lateral acceleration in m/s^2: it goes slower through bends.
-    height : float
-        Metres of the sensor above the ground.
-    base : tuple of float
-        Length and width in metres over which the ground carries it.
-    weave : float
-        Metres by which it strays from the road's middle, about.
-    shift : tuple of float
-        Standard deviation along x, y and z of the mount's shake on a paved road, in metres.
-    turn : tuple of float
-        Standard deviation about x, y and z of the same, in radians.
-    band : tuple of float
-        Least and greatest frequency of the shake in Hz.
-    """
-
-    speed: float
-    acceleration: float
-    turning: float
-    height: float
-    base: tuple[float, float]
-    weave: float
-    shift: tuple[float, float, float]
-    turn: tuple[float, float, float]
-    band: tuple[float, float]
-
-    @property
-    def least_rate(self) -> float:
-        """Scans a second below which its shake is lost or scans lie two metres apart."""
-        return max(2.0 * self.band[1], self.speed / 2.0)
-
-
-def _degrees(*angles: float) -> tuple[float, ...]:
-    return tuple(np.radians(angles).tolist())
-
-
-MOTIONS: Mapping[str, Motion] = MappingProxyType(
-    {
-        "robot": Motion(
-            speed=3.0,
-            acceleration=0.8,
-            turning=1.0,
-            height=0.9,
-            base=(0.8, 0.6),
-            weave=0.15,
-            shift=(0.002, 0.003, 0.004),
-            turn=(0.0015, 0.0015, 0.001),
-            band=(0.5, 3.5),
-        ),
-        "car": Motion(
-            speed=10.0,
-            acceleration=2.0,
-            turning=2.5,
-            height=1.75,
-            base=(2.7, 1.6),
-            weave=0.15,
-            shift=(0.003, 0.006, 0.010),
-            turn=(0.0015, 0.0020, 0.0007),
-            band=(0.6, 2.5),
-        ),
-        "handheld": Motion(
-            speed=1.3,
-            acceleration=0.6,
-            turning=0.8,
-            height=1.5,
-            base=(0.4, 0.4),
-            weave=0.3,
-            shift=(0.012, 0.020, 0.022),
-            turn=(0.012, 0.012, 0.015),
-            band=(0.4, 2.5),
-        ),
-    }
-)
-"""Ways of carrying a sensor, by name."""
-
-
 class Ride:
     """The sensor's trajectory in continuous time, with its derivatives.
 
-    One spline of fifth order through positions and roll, pitch and yaw: what the world's shape,
-    the vehicle and its shake contribute is all in it, so that poses, velocities and accelerations
-    belong together exactly.
+    One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
+    vehicle and its shake. Poses, velocities and accelerations thus match exactly.
 
     Parameters
     ----------

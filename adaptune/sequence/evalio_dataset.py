@@ -10,10 +10,12 @@ import numpy as np
 
 from adaptune import geometry
 from adaptune.geometry import Poses
-from adaptune.sequence.bag import BagSource, bag_paths
+from adaptune.sequence.bag import BagSource
+from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
-from adaptune.sequence.sequence import Frame, SequenceError, Source
+from adaptune.sequence.sequence import SequenceError
+from adaptune.sequence.source import Frame, Source
 from adaptune.sequence.timing import Timing
 from adaptune.trajectory import Trajectory
 
@@ -21,8 +23,8 @@ from adaptune.trajectory import Trajectory
 def evalio_source(name: str) -> Source:
     """Scans, poses and IMU of a sequence such as ``newer_college_2020/short_experiment``.
 
-    evalio tells where the files are (in its data folder, ``$EVALIO_DATA``), what their stamps mean
-    and which frames the poses are of. Bags are read here; evalio converts all other files.
+    evalio knows where the files are (in its data folder, ``$EVALIO_DATA``), what their stamps mean
+    and the frames of the poses. adaptune reads bags itself; evalio converts all other files.
 
     Raises
     ------
@@ -51,8 +53,8 @@ def evalio_source(name: str) -> Source:
         )
     recording = dataset.data_iter()
     if isinstance(recording, datasets.RosbagIter):
-        return _EvalioBag(dataset, recording)
-    return _EvalioFiles(dataset)
+        return EvalioBag(dataset, recording)
+    return EvalioFiles(dataset)
 
 
 def _poses(dataset: Any) -> Trajectory | None:
@@ -68,12 +70,12 @@ def _poses(dataset: Any) -> Trajectory | None:
 
 
 def _place_of_imu(dataset: Any) -> Poses:
-    """Tell the IMU's pose in the LiDAR's frame."""
+    """The IMU's pose in the LiDAR's frame."""
     return geometry.invert(np.asarray(dataset.imu_T_lidar().to_mat(), np.float64))
 
 
-class _EvalioBag(BagSource):
-    """A data set kept in bags: evalio tells the topics, the stamps and the poses."""
+class EvalioBag(BagSource):
+    """A data set in bags. evalio knows the topics, the meaning of the stamps and the poses."""
 
     def __init__(self, dataset: Any, recording: Any):
         at_end = str(recording.lidar_format.stamp) == "end"
@@ -99,8 +101,8 @@ class _EvalioBag(BagSource):
         )
 
 
-class _EvalioFiles:
-    """A data set kept in files of its own, which evalio converts point by point."""
+class EvalioFiles:
+    """A data set in its own format, which evalio converts point by point."""
 
     random_access: ClassVar[bool] = False
 
@@ -114,7 +116,7 @@ class _EvalioFiles:
         return str(self._dataset.full_name)
 
     def about(self) -> dict[str, Any]:
-        """Its name is all there is to note."""
+        """Its name."""
         return {"name": self.name}
 
     def frames(self) -> Iterator[Frame]:

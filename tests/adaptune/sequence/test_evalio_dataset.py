@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptune.sequence import SequenceConfig, SequenceError, evalio, open_sequence
+from adaptune.sequence import SequenceConfig, SequenceError
+from adaptune.sequence.evalio_dataset import EvalioFiles
+from adaptune.sequence.opening import open_sequence
 
 
 def test_without_evalio_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,7 +77,7 @@ def test_a_data_set_is_read_as_evalio_reads_it(rec: Any, tmp_path: Path, dataset
         np.testing.assert_allclose(scan.points[ours], theirs)
         np.testing.assert_allclose(scan.times[ours], times[order], atol=1e-6)
     # Data sets that are no bags are converted by evalio itself.
-    for frame, scan in zip(evalio._EvalioFiles(dataset).frames(), scans, strict=True):
+    for frame, scan in zip(EvalioFiles(dataset).frames(), scans, strict=True):
         converted = frame.load()
         assert abs(converted.stamp - scan.stamp) < 1000
         assert sorted(converted.points[:, 0]) == sorted(scan.points[:, 0])

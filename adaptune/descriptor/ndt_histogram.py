@@ -5,13 +5,9 @@ data using the normal distributions transform*, ICRA 2009, and Koide et al., IRO
 leave the constants open; they are set here.
 """
 
-from collections.abc import Iterable
-from typing import Any, Self
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
 
 from adaptune.sequence import Scan
 
@@ -29,7 +25,7 @@ N_FEATURES = N_DISTANCES * N_CLASSES
 SPAN = 128
 """Cells across, more than there can be within the last bin."""
 Z_LIMIT = 1_000_000
-"""Metres and cells; beyond, the number of a cell would lose its meaning."""
+"""Metres and cells; beyond it the number of a cell would overflow."""
 
 
 @numba.njit(cache=True)
@@ -74,15 +70,15 @@ def _tilt(c: NDArray[np.float64], value: float) -> float:
 
 
 @numba.njit(cache=True)
-def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sum up the points of every cell.
 
     Returns
     -------
     sums : ndarray of shape (n_cells, 10)
         Count, x, y, z, xx, yy, zz, xy, xz, yz, about the cell's centre.
-    centres : ndarray of shape (n_cells, 2)
-        x and y.
+    keys : ndarray of shape (n_cells,)
+        Number of each cell.
     """
     n = len(points)
     size = 1024
@@ -120,8 +116,7 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
                 if keys[cell] == key:
                     break
                 slot = (slot + 1) & mask
-        x -= (kx + 0.5) * CELL_SIZE
-        y -= (ky + 0.5) * CELL_SIZE
+        x, y = x - (kx + 0.5) * CELL_SIZE, y - (ky + 0.5) * CELL_SIZE
         z -= (kz + 0.5) * CELL_SIZE
         s = sums[cell]
         s[0] += 1.0
@@ -134,17 +129,13 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
         s[7] += x * y
         s[8] += x * z
         s[9] += y * z
-    centres = np.empty((cells, 2), np.float64)
-    for cell in range(cells):
-        centres[cell, 0] = (keys[cell] % SPAN - SPAN // 2 + 0.5) * CELL_SIZE
-        centres[cell, 1] = (keys[cell] // SPAN % SPAN - SPAN // 2 + 0.5) * CELL_SIZE
-    return sums[:cells], centres
+    return sums[:cells], keys[:cells]
 
 
 @numba.njit(cache=True)
 def _histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     counts = np.zeros(N_FEATURES)
-    sums, centres = _accumulate(points)
+    sums, keys = _accumulate(points)
     c = np.empty(6)
     for cell in range(len(sums)):
         s = sums[cell]
@@ -152,7 +143,9 @@ def _histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
         if n < MIN_POINTS:
             continue
         mx, my, mz = s[1] / n, s[2] / n, s[3] / n
-        distance = np.hypot(centres[cell, 0] + mx, centres[cell, 1] + my)
+        x = (keys[cell] % SPAN - SPAN // 2 + 0.5) * CELL_SIZE + mx
+        y = (keys[cell] // SPAN % SPAN - SPAN // 2 + 0.5) * CELL_SIZE + my
+        distance = np.hypot(x, y)
         distance_bin = int(distance / DISTANCE_BIN)
         if distance_bin >= N_DISTANCES:
             continue
@@ -180,14 +173,14 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """Count the NDT cells of a scan by distance and shape.
 
     Cells are linear (l2/l1 < 0.1), planar (l3/l2 < 0.1) or spherical, where l1 >= l2 >= l3 are the
-    eigenvalues of the points' covariance. Linear ones are told apart by thirds of abs(z) of their
-    direction, planar ones by thirds of abs(z) of their normal, spherical ones by l2/l1. Turning
-    the sensor about z does not change any of this.
+    eigenvalues of the points' covariance. Linear cells are classified by thirds of abs(z) of their
+    direction, planar cells by thirds of abs(z) of their normal, spherical cells by l2/l1. A turn
+    of the sensor about z changes nothing.
 
     Parameters
     ----------
     points
-        Metres in the sensor's frame, of shape (n, 3). Those that are not finite do not count.
+        Metres in the sensor's frame, of shape (n, 3). Points that are not finite do not count.
 
     Returns
     -------
@@ -201,28 +194,3 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
 def describe(scan: Scan) -> NDArray[np.float64]:
     """`ndt_histogram` of a scan."""
     return ndt_histogram(scan.points)
-
-
-class NdtHistogram(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """`ndt_histogram` of many scans, as a scikit-learn transformer without state."""
-
-    def fit(self, X: Any = None, y: Any = None) -> Self:  # noqa: ARG002
-        """Do nothing: there is nothing to learn."""
-        return self
-
-    def transform(self, X: Iterable[NDArray[np.float32]]) -> NDArray[np.float64]:
-        """Describe scans.
-
-        Parameters
-        ----------
-        X
-            Point clouds of shape (n_points, 3).
-
-        Returns
-        -------
-        ndarray of shape (n_scans, 90)
-        """
-        return np.array([ndt_histogram(points) for points in X]).reshape(-1, N_FEATURES)
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return True

@@ -6,9 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
-from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError, open_sequence
+from adaptune.sequence import Imu, Scan, SequenceConfig, SequenceError
+from adaptune.sequence.compensation import compensate, compensate_neighbours, compensate_rotation
 from adaptune.sequence.imu import clock_offset
-from adaptune.sequence.motion import compensate, compensate_neighbours, compensate_rotation
+from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import Trajectory
 
 RATE = np.array([0.3, -0.2, 1.5])
@@ -203,7 +204,7 @@ def test_scans_tell_the_offset_where_there_is_no_imu(rec: Any, tmp_path: Path) -
         messages.append(("/points", stamp, rec.cloud(rec.velodyne(points), stamp, rec.ROS1)))
         messages.append(("/poses", stamp, rec.pose(stamp - 10**15, (0, 0, 0), q, rec.ROS1)))
     bag = str(rec.write_bag(tmp_path / "a.bag", messages))
-    with pytest.raises(SequenceError, match=r"the scans tell the same motion with") as caught:
+    with pytest.raises(SequenceError, match=r"the scans show the same motion with") as caught:
         open_sequence(SequenceConfig(bag=bag, reference="/poses")).reference()
     proposed = float(str(caught.value).split("clock_offset: ")[-1].rstrip(")"))
     assert proposed == pytest.approx(1e6, abs=0.1)

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.base import clone
-from sklearn.pipeline import make_pipeline
 
-from adaptune.descriptor.ndt import NdtHistogram, ndt_histogram
-from adaptune.descriptor.pca import ScaledPCA
+from adaptune.descriptor.ndt_histogram import ndt_histogram
 
 modest = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -255,17 +252,3 @@ def test_other_layouts_and_types_of_points():
     np.testing.assert_array_equal(ndt_histogram(points.astype(np.float64)), want)
     np.testing.assert_array_equal(ndt_histogram(np.asfortranarray(points)), want)
     np.testing.assert_array_equal(ndt_histogram(np.repeat(points, 2, axis=0)[::2]), want)
-
-
-def test_histograms_of_many_scans():
-    scans = [street(seed) for seed in range(3)] + [np.empty((0, 3), np.float32)]
-    histograms = NdtHistogram().fit_transform(scans)
-    np.testing.assert_array_equal(histograms, [ndt_histogram(points) for points in scans])
-    assert NdtHistogram().transform(iter(())).shape == (0, 90)
-
-
-def test_they_are_sklearn_estimators():
-    pca = clone(ScaledPCA(n_components=4))
-    assert pca.get_params() == {"n_components": 4, "blocks": None}
-    scans = [street(seed, 1500) for seed in range(8)]
-    assert make_pipeline(NdtHistogram(), pca).fit_transform(scans).shape == (8, 4)

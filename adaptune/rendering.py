@@ -1,0 +1,139 @@
+"""Show an inspected recording, and the cache, on a terminal; draw a recording's first scan."""
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from adaptune.files import replacing
+from adaptune.inspect import Inspection, ScanSummary
+from adaptune.sequence import SequenceError, cache
+from adaptune.sequence.pointcloud2 import RING_FIELDS
+from adaptune.sequence.timing import TIME_FIELDS
+from adaptune.trajectory import Trajectory
+
+
+def render_inspection(inspection: Inspection) -> RenderableType:
+    """The inspection for a terminal."""
+    parts: list[RenderableType] = [
+        Text(str(inspection.path), style="bold"),
+        _topic_table(inspection),
+    ]
+    if inspection.layout:
+        parts.append(Text(f"point: {_layout_text(inspection.layout)}"))
+    if inspection.scan is not None:
+        parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
+    if inspection.reference is not None:
+        parts.append(Text(f"reference: {_reference_text(inspection.reference)}"))
+    parts += [Text(f"! {problem}", style="yellow") for problem in inspection.problems]
+    for stage, lacking in inspection.missing.items():
+        state = f"lacks {' and '.join(lacking)}" if lacking else "has all it needs"
+        parts.append(Text(f"{stage}: {state}", style="red" if lacking else "green"))
+    parts.append(Text("\n" + inspection.entry))
+    return Group(*parts)
+
+
+def _topic_table(inspection: Inspection) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in ("topic", "type", "count", "rate", "seconds", "max gap"):
+        numeric = column not in ("topic", "type")
+        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
+    for topic in inspection.topics:
+        seconds = None
+        if topic.first is not None and topic.last is not None:
+            seconds = (topic.last - topic.first) * 1e-9
+        table.add_row(
+            topic.name,
+            topic.type.replace("/msg/", "/"),
+            str(topic.count),
+            "" if topic.rate is None else f"{topic.rate:.2f} Hz",
+            "" if seconds is None else f"{seconds:.2f}",
+            "" if topic.gap is None else f"{topic.gap:.3f} s",
+        )
+    return table
+
+
+def _layout_text(layout: Sequence[tuple[str, str, int]]) -> str:
+    words = []
+    for name, kind, offset in layout:
+        role = " (time)" if name in TIME_FIELDS else " (ring)" if name in RING_FIELDS else ""
+        words.append(f"{name}{role} {kind}@{offset}" if kind else f"{name}{role}")
+    return ", ".join(words)
+
+
+def _scan_text(scan: ScanSummary) -> str:
+    words = [f"{len(scan.scan):,} points"]
+    if scan.recorded > len(scan.scan):
+        words[0] += f" of {scan.recorded:,}"
+    if scan.ranges is not None:
+        near, middle, far = scan.ranges
+        words.append(f"{near:.2f} to {far:.2f} m away, half of them within {middle:.2f} m")
+    words.append("no times" if scan.span is None else f"times spanning {scan.span:.4f} s")
+    words.append("no rings" if scan.rings is None else f"{scan.rings} rings")
+    light = scan.scan.intensities
+    if light is None or not len(light):
+        words.append("no intensities")
+    else:
+        words.append(f"intensities from {light.min():g} to {light.max():g}")
+    return ", ".join(words)
+
+
+def _reference_text(reference: Trajectory) -> str:
+    length = np.linalg.norm(np.diff(reference.T_world_sensor[:, :3, 3], axis=0), axis=1).sum()
+    seconds = (reference.stamps[-1] - reference.stamps[0]) * 1e-9
+    return f"{len(reference):,} poses, {length:.1f} m in {seconds:.1f} s"
+
+
+def write_inspection_png(inspection: Inspection, path: Path) -> None:
+    """Draw the first scan from above and from the side.
+
+    Raises
+    ------
+    SequenceError
+        If no scan could be read.
+    """
+    if inspection.scan is None:
+        raise SequenceError(f"{inspection.path}: no scan can be drawn, none could be read")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    points = inspection.scan.scan.points
+    # Few far points would shrink all others to a dot.
+    reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
+    low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
+    figure = Figure(figsize=(9, 12), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, side = figure.subplots(2, 1, height_ratios=(3, 1))
+    for axes, (i, j), names in ((above, (0, 1), "xy"), (side, (0, 2), "xz")):
+        order = np.argsort(points[:, 2])
+        x, y, z = points[order, i], points[order, j], points[order, 2]
+        dots = axes.scatter(x, y, c=z, s=0.4, cmap="viridis", vmin=low, vmax=high)
+        axes.set_xlim(-reach, reach)
+        axes.set_aspect("equal")
+        axes.set_xlabel(f"{names[0]} (m)")
+        axes.set_ylabel(f"{names[1]} (m)")
+    above.set_ylim(-reach, reach)
+    above.plot(0, 0, "r+", markersize=10)
+    figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6, extend="both")
+    figure.suptitle(f"{inspection.path.name}: {_scan_text(inspection.scan)}", fontsize=9)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def render_cache() -> RenderableType:
+    """The decoded sequences on disk, for a terminal."""
+    entries = cache.list_cache()
+    table = Table(box=None, pad_edge=False)
+    for column in ("sequence", "scans", "size", "last used"):
+        table.add_column(column, justify="left" if column == "sequence" else "right")
+    for entry in entries:
+        used = datetime.datetime.fromtimestamp(entry.used).strftime("%Y-%m-%d %H:%M")
+        table.add_row(entry.name, str(entry.n_scans), f"{entry.size / 1e6:,.1f} MB", used)
+    total = sum(entry.size for entry in entries) / 1e9
+    return Group(
+        table, Text(f"{cache.folder()}: {total:.2f} GB of at most {cache.cap() / 1e9:g} GB")
+    )

@@ -1,0 +1,124 @@
+"""Open the sequences that a study describes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from adaptune.sequence import cache, views
+from adaptune.sequence.bag import IMU_TYPES, BagSource
+from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.config import REFERENCE_FILES, ImuConfig, SequenceConfig, to_pose
+from adaptune.sequence.folder import kitti, scan_folder
+from adaptune.sequence.imu import ImuNoise
+from adaptune.sequence.recorded import ImuSettings, RecordedSequence, ReferenceSettings
+from adaptune.sequence.sequence import Sequence, SequenceError
+from adaptune.sequence.source import Section, Source
+from adaptune.sequence.timing import Timing
+from adaptune.sequence.views import Reversible
+
+# Livox IMUs measure acceleration in multiples of this.
+_STANDARD_GRAVITY = 9.80665
+
+_VIEWS: dict[str, Callable[[Reversible, Any], Reversible]] = {
+    "cut": views.cut,
+    "drop": lambda of, v: views.drop(of, v.share, (v.start, v.stop), v.seed),
+    "speed": lambda of, v: views.speed(of, v.factor, (v.start, v.stop)),
+    "reverse": lambda of, _: views.Reversed(of),
+    "rings": views.thin_rings,
+    "noise": lambda of, v: views.add_noise(of, v.sigma, v.seed),
+    "transform": lambda of, v: views.transform(of, to_pose(v)),
+}
+
+
+def open_sequence(config: SequenceConfig) -> Sequence:
+    """Open what a study describes; scans are not read before they are asked for.
+
+    Raises
+    ------
+    SequenceError
+        If it cannot be opened as described.
+    """
+    sequence: Reversible = _recorded(config)
+    if config.compensate == "constant_velocity":
+        sequence = views.WithoutMotion(sequence)
+    elif config.compensate == "gyro":
+        sequence = views.without_rotation(sequence)
+    for view in config.views:
+        sequence = _VIEWS[view.name](sequence, getattr(view, view.name))
+    return sequence
+
+
+def check_sequence(config: SequenceConfig) -> None:
+    """Find what would fail while it is read, without reading its scans.
+
+    Raises
+    ------
+    SequenceError
+        If it cannot be opened as described, ends before its `start`, or its reference is of
+        another time.
+    """
+    _recorded(config).check()
+
+
+def _recorded(config: SequenceConfig) -> RecordedSequence:
+    reference: str | Path | None = config.reference
+    if isinstance(reference, str) and reference.endswith(REFERENCE_FILES):
+        reference = Path(reference)
+        if not reference.is_file():
+            raise SequenceError(f"{reference}: there is no such file")
+    source, key = _source(config)
+    if isinstance(source, BagSource):
+        topic = reference if isinstance(reference, str) else None
+        source.check(topic, None if config.imu is None else config.imu.topic)
+        if config.imu is not None and config.bag is not None:
+            source.topic(config.imu.topic, IMU_TYPES, "an IMU's measurements")
+    return RecordedSequence(
+        source,
+        _section(config),
+        ReferenceSettings(
+            reference,
+            config.child_frame,
+            None if config.extrinsic is None else to_pose(config.extrinsic),
+            config.clock_offset,
+            config.max_gap,
+        ),
+        _imu(config.imu),
+        key,
+    )
+
+
+def _source(config: SequenceConfig) -> tuple[Source, str | None]:
+    """What reads the recording, and under which key its decoded scans are kept."""
+    timing = Timing(config.stamp, config.time_unit, config.period)
+    if config.kitti is not None:
+        return kitti(Path(config.kitti), config.elevation), None
+    if config.folder is not None:
+        return scan_folder(Path(config.folder), timing), None
+    if config.evalio is not None:
+        # evalio is an optional package.
+        from adaptune.sequence.evalio_dataset import evalio_source
+
+        return evalio_source(config.evalio), None
+    bags = (config.bag,) if isinstance(config.bag, str) else config.bag or ()
+    paths = bag_paths(bags)
+    if not config.cache or not cache.cap():
+        return BagSource(paths, config.points, timing), None
+    try:
+        key = cache.key(paths, (config.points, timing, _section(config)))
+    except OSError as error:
+        raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
+    entry = cache.find(key)
+    about = None if entry is None else entry.about
+    return BagSource(paths, config.points, timing, about), key
+
+
+def _section(config: SequenceConfig) -> Section:
+    return Section(config.start, config.stop, config.stride)
+
+
+def _imu(config: ImuConfig | None) -> ImuSettings | None:
+    if config is None:
+        return None
+    T = None if config.extrinsic is None else to_pose(config.extrinsic)
+    scale = _STANDARD_GRAVITY if config.unit == "g" else 1.0
+    return ImuSettings(config.topic, T, scale, ImuNoise(**config.noise.model_dump()))

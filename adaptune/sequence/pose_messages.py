@@ -1,0 +1,90 @@
+"""Poses in ROS messages."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import geometry
+from adaptune.sequence.sequence import SequenceError
+from adaptune.space import nearest
+from adaptune.trajectory import Trajectory
+
+Pose = tuple[int, str, Any, Any]
+"""Stamp, frame, translation, quaternion."""
+
+
+def message_stamp(message: Any) -> int:
+    """Nanoseconds of a message's header."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def _header_pose(message: Any, pose: Any) -> list[Pose]:
+    return [(message_stamp(message), message.header.frame_id, pose.position, pose.orientation)]
+
+
+def _transforms(transforms: Iterable[Any]) -> list[Pose]:
+    return [
+        (message_stamp(t), t.child_frame_id, t.transform.translation, t.transform.rotation)
+        for t in transforms
+    ]
+
+
+POSES: dict[str, Callable[[Any], list[Pose]]] = {
+    "geometry_msgs/msg/PoseStamped": lambda m: _header_pose(m, m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _header_pose(m, m.pose.pose),
+    "nav_msgs/msg/Odometry": lambda m: _header_pose(m, m.pose.pose),
+    "nav_msgs/msg/Path": lambda m: [pose for p in m.poses for pose in _header_pose(p, p.pose)],
+    "geometry_msgs/msg/TransformStamped": lambda m: _transforms([m]),
+    "tf2_msgs/msg/TFMessage": lambda m: _transforms(m.transforms),
+    "tf/msg/tfMessage": lambda m: _transforms(m.transforms),
+}
+"""Poses in a message, by its type."""
+# Each message of this type repeats all poses of the one before.
+PATH = "nav_msgs/msg/Path"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]:
+    """Poses of one child frame; of the only one if `frame` is None.
+
+    Raises
+    ------
+    SequenceError
+        Naming the frames on the topic.
+    """
+    frames = sorted({name for _, name, *_ in poses})
+    if frame is None and len(frames) > 1:
+        raise SequenceError(
+            f"{topic} has the transforms of several frames, name one of them as `child_frame`: "
+            f"{', '.join(frames)}"
+        )
+    if frame is not None and frame not in frames:
+        raise SequenceError(f"{topic}: no frame {frame}; {nearest(frame, frames)}")
+    return [pose for pose in poses if frame in (None, pose[1])]
+
+
+def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
+    """Trajectory of the poses that are finite and have a rotation, each stamp once.
+
+    Returns
+    -------
+    trajectory : Trajectory or None
+        None if no pose is usable.
+    unusable : int
+        How many are not.
+    """
+    stamps = np.array([stamp for stamp, *_ in poses], np.int64)
+    values: NDArray[np.float64] = np.array(
+        [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for _, _, p, q in poses]
+    )
+    with np.errstate(invalid="ignore", over="ignore"):
+        norms = np.linalg.norm(values[:, 3:], axis=1)
+    good = np.isfinite(values).all(axis=1) & np.isfinite(norms) & (norms > 0.1)
+    if not good.any():
+        return None, len(poses)
+    unique, index = np.unique(stamps[good], return_index=True)
+    values = values[good][index]
+    T = geometry.from_quaternions(values[:, :3], values[:, 3:])
+    return Trajectory(unique, T), int(np.count_nonzero(~good))
