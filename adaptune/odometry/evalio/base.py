@@ -9,7 +9,7 @@ from pydantic import Field
 
 from adaptune.geometry import Poses, invert
 from adaptune.odometry.base import BaseSettings, Description, OdometryError
-from adaptune.odometry.evalio.points import (
+from adaptune.odometry.evalio.point_layout import (
     MIN_POINTS,
     Prepared,
     cloud,

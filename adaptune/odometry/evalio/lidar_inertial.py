@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses
 from adaptune.odometry.evalio.base import Pipeline, RingedPipeline
-from adaptune.odometry.evalio.points import Prepared
+from adaptune.odometry.evalio.point_layout import Prepared
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
