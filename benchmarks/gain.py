@@ -125,7 +125,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     config = OfflineConfig(sampler="sobol", batch=N_SETS, seed=seed)
     sets = make_sampler(factory.space, config).propose([])
     one = factory()
-    prepared = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
+    prepared: Any = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
     trials = run_trials(settings, factory, prepared, sets)
     length, lost_track = settings.sub_trajectory, settings.lost_track
     vectors = [error_vectors(frames, trial, length) for trial in trials]

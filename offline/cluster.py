@@ -59,18 +59,8 @@ class _Place(NamedTuple):
 class Cluster:
     """The workers of a Dask cluster, as a `Pool`.
 
-    Use it as a context: leaving it cancels the tasks that are not done.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    names
-        The training sequences.
-    memory
-        Bytes that prepared scans may take, in all workers together.
-    address
-        Address of the scheduler, as ``tcp://scheduler:8786``.
+    Its workers share `memory` bytes for prepared scans. Use it as a context: leaving it cancels the
+    tasks that are not done.
 
     Raises
     ------

@@ -101,17 +101,7 @@ def exceeded(constraints: Sequence[float]) -> float:
 def trajectory_metrics(
     frames: Frames, T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]
 ) -> dict[str, float]:
-    """The metrics of a whole trajectory; KITTI's error if it is long enough.
-
-    Parameters
-    ----------
-    frames
-        The sequence's frames.
-    T_odom_sensor
-        The odometry's poses, of shape (n, 4, 4).
-    lost_steps
-        See `joined`.
-    """
+    """The metrics of a whole trajectory; KITTI's error if it is long enough."""
     T_ref_sensor, T = frames.T_ref_sensor, joined(T_odom_sensor, lost_steps)
     with np.errstate(over="ignore", invalid="ignore"):
         kitti = kitti_error(T_ref_sensor, T)
@@ -146,15 +136,7 @@ def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
 
 
 def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
-    """Judge a parameter set by its trials on some sequences.
-
-    Parameters
-    ----------
-    config
-        Objectives and limits. A limit holds on every sequence.
-    runs
-        The set's trials, one for each sequence.
-    """
+    """Judge a parameter set by its trials on some sequences."""
     metrics = [run.metrics for run in runs]
     values = tuple(
         float(np.mean([weighted(weights, of_run) for of_run in metrics]))
@@ -210,11 +192,6 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
 
     A set that breaks limits is worse by `SEVERITY` times the baseline's value, and more with a
     larger excess: the sampler keeps away from it.
-
-    Parameters
-    ----------
-    history
-        Results of all trials; the first one is the baseline's.
     """
     if not any(result.constraints for result in history):
         return list(history)

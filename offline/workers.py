@@ -51,14 +51,7 @@ class Task(NamedTuple):
 
 
 class TaskResult(NamedTuple):
-    """The result of a task.
-
-    Attributes
-    ----------
-    trials : list of Trial
-    frames : Frames, optional
-        If the task asks for them.
-    """
+    """The result of a task; the frames are there if the task asks for them."""
 
     trials: list[Trial]
     frames: Frames | None
@@ -176,15 +169,7 @@ def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
 
 
 class Sequences:
-    """The sequences that a worker has prepared, as many as its memory holds.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    memory
-        Bytes that prepared scans may take.
-    """
+    """The sequences that a worker has prepared, as many as its memory holds."""
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
@@ -225,18 +210,9 @@ class _Worker(NamedTuple):
 
 
 class Workers:
-    """Processes on this machine.
+    """Processes on this machine, which share `memory` bytes for prepared scans.
 
     Use it as a context: leaving it ends the processes.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    n
-        Number of processes.
-    memory
-        Bytes that prepared scans may take, in all processes together.
     """
 
     def __init__(self, setup: TrialSetup, n: int, memory: float):

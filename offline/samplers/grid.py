@@ -71,11 +71,6 @@ class Axis:
 class Grid:
     """All combinations of the axes' values, in row-major order: the last axis changes fastest.
 
-    Parameters
-    ----------
-    axes
-        By name.
-
     Attributes
     ----------
     size : int
@@ -176,15 +171,6 @@ def check_grid(
     axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
 ) -> Iterable[Mistake]:
     """Find mistakes in a grid.
-
-    Parameters
-    ----------
-    axes
-        The values to try, by parameter.
-    space
-        The tuned parameters.
-    bounded
-        Whether the search stops before the end of a large grid.
 
     Yields
     ------
