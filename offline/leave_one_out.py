@@ -115,7 +115,7 @@ class Validation:
     @property
     def default(self) -> str:
         """The first of them."""
-        return self.modes[0] if self.modes else next(iter(RULES))
+        return (*self.modes, RULES[0])[0]
 
     def summary(self, mode: str) -> dict[str, float]:
         """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
@@ -153,14 +153,11 @@ class Validation:
         s = self.summary(rule)
         worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
+        weight = f"{share:.0f} % of the weight on other members than the fixed set"
         ratio = (
             f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
             f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
-            + (
-                f"others than the fixed set having {share:.0f} % of the weight"
-                if rule == BANK
-                else f"adapting {share:.0f} % of the time"
-            )
+            + (f"with {weight}" if rule == BANK else f"adapting {share:.0f} % of the time")
         )
         if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
             return f"`{rule}` kept the fixed set: what it was fitted on did not show that it pays."

@@ -193,14 +193,8 @@ def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
 
 
 _SELECTION = (
-    "stamp_ns",
-    "trial",
-    "predicted_error_percent",
-    "predicted_fixed_percent",
-    "familiarity",
-    "sequences",
-    "weights",
-    "ms",
+    *("stamp_ns", "trial", "predicted_error_percent", "predicted_fixed_percent"),
+    *("familiarity", "sequences", "weights", "ms"),
 )
 """Columns of ``selections.csv`` before the parameters."""
 

@@ -43,7 +43,7 @@ def test_the_example_is_what_adaptune_online_does(folder, monkeypatch, bank):
     run_replays(study, study.model_path)
     poses = []
     example = EXAMPLE.replace('"my.yaml"', f'"my.yaml", {overrides}')
-    exec(example + "    poses.append(T_odom_sensor)\n", {"poses": poses})  # noqa: S102
+    exec(example + "    poses.append(T_odom_sensor)\n", {"poses": poses})
     replayed = read_tum(study.folder / "replays/home/paired/trajectory.tum")
     np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
     weights = (study.folder / "replays/home/paired/selections.csv").read_text()

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 """Becomes the name of a file."""
 
-RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
-"""Keys of earlier versions and what they are called now."""
-
 
 class StudySection(BaseModel):
     """A section of a study's YAML."""

@@ -10,10 +10,12 @@ from pydantic import BaseModel, ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.space import nearest
-from adaptune.study.config import RENAMED
 
 Key = tuple[str | int, ...]
 """Keys and indices that lead to a value."""
+
+RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
+"""Keys of earlier versions, and their present names."""
 
 M = TypeVar("M", bound=BaseModel)
 
