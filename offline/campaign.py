@@ -131,18 +131,10 @@ class _Campaign:
 
 
 class Missing(NamedTuple):
-    """What is still to be run.
+    """What is still to be run."""
 
-    Attributes
-    ----------
-    numbers : dict
-        On every sequence, of the trials.
-    parameters : callable
-        Tells a trial's set.
-    """
-
-    numbers: Mapping[str, Sequence[int]]
-    parameters: Callable[[int], ParameterSet]
+    numbers: Mapping[str, Sequence[int]]  # on every sequence, of the trials
+    parameters: Callable[[int], ParameterSet]  # the set of a trial
 
 
 def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) -> list[Task]:

@@ -30,23 +30,14 @@ _log = logging.getLogger(__name__)
 
 
 class Training(NamedTuple):
-    """Result of the offline stage.
-
-    Attributes
-    ----------
-    model : ErrorModel
-    means : dict
-        For every training sequence the mean capped error in percent of each trial, by rising
-        number, of shape (n_trials,); NaN where it was not run.
-    fixed : int
-        Number of the trial of the fixed set.
-    rows : list of dict
-        For every training sequence what the baseline, the fixed set and its own best set do there.
-    """
+    """Result of the offline stage."""
 
     model: ErrorModel
+    # For every training sequence the mean capped error in percent of each trial, by rising number,
+    # of shape (n_trials,); NaN where it was not run.
     means: dict[str, list[float]]
-    fixed: int
+    fixed: int  # number of the trial of the fixed set
+    # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
 
 

@@ -18,21 +18,13 @@ from offline.offline_study import OfflineStudy
 
 
 class Validated(NamedTuple):
-    """Result of `validate`.
-
-    Attributes
-    ----------
-    validation : Validation
-    rows : list of dict
-        Ratio to the fixed set's error of every mode on every sequence left out.
-    learning, banks : list of dict
-        See `learning_curve` and `bank_curve`; empty where they were not asked for.
-    """
+    """Result of `validate`."""
 
     validation: Validation
+    # Ratio to the fixed set's error of every mode on every sequence left out.
     rows: list[dict[str, Any]]
-    learning: list[dict[str, Any]]
-    banks: list[dict[str, Any]]
+    learning: list[dict[str, Any]]  # see `learning_curve`; empty where nobody asked
+    banks: list[dict[str, Any]]  # see `bank_curve`; empty where nobody asked
 
 
 def validate(
