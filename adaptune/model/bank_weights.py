@@ -29,7 +29,7 @@ class BankSettings(BaseModel):
     # A file of a later version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    adapt: bool = True  # if not, the bank was not shown to pay, and is not used
+    adapt: bool = True  # if not, the fixed set keeps all the weight
     # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
     n_frames: PositiveInt = 300  # nearest frames of each sequence
@@ -164,7 +164,8 @@ def bank_weights(
     of_sequences = near.evidence.weights(settings.sharpness)
     squares = np.einsum("qs,qsjk->qjk", of_sequences, relative)
     weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
-    trust = near.evidence.trust * (1.0 - settings.min_fixed_share)
+    kept = settings.min_fixed_share if settings.adapt else 1.0
+    trust = near.evidence.trust * (1.0 - kept)
     weights *= trust[:, None]
     weights[:, 0] += 1.0 - trust
     mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)
