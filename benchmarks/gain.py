@@ -20,7 +20,20 @@ from gain_ablation import ablate, less
 from gain_data import ODOMETRIES, describe, factory_of, labelled, training_courses, trials
 from gain_modes import by_descriptor, curve, validate
 
+from offline.labelled import LabelledData
 from offline.leave_one_out import BANK_SIZE
+
+
+def compare(data: LabelledData, arguments: argparse.Namespace) -> None:
+    """Leave each sequence out in turn, in the way that is asked for."""
+    if arguments.less:
+        less(data)
+    elif arguments.curve:
+        curve(data)
+    elif arguments.ablate:
+        ablate(data, arguments.bank)
+    else:
+        validate(data, arguments.bank)
 
 
 def main() -> None:
@@ -49,14 +62,8 @@ def main() -> None:
         if arguments.descriptors:
             described = describe(arguments.folder, courses, seed)
             by_descriptor(data, paths, described, arguments.bank)
-        elif arguments.less:
-            less(data)
-        elif arguments.curve:
-            curve(data)
-        elif arguments.ablate:
-            ablate(data, arguments.bank)
         else:
-            validate(data, arguments.bank)
+            compare(data, arguments)
 
 
 if __name__ == "__main__":

@@ -222,10 +222,10 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         "bank, half kept": simulated(min_fixed_share=0.5),
         "bank, familiar everywhere": simulated(all_familiar=True),
         "bank, the 100 nearest frames": simulated(n_frames=100),
-        "bank, limit 6": simulated(clip=6.0),
-        "bank, limit 18": simulated(clip=18.0),
+        "bank, clip 6": simulated(clip=6.0),
+        "bank, clip 18": simulated(clip=18.0),
         "bank, errors count in full": simulated(clip=1e9),
-        "bank, likes do not share": simulated(ridge=0.0),
+        "bank, without ridge": simulated(ridge=0.0),
         "bank, weights of each second": simulated(smoothing=1),
         "bank, weights of 20 seconds": simulated(smoothing=20),
     }

@@ -83,7 +83,7 @@ def model_of(odometry: str, data: LabelledData) -> ErrorModel:
 
 
 def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
-    """All ways to drive, by name."""
+    """All ways to replay a course, by name."""
     model = model_of(odometry, data)
     print(f"settings of the paired rule: {model.paired}")
     factory, sets = factory_of(odometry), model.sets
@@ -120,10 +120,10 @@ def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
     }
 
 
-def replays_of(scans: list[SimulatedScan], driven: Mapping[str, Way]) -> list[Replay]:
+def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[Replay]:
     """Replay a course in all ways."""
     replays = []
-    for make, selector in driven.values():
+    for make, selector in compared.values():
         if isinstance(selector, Selector):
             selector.reset()
         replays.append(replay(scans, make(), HealthCheck(), selector))
@@ -145,23 +145,23 @@ def print_table(names: list[str], means: NDArray[np.float64]) -> None:
 
 
 def main() -> None:
-    """Drive all courses in all ways."""
+    """Replay all courses in all ways."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=8)
     parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
-    parser.add_argument("--modes", nargs="+", help="to drive, besides fixed; all if left out")
+    parser.add_argument("--modes", nargs="+", help="besides fixed; all if left out")
     parser.add_argument("--length", type=float, default=120.0, help="of the training courses")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
     odometry, seed = arguments.odometry, arguments.seed
     paths = trials(arguments.folder, odometry, training_courses(seed, arguments.length), seed)
-    driven = ways(odometry, labelled(paths, factory_of(odometry).space))
+    compared = ways(odometry, labelled(paths, factory_of(odometry).space))
     if arguments.modes:
-        driven = {n: way for n, way in driven.items() if n == "fixed" or n in arguments.modes}
-    print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in driven))
+        compared = {n: way for n, way in compared.items() if n == "fixed" or n in arguments.modes}
+    print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in compared))
     means: list[list[float]] = []
     for i, scenes in enumerate(ORDERS):
         course = Course(scenes=scenes, length=LENGTH, seed=1000 * seed + 500 + i)
@@ -169,13 +169,13 @@ def main() -> None:
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
         row = f"{' '.join(scenes):32}"
-        for result in replays_of(scans, driven):
+        for result in replays_of(scans, compared):
             T_odom_sensor = result.trajectory.T_world_sensor
             errors = sub_trajectory_rte(T_world_sensor, T_odom_sensor, SUB_TRAJECTORY)
             means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
             row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
         print(row, flush=True)
-    print_table(list(driven), np.array(means))
+    print_table(list(compared), np.array(means))
 
 
 if __name__ == "__main__":
