@@ -300,15 +300,9 @@ def fingerprint(config: SequenceConfig) -> str:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AwaySequences(StudySequences):
-    """The sequences of a study on a worker, which may not have the recordings.
+    """The sequences of a study on a worker, which may not have the recordings."""
 
-    Attributes
-    ----------
-    digests : dict
-        `fingerprint` of every sequence at the driver.
-    """
-
-    digests: Mapping[str, str]
+    digests: Mapping[str, str]  # `fingerprint` of every sequence at the driver
 
     def open(self, name: str) -> Any:
         """See `StudySequences.open`.

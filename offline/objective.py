@@ -40,30 +40,18 @@ Value = float | tuple[float, ...]
 
 
 class Verdict(NamedTuple):
-    """How a parameter set did on the sequences on which it was run.
-
-    Attributes
-    ----------
-    parameters : dict
-    values : tuple of float
-        Mean of every objective over the sequences.
-    constraints : tuple of float
-        Excess over every limit, as a share of the limit; negative if the limit is kept.
-    margin : float
-        Distance from the first value to the upper end of its one-sided 95 % confidence interval;
-        0 unless trials are repeated.
-    complete : bool
-        Whether the set was run on all sequences; if not, its values are estimates.
-    sequences : tuple of str
-        The sequences on which it was run.
-    """
+    """How a parameter set did on the sequences on which it was run."""
 
     parameters: ParameterSet
-    values: tuple[float, ...]
+    values: tuple[float, ...]  # mean of every objective over the sequences
+    # Excess over every limit, as a share of the limit; negative if the limit is kept.
     constraints: tuple[float, ...] = ()
+    # Distance from the first value to the upper end of its one-sided 95 % confidence interval; 0
+    # unless trials are repeated.
     margin: float = 0.0
+    # Whether the set was run on all sequences; if not, its values are estimates.
     complete: bool = True
-    sequences: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = ()  # the sequences on which it was run
 
     @property
     def excess(self) -> float:
@@ -77,20 +65,11 @@ class Verdict(NamedTuple):
 
 
 class SamplerResult(NamedTuple):
-    """The result of a trial as samplers receive it.
-
-    Attributes
-    ----------
-    parameters : dict
-    value : float or tuple of float
-        Samplers minimise it.
-    constraints : tuple of float
-        See `Verdict`.
-    """
+    """The result of a trial as samplers receive it."""
 
     parameters: ParameterSet
-    value: Value
-    constraints: tuple[float, ...] = ()
+    value: Value  # samplers minimise it
+    constraints: tuple[float, ...] = ()  # see `Verdict`
 
 
 def exceeded(constraints: Sequence[float]) -> float:

@@ -182,17 +182,10 @@ def _rank(verdict: Verdict) -> tuple[bool, float, float]:
 
 
 class Stage(NamedTuple):
-    """Searches that run side by side.
-
-    Attributes
-    ----------
-    searches : list of Search
-    alone : bool
-        Whether each search uses one sequence alone.
-    """
+    """Searches that run side by side."""
 
     searches: list[Search]
-    alone: bool
+    alone: bool  # whether each search uses one sequence alone
 
 
 def make_stages(

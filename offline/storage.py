@@ -37,23 +37,12 @@ class StorageError(AdaptuneError):
 
 
 class MirrorRow(NamedTuple):
-    """A trial as the mirror receives it.
-
-    Attributes
-    ----------
-    parameters : dict
-    values : tuple of float
-        The value of each objective.
-    attributes : dict
-        Further figures, as plain data.
-    constraints : dict
-        Excess over every limit; negative if the limit is kept.
-    """
+    """A trial as the mirror receives it."""
 
     parameters: ParameterSet
-    values: tuple[float, ...]
-    attributes: Mapping[str, Any] = {}
-    constraints: Mapping[str, float] = {}
+    values: tuple[float, ...]  # the value of each objective
+    attributes: Mapping[str, Any] = {}  # further figures, as plain data
+    constraints: Mapping[str, float] = {}  # excess over every limit; negative if the limit is kept
 
 
 def open_mirror(

@@ -25,26 +25,13 @@ class WorkerError(AdaptuneError):
 
 
 class Task(NamedTuple):
-    """Trials to run on one pass over a sequence.
-
-    Attributes
-    ----------
-    sequence : str
-    numbers : tuple of int
-        Trial numbers.
-    sets : tuple of dict
-        The parameter sets of the trials.
-    whole : bool
-        Run them from end to end, without restarts at the reference.
-    frames : bool
-        Return the frames, which all trials on the sequence share, too.
-    """
+    """Trials to run on one pass over a sequence."""
 
     sequence: str
-    numbers: tuple[int, ...]
-    sets: tuple[ParameterSet, ...]
-    whole: bool = False
-    frames: bool = False
+    numbers: tuple[int, ...]  # trial numbers
+    sets: tuple[ParameterSet, ...]  # the parameter sets of the trials
+    whole: bool = False  # run them from end to end, without restarts at the reference
+    frames: bool = False  # return the frames, which all trials on the sequence share, too
 
     def __str__(self) -> str:
         return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"

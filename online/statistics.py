@@ -14,7 +14,7 @@ from adaptune.trajectory import Trajectory, read_tum
 from online.stored_replays import StoredReplay
 
 Interval = tuple[float, float] | None
-"""Ends of a 95 % interval, where it can be told."""
+"""Ends of a 95 % interval, where it is known."""
 
 
 class Reference(NamedTuple):

@@ -29,17 +29,10 @@ Mechanism = Literal["live", "hand_over", "bank"]
 
 @dataclass(frozen=True)
 class Study(Generic[C_co]):
-    """A checked configuration and its folder.
-
-    Attributes
-    ----------
-    config : StudyConfig
-    folder : Path
-        Keeps trials, model, replays and comparison.
-    """
+    """A checked configuration and its folder."""
 
     config: C_co
-    folder: Path
+    folder: Path  # keeps trials, model, replays and comparison
 
     @property
     def name(self) -> str:

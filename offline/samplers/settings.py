@@ -74,15 +74,10 @@ class Span(_Settings):
 
 
 class GridSettings(_Settings):
-    """Settings of `grid`.
+    """Settings of `grid`."""
 
-    Attributes
-    ----------
-    grid : dict
-        For every number ``[first, step, count]`` or a `Span`; for categories the choices to try,
-        by default all.
-    """
-
+    # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
+    # default all.
     grid: dict[str, Span | tuple[Value, ...]]
 
 
