@@ -98,35 +98,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Summary:
-    """The part of a finished trial that stays in memory.
-
-    Attributes
-    ----------
-    parameters : dict
-    mean_error : float
-        See `Trial.mean_error`.
-    lost : int
-        How often the odometry lost track.
-    faults : int
-        How often its process ended or gave no pose.
-    ms : float
-        Milliseconds of the odometry for a scan.
-    others : dict
-        Other metrics by name.
-    repeats : sequence of dict
-        See `Trial`.
-    unhealthy : dict
-        See `Trial`.
-    """
+    """The part of a finished trial that stays in memory."""
 
     parameters: ParameterSet
-    mean_error: float
-    lost: int
-    faults: int
-    ms: float
-    others: dict[str, float] = field(default_factory=dict)
-    repeats: Sequence[dict[str, float]] = ()
-    unhealthy: dict[str, int] = field(default_factory=dict)
+    mean_error: float  # see `Trial.mean_error`
+    lost: int  # how often the odometry lost track
+    faults: int  # how often its process ended or gave no pose
+    ms: float  # milliseconds of the odometry for a scan
+    others: dict[str, float] = field(default_factory=dict)  # other metrics by name
+    repeats: Sequence[dict[str, float]] = ()  # see `Trial`
+    unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
 
     @property
     def metrics(self) -> dict[str, float]:

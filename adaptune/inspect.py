@@ -28,86 +28,44 @@ _KITTI_FOLDERS = ("velodyne", "velodyne_points")
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic, or the scans of a folder.
-
-    Attributes
-    ----------
-    name, type : str
-    count : int
-        Messages.
-    rate : float, optional
-        Messages per second of their stamps; for topics without stamps, of their recording.
-    first, last : int, optional
-        Nanoseconds of the first and the last stamp.
-    gap : float, optional
-        Longest time between one message and the next, in seconds.
-    oddities : tuple of str
-        What is wrong with the stamps.
-    """
+    """A topic, or the scans of a folder."""
 
     name: str
     type: str
-    count: int
+    count: int  # messages
+    # Messages per second of their stamps; for topics without stamps, of their recording.
     rate: float | None = None
+    # Nanoseconds of the first and the last stamp.
     first: int | None = None
     last: int | None = None
-    gap: float | None = None
-    oddities: tuple[str, ...] = ()
+    gap: float | None = None  # longest time between one message and the next, in seconds
+    oddities: tuple[str, ...] = ()  # what is wrong with the stamps
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSummary:
-    """The first scan.
-
-    Attributes
-    ----------
-    scan : Scan
-    recorded : int
-        Points in the message, those without a measurement included.
-    ranges : tuple of float
-        Least, median and greatest distance in metres.
-    span : float, optional
-        Seconds from the first point to the last.
-    rings : int, optional
-        How many rings there are.
-    """
+    """The first scan."""
 
     scan: Scan
-    recorded: int
-    ranges: tuple[float, float, float] | None
-    span: float | None
-    rings: int | None
+    recorded: int  # points in the message, those without a measurement included
+    ranges: tuple[float, float, float] | None  # least, median and greatest distance in metres
+    span: float | None  # seconds from the first point to the last
+    rings: int | None  # how many rings there are
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Content of a recording.
-
-    Attributes
-    ----------
-    path : Path
-    topics : tuple of Topic
-    layout : Layout
-        Of the first cloud.
-    scan : ScanSummary, optional
-        None where no scan could be read.
-    reference : Trajectory, optional
-    problems : tuple of str
-        What is odd or unreadable.
-    missing : dict
-        What each stage still needs, by stage; empty if it can run.
-    entry : str
-        YAML for the `sequences:` of a study.
-    """
+    """Content of a recording."""
 
     path: Path
     topics: tuple[Topic, ...]
-    layout: Layout
-    scan: ScanSummary | None
+    layout: Layout  # of the first cloud
+    scan: ScanSummary | None  # none where no scan could be read
     reference: Trajectory | None
-    problems: tuple[str, ...]
+    problems: tuple[str, ...]  # what is odd or unreadable
+    # What each stage still needs, by stage; empty if it can run.
     missing: dict[str, tuple[str, ...]]
-    entry: str
+    entry: str  # YAML for the `sequences:` of a study
 
 
 def inspect(path: Path) -> Inspection:

@@ -130,20 +130,11 @@ def sub_trajectory_vectors(
 
 
 class KittiError(NamedTuple):
-    """Mean errors over sub-trajectories of several lengths.
+    """Mean errors over sub-trajectories of several lengths."""
 
-    Attributes
-    ----------
-    translation : float
-        Percent; NaN when the path is shorter than every length.
-    rotation : float
-        Degrees a metre.
-    lengths : tuple of float
-        The lengths in metres for which there was at least one sub-trajectory.
-    """
-
-    translation: float
-    rotation: float
+    translation: float  # percent; NaN when the path is shorter than every length
+    rotation: float  # degrees a metre
+    # The lengths in metres for which there was at least one sub-trajectory.
     lengths: tuple[float, ...]
 
 

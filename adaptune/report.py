@@ -27,25 +27,13 @@ _FEW = 10
 
 
 class Track(NamedTuple):
-    """Errors and selections of one mode along a sequence.
+    """Errors and selections of one mode along a sequence."""
 
-    Attributes
-    ----------
-    seconds : ndarray of shape (n,)
-        Since the first scan.
-    errors : ndarray of shape (n,)
-        Sub-trajectory RTE in percent.
-    restarted : ndarray of shape (n,)
-    choice_seconds : ndarray of shape (m,)
-    choices : dict
-        For every parameter its values, of shape (m,).
-    """
-
-    seconds: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    restarted: NDArray[np.bool_]
-    choice_seconds: NDArray[np.float64]
-    choices: Mapping[str, Sequence[Any]]
+    seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
+    errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
+    restarted: NDArray[np.bool_]  # of shape (n,)
+    choice_seconds: NDArray[np.float64]  # of shape (m,)
+    choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
@@ -201,31 +189,17 @@ def draw_front(
 
 
 class LeftOutResults(NamedTuple):
-    """Results on the sequences that were left out of training.
+    """Results on the sequences that were left out of training."""
 
-    Attributes
-    ----------
-    ratios : dict
-        By mode, the ratio to the fixed set's error on each sequence.
-    sequences : sequence of str
-        Their names.
-    familiarity, gain : ndarray of shape (n,)
-        Of every frame; the gain is the ratio to the fixed set's error.
-    portfolio : ndarray
-        Ratio if the best of 1, 2, ... sets were known.
-    learning : sequence of dict
-        Rows of a learning curve, or none.
-    banks : sequence of dict
-        Rows of banks of several sizes, or none.
-    """
-
+    # By mode, the ratio to the fixed set's error on each sequence.
     ratios: Mapping[str, NDArray[np.float64]]
-    sequences: Sequence[str]
+    sequences: Sequence[str]  # their names
+    # Of every frame; the gain is the ratio to the fixed set's error, of shape (n,).
     familiarity: NDArray[np.float64]
     gain: NDArray[np.float64]
-    portfolio: NDArray[np.float64]
-    learning: Sequence[Mapping[str, Any]]
-    banks: Sequence[Mapping[str, Any]]
+    portfolio: NDArray[np.float64]  # ratio if the best of 1, 2, ... sets were known.
+    learning: Sequence[Mapping[str, Any]]  # rows of a learning curve, or none
+    banks: Sequence[Mapping[str, Any]]  # rows of banks of several sizes, or none
 
 
 def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:

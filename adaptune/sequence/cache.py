@@ -275,25 +275,12 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """A decoded sequence on disk.
+    """A decoded sequence on disk."""
 
-    Attributes
-    ----------
-    name : str
-        The recording.
-    path : Path
-        Folder of the entry.
-    size : int
-        Bytes.
-    used : float
-        When it was last opened, in seconds since 1970.
-    n_scans : int
-    """
-
-    name: str
-    path: Path
-    size: int
-    used: float
+    name: str  # the recording
+    path: Path  # folder of the entry
+    size: int  # bytes
+    used: float  # when it was last opened, in seconds since 1970
     n_scans: int
 
 

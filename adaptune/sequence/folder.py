@@ -28,29 +28,15 @@ _ELEVATION = 0.205
 
 @dataclass(frozen=True, eq=False)
 class FileSource:
-    """Scans in files of their own.
+    """Scans in files of their own."""
 
-    Attributes
-    ----------
-    name : str
-        The folder.
-    files : sequence of Path
-    stamps : ndarray of shape (n,)
-        Nanoseconds of each file.
-    timing : Timing
-        What the stamps mean.
-    own_poses : callable, optional
-        Reads the LiDAR's poses stored with the files.
-    elevation : float
-        Degrees by which every ray is to be turned up.
-    """
-
-    name: str
+    name: str  # the folder
     files: Sequence[Path]
-    stamps: NDArray[np.int64]
-    timing: Timing = AUTO
+    stamps: NDArray[np.int64]  # nanoseconds of each file, of shape (n,)
+    timing: Timing = AUTO  # what the stamps mean
+    # Reads the LiDAR's poses stored with the files.
     own_poses: Callable[[], Trajectory] | None = None
-    elevation: float = 0.0
+    elevation: float = 0.0  # degrees by which every ray is to be turned up
 
     random_access: ClassVar[bool] = True
 

@@ -15,24 +15,12 @@ _CORRELATION = 0.8
 
 
 class ImuNoise(NamedTuple):
-    """White noise of an IMU and the random walk of its biases; the defaults are a fair MEMS IMU's.
+    """White noise of an IMU and the random walk of its biases; the defaults are a fair MEMS IMU's."""
 
-    Attributes
-    ----------
-    gyroscope : float
-        rad/s for a root hertz.
-    accelerometer : float
-        m/s^2 for a root hertz.
-    gyroscope_walk : float
-        rad/s^2 for a root hertz.
-    accelerometer_walk : float
-        m/s^3 for a root hertz.
-    """
-
-    gyroscope: float = 2e-4
-    accelerometer: float = 2e-3
-    gyroscope_walk: float = 2e-5
-    accelerometer_walk: float = 2e-4
+    gyroscope: float = 2e-4  # rad/s for a root hertz
+    accelerometer: float = 2e-3  # m/s^2 for a root hertz
+    gyroscope_walk: float = 2e-5  # rad/s^2 for a root hertz
+    accelerometer_walk: float = 2e-4  # m/s^3 for a root hertz
 
 
 USUAL = ImuNoise()

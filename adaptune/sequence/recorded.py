@@ -31,47 +31,23 @@ _FASTEST = 100.0
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSettings:
-    """Where reference poses come from and how they become those of the LiDAR.
+    """Where reference poses come from and how they become those of the LiDAR."""
 
-    Attributes
-    ----------
-    source : str or Path, optional
-        A topic or a file; the recording's own poses if left out.
-    child_frame : str, optional
-        On a topic of transforms, the frame whose poses to take.
-    T_reference_sensor : ndarray of shape (4, 4), optional
-        The LiDAR's pose in the frame that the poses are of.
-    clock_offset : float
-        Seconds to add to the poses' stamps.
-    max_gap : float
-        Seconds. Between poses further apart the reference is unknown.
-    """
-
-    source: str | Path | None = None
-    child_frame: str | None = None
+    source: str | Path | None = None  # a topic or a file; the recording's own poses if left out
+    child_frame: str | None = None  # on a topic of transforms, the frame whose poses to take
+    # The LiDAR's pose in the frame that the poses are of, of shape (4, 4).
     T_reference_sensor: Poses | None = None
-    clock_offset: float = 0.0
-    max_gap: float = 1.0
+    clock_offset: float = 0.0  # seconds to add to the poses' stamps
+    max_gap: float = 1.0  # seconds. Between poses further apart the reference is unknown.
 
 
 @dataclass(frozen=True, eq=False)
 class ImuSettings:
-    """Which IMU, and how its measurements become SI units.
+    """Which IMU, and how its measurements become SI units."""
 
-    Attributes
-    ----------
-    topic : str, optional
-        The only one when left out.
-    T_sensor_imu : ndarray of shape (4, 4), optional
-        The IMU's pose in the LiDAR's frame.
-    scale : float
-        Metres per second squared in a unit of its accelerometer.
-    noise : ImuNoise
-    """
-
-    topic: str | None = None
-    T_sensor_imu: Poses | None = None
-    scale: float = 1.0
+    topic: str | None = None  # the only one when left out
+    T_sensor_imu: Poses | None = None  # the IMU's pose in the LiDAR's frame, of shape (4, 4)
+    scale: float = 1.0  # metres per second squared in a unit of its accelerometer
     noise: ImuNoise = USUAL
 
 

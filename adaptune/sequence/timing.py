@@ -26,22 +26,15 @@ class TimingError(AdaptuneError):
 
 @dataclass(frozen=True)
 class Timing:
-    """Meaning of the time stamps of a recording.
+    """Meaning of the time stamps of a recording."""
 
-    Attributes
-    ----------
-    stamp : {"auto", "start", "end"}
-        Moment of the scan that the header's stamp marks. `auto` follows the points: they come
-        before the stamp or after it. Scans whose points have no time are stamped at their start.
-    unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
-        nanoseconds; the size of absolute times reveals their unit.
-    period : float
-        Seconds a scan takes; only for scans stamped at their end whose points have no time.
-    """
-
+    # Moment of the scan that the header's stamp marks. `auto` follows the points: they come before
+    # the stamp or after it. Scans whose points have no time are stamped at their start.
     stamp: Literal["auto", "start", "end"] = "auto"
+    # Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
+    # nanoseconds; the size of absolute times reveals their unit.
     unit: Unit | None = None
+    # Seconds a scan takes; only for scans stamped at their end whose points have no time.
     period: float = 0.1
 
     def resolve(

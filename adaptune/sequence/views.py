@@ -38,20 +38,12 @@ class Reversible(Sequence, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A sequence of which every scan is changed or left out by itself.
+    """A sequence of which every scan is changed or left out by itself."""
 
-    Attributes
-    ----------
-    inner : Reversible
-        What it is a view of.
-    change : callable
-        Gives the scan as seen, or None to leave it out.
-    of_reference, of_imu, of_clock : callable
-        What the view does to poses, to measurements and to the time of arrival.
-    """
-
-    inner: Reversible
+    inner: Reversible  # what it is a view of
+    # Gives the scan as seen, or None to leave it out.
     change: Callable[[Scan], Scan | None] = lambda scan: scan
+    # What the view does to poses, to measurements and to the time of arrival.
     of_reference: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
     of_imu: Callable[[Imu], Imu] = lambda imu: imu
     of_clock: Callable[[NDArray[np.int64]], NDArray[np.int64]] = lambda stamps: stamps

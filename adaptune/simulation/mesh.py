@@ -38,21 +38,11 @@ REFLECTIVITY = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in space.
+    """Triangles in space."""
 
-    Attributes
-    ----------
-    vertices : ndarray of shape (n, 3)
-        float64 metres.
-    triangles : ndarray of shape (m, 3)
-        uint32 indices of vertices.
-    materials : ndarray of shape (m,)
-        uint8 codes of `Material`.
-    """
-
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.uint32]
-    materials: NDArray[np.uint8]
+    vertices: NDArray[np.float64]  # float64 metres, of shape (n, 3)
+    triangles: NDArray[np.uint32]  # uint32 indices of vertices, of shape (m, 3)
+    materials: NDArray[np.uint8]  # uint8 codes of `Material`, of shape (m,)
 
 
 def mesh(vertices: ArrayLike, triangles: ArrayLike, material: ArrayLike) -> Mesh:

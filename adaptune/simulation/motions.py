@@ -7,39 +7,18 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Motion:
-    """A way of carrying a sensor.
+    """A way of carrying a sensor."""
 
-    Attributes
-    ----------
-    speed : float
-        Usual speed in m/s.
-    acceleration : float
-        Greatest acceleration and braking in m/s^2.
-    turning : float
-        Greatest lateral acceleration in m/s^2: it goes slower through bends.
-    height : float
-        Metres of the sensor above the ground.
-    base : tuple of float
-        Length and width in metres over which the ground carries it.
-    weave : float
-        Metres by which it strays from the road's middle, about.
-    shift : tuple of float
-        Standard deviation along x, y and z of the mount's shake on a paved road, in metres.
-    turn : tuple of float
-        Standard deviation about x, y and z of the same, in radians.
-    band : tuple of float
-        Least and greatest frequency of the shake in Hz.
-    """
-
-    speed: float
-    acceleration: float
-    turning: float
-    height: float
-    base: tuple[float, float]
-    weave: float
+    speed: float  # usual speed in m/s
+    acceleration: float  # greatest acceleration and braking in m/s^2
+    turning: float  # greatest lateral acceleration in m/s^2: it goes slower through bends
+    height: float  # metres of the sensor above the ground
+    base: tuple[float, float]  # length and width in metres over which the ground carries it
+    weave: float  # metres by which it strays from the road's middle, about
+    # Standard deviation along x, y and z of the mount's shake on a paved road, in metres.
     shift: tuple[float, float, float]
-    turn: tuple[float, float, float]
-    band: tuple[float, float]
+    turn: tuple[float, float, float]  # standard deviation about x, y and z of the same, in radians
+    band: tuple[float, float]  # least and greatest frequency of the shake in Hz
 
     @property
     def least_rate(self) -> float:

@@ -11,22 +11,12 @@ F64 = NDArray[np.float64]
 
 
 class Cast(NamedTuple):
-    """Rays, and what they hit.
+    """Rays, and what they hit."""
 
-    Attributes
-    ----------
-    rays : ndarray of shape (n, 6)
-        Origins and directions.
-    hits : ndarray of shape (n,)
-        Metres to what each ray hit, infinite where nothing.
-    normals : ndarray of shape (n, 3)
-    reflectivity : ndarray of shape (n,)
-    """
-
-    rays: F32
-    hits: F32
-    normals: F32
-    reflectivity: F32
+    rays: F32  # origins and directions, of shape (n, 6)
+    hits: F32  # metres to what each ray hit, infinite where nothing, of shape (n,)
+    normals: F32  # of shape (n, 3)
+    reflectivity: F32  # of shape (n,)
 
 
 class Receiver(NamedTuple):

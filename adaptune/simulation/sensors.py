@@ -12,34 +12,19 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A LiDAR.
+    """A LiDAR."""
 
-    Attributes
-    ----------
-    elevations : ndarray of shape (n_rings,)
-        Radians above the sensor's horizon, by the ring number its driver gives: upwards on
-        Velodynes, downwards on Ousters. On a Livox, the offset of each of its lines.
-    columns : int
-        Firings in a turn; all rings fire at once.
-    rate : float
-        Turns in a second.
-    range : tuple of float
-        Least and greatest range in metres. The greatest holds for a target that reflects a tenth
-        of the light or more and is met squarely.
-    noise : float
-        Standard deviation of a range in metres.
-    dropout : float
-        Share of echoes lost for no reason.
-    pattern : {"spin", "rosette"}
-        Whether it turns about its vertical axis, or draws a rosette ahead which never repeats.
-    """
-
+    # Radians above the sensor's horizon, by the ring number its driver gives: upwards on Velodynes,
+    # downwards on Ousters. On a Livox, the offset of each of its lines, of shape (n_rings,).
     elevations: NDArray[np.float64]
-    columns: int
-    rate: float
+    columns: int  # firings in a turn; all rings fire at once
+    rate: float  # turns in a second
+    # Least and greatest range in metres. The greatest holds for a target that reflects a tenth of
+    # the light or more and is met squarely.
     range: tuple[float, float]
-    noise: float
-    dropout: float
+    noise: float  # standard deviation of a range in metres
+    dropout: float  # share of echoes lost for no reason
+    # Whether it turns about its vertical axis, or draws a rosette ahead which never repeats.
     pattern: Literal["spin", "rosette"] = "spin"
 
     @property
