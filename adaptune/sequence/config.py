@@ -56,6 +56,11 @@ def _resolve_file(reference: str, info: ValidationInfo) -> str:
 _Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
+def _check_transform(given: Any) -> Any:
+    to_pose(given)
+    return given
+
+
 def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
     """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
     values = np.array(given, np.float64) if len({np.size(row) for row in given}) == 1 else None
@@ -78,9 +83,7 @@ def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
     return T
 
 
-Transform = Annotated[
-    _Numbers | tuple[_Numbers, ...], AfterValidator(lambda given: (to_pose(given), given)[1])
-]
+Transform = Annotated[_Numbers | tuple[_Numbers, ...], AfterValidator(_check_transform)]
 """A pose as seven numbers, or as the rows of a matrix."""
 
 
@@ -136,10 +139,8 @@ class ViewConfig(_Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if len(self._given()) != 1:
-            raise ValueError(
-                f"each view is an entry of its own, `- name: ...` with one of "
-                f"{', '.join(type(self).model_fields)}"
-            )
+            names = ", ".join(type(self).model_fields)
+            raise ValueError(f"each view is an entry of its own, `- name: ...` with one of {names}")
         if self.cut and (bad := [part for part in self.cut if not 0 <= part[0] < part[1]]):
             raise ValueError(f"a part goes from a start to a later stop, not {list(bad[0])}")
         return self
@@ -192,9 +193,11 @@ class SequenceConfig(_Part):
     stride: int = Field(1, ge=1)  # use every stride-th scan
     # Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
-    child_frame: str | None = None  # where `reference` is a topic of transforms, whose poses to take
+    child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
-    clock_offset: float = Field(0.0, allow_inf_nan=False)  # seconds to add to the reference's stamps
+    clock_offset: float = Field(
+        0.0, allow_inf_nan=False
+    )  # seconds to add to the reference's stamps
     # Seconds. The reference is unknown between poses further apart.
     max_gap: float = Field(1.0, gt=0, allow_inf_nan=False)
     imu: ImuConfig | None = None
@@ -210,9 +213,8 @@ class SequenceConfig(_Part):
     def _check_source(self) -> Self:
         given = [name for name in _SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(
-                f"give one of {', '.join(_SOURCES)}, not {' and '.join(given) or 'none'}"
-            )
+            found = " and ".join(given) or "none"
+            raise ValueError(f"give one of {', '.join(_SOURCES)}, not {found}")
         if self.points is not None and given[0] != "bag":
             raise ValueError(f"`points` names a topic of a bag; {given[0]} has none")
         if self.elevation is not None and given[0] != "kitti":
@@ -222,13 +224,7 @@ class SequenceConfig(_Part):
         return self
 
     def paths(self) -> list[Path]:
-        """Files and folders that it is read from.
-
-        Raises
-        ------
-        SequenceError
-            If there is no such bag.
-        """
+        """Files and folders that it is read from; a SequenceError if there is no such bag."""
         paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
         paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
         if self.reference is not None and self.reference.endswith(REFERENCE_FILES):
