@@ -14,7 +14,7 @@ from adaptune.sequence.serialized import Serialized
 from adaptune.sequence.timing import AUTO, TIME_FIELDS, Timing, TimingError
 
 # The numbers of sensor_msgs/PointField's datatypes.
-_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
 INTENSITY_FIELDS = ("intensity", "reflectivity")
@@ -75,11 +75,11 @@ def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) 
         raise PointCloudError(f"a point of {point_step} bytes is none")
     names, formats, offsets = [], [], []
     for name, offset, datatype, count in fields:
-        if datatype not in _DATATYPES:
+        if datatype not in DATATYPES:
             raise PointCloudError(f"field {name!r} has unknown datatype {datatype}")
         if name in names:
             raise PointCloudError(f"field {name!r} appears twice")
-        single = np.dtype((">" if is_bigendian else "<") + _DATATYPES[datatype])
+        single = np.dtype((">" if is_bigendian else "<") + DATATYPES[datatype])
         # Some drivers leave the count at zero.
         if offset + single.itemsize * max(count, 1) > point_step:
             raise PointCloudError(f"field {name!r} ends beyond the point's {point_step} bytes")
