@@ -82,10 +82,8 @@ class Course(BaseModel):
     def _rate_follows_motion(self) -> Self:
         least, rate = MOTIONS[self.motion].least_rate, self.turns
         if rate < least:
-            raise ValueError(
-                f"a {self.motion} moves too fast for {rate:g} scans a second: it needs at least "
-                f"{least:g}"
-            )
+            what = f"a {self.motion} moves too fast for {rate:g} scans a second"
+            raise ValueError(f"{what}: it needs at least {least:g}")
         if sum(length for _, length in self.legs) > LONGEST:
             raise ValueError(f"a course is at most {LONGEST:g} m long")
         return self

@@ -28,38 +28,18 @@ class Motion:
 
 MOTIONS: Mapping[str, Motion] = MappingProxyType(
     {
+        # Speed, acceleration, turning, height, base and weave; shift, turn and band of the shake.
         "robot": Motion(
-            speed=3.0,
-            acceleration=0.8,
-            turning=1.0,
-            height=0.9,
-            base=(0.8, 0.6),
-            weave=0.15,
-            shift=(0.002, 0.003, 0.004),
-            turn=(0.0015, 0.0015, 0.001),
-            band=(0.5, 3.5),
+            *(3.0, 0.8, 1.0, 0.9, (0.8, 0.6), 0.15),
+            *((0.002, 0.003, 0.004), (0.0015, 0.0015, 0.001), (0.5, 3.5)),
         ),
         "car": Motion(
-            speed=10.0,
-            acceleration=2.0,
-            turning=2.5,
-            height=1.75,
-            base=(2.7, 1.6),
-            weave=0.15,
-            shift=(0.003, 0.006, 0.010),
-            turn=(0.0015, 0.0020, 0.0007),
-            band=(0.6, 2.5),
+            *(10.0, 2.0, 2.5, 1.75, (2.7, 1.6), 0.15),
+            *((0.003, 0.006, 0.010), (0.0015, 0.0020, 0.0007), (0.6, 2.5)),
         ),
         "handheld": Motion(
-            speed=1.3,
-            acceleration=0.6,
-            turning=0.8,
-            height=1.5,
-            base=(0.4, 0.4),
-            weave=0.3,
-            shift=(0.012, 0.020, 0.022),
-            turn=(0.012, 0.012, 0.015),
-            band=(0.4, 2.5),
+            *(1.3, 0.6, 0.8, 1.5, (0.4, 0.4), 0.3),
+            *((0.012, 0.020, 0.022), (0.012, 0.012, 0.015), (0.4, 2.5)),
         ),
     }
 )

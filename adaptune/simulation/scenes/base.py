@@ -70,14 +70,8 @@ class Tile:
     ) -> tuple[Floats, Floats]:
         """Stations and offsets of objects strewn on both sides of the road.
 
-        Parameters
-        ----------
-        density
-            How many there are on a square metre, on average.
-        near, far
-            Least and greatest distance from the road's middle in metres.
-        margin
-            Metres kept free at the ends where another scene begins.
+        `density` is their mean number on a square metre, `near` and `far` bound their distance from
+        the road's middle, and `margin` is kept free at the ends where another scene begins.
         """
         start = self.start + margin * self.opens
         stop = self.stop - margin * self.closes
