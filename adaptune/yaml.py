@@ -55,22 +55,9 @@ _Loader.add_constructor(_PREFIX + "int", _int)
 
 
 class Document:
-    """A YAML text as plain data, and the line of each part.
+    """A YAML text as plain data (`data`), and where in the text each part of it stands.
 
-    Parameters
-    ----------
-    text
-        One YAML document.
-
-    Attributes
-    ----------
-    data
-        Mappings, lists and scalars.
-
-    Raises
-    ------
-    YamlError
-        It names the line.
+    A YamlError names the line that is wrong.
     """
 
     def __init__(self, text: str):
@@ -88,24 +75,18 @@ class Document:
             raise YamlError(f"{type(error).__name__}: {error}") from error
 
     def line(self, path: Sequence[str | int]) -> int | None:
-        """Line of the deepest part of `path` that is there; None for an empty document."""
-        node = self._node
-        line = None
+        """Line of the deepest part of `path` that is there; none for an empty document."""
+        node, line = self._node, None
         for part in path:
+            found: list[tuple[Any, Any]] = []
             if isinstance(node, yaml.MappingNode):
-                for key, value in node.value:
-                    if key.value == str(part):
-                        line, node = key.start_mark.line + 1, value
-                        break
-                else:
-                    return line
+                found = [entry for entry in node.value if entry[0].value == str(part)]
             elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
-                if part >= len(node.value):
-                    return line
-                node = node.value[part]
-                line = node.start_mark.line + 1
-            else:
-                return line
+                found = [(value, value) for value in node.value[part : part + 1]]
+            if not found:
+                break
+            begin, node = found[0]
+            line = begin.start_mark.line + 1
         return line
 
 
