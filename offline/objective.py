@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from adaptune.archive import Frames, Summary
 from adaptune.errors import AdaptuneError
@@ -152,6 +151,9 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
     repeats
         Values of every run, of shape (n_sequences, ..., n_repeats).
     """
+    # Workers import this module too; scipy.stats takes half a second.
+    from scipy import stats
+
     n_sequences, n_repeats = len(repeats), repeats.shape[-1]
     variance = repeats.var(axis=-1, ddof=1).sum(axis=0)
     error = np.sqrt(variance / n_repeats) / n_sequences

@@ -209,7 +209,7 @@ class Workers:
         # A process forked from one with threads may deadlock. A small server that has imported
         # what workers need forks them in milliseconds.
         self._context = mp.get_context("forkserver")
-        self._context.set_forkserver_preload(["offline.trial"])
+        self._context.set_forkserver_preload(["offline.preload"])
         self._workers: dict[int, _Worker] = {}
         self._busy: set[int] = set()
 
