@@ -98,35 +98,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Summary:
-    """The part of a finished trial that stays in memory.
-
-    Attributes
-    ----------
-    parameters : dict
-    mean_error : float
-        See `Trial.mean_error`.
-    lost : int
-        How often the odometry lost track.
-    faults : int
-        How often its process ended or gave no pose.
-    ms : float
-        Milliseconds of the odometry for a scan.
-    others : dict
-        Other metrics by name.
-    repeats : sequence of dict
-        See `Trial`.
-    unhealthy : dict
-        See `Trial`.
-    """
+    """The part of a finished trial that stays in memory."""
 
     parameters: ParameterSet
-    mean_error: float
-    lost: int
-    faults: int
-    ms: float
-    others: dict[str, float] = field(default_factory=dict)
-    repeats: Sequence[dict[str, float]] = ()
-    unhealthy: dict[str, int] = field(default_factory=dict)
+    mean_error: float  # see `Trial.mean_error`
+    lost: int  # how often the odometry lost track
+    faults: int  # how often its process ended or gave no pose
+    ms: float  # milliseconds of the odometry for a scan
+    others: dict[str, float] = field(default_factory=dict)  # other metrics by name
+    repeats: Sequence[dict[str, float]] = ()  # see `Trial`
+    unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -174,20 +155,18 @@ class _Entry(NamedTuple):
 
 
 INDEX = "index.jsonl"
+_PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy")
+"""Parts of a trial that are stored as JSON, as its parameters are."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
 
 class Archive:
     """The trials of a study, a file for each trial and sequence.
 
-    The files are the truth. The index of their summaries, ``index.jsonl``, only avoids opening
-    all of them. A line does not count if its file has changed or is gone. Trials without a line
-    are read from their files.
-
-    Parameters
-    ----------
-    folder
-        Where they are kept: ``<sequence>/frames.npz`` and ``<sequence>/<number>.npz``.
+    Its folder holds ``<sequence>/frames.npz`` and ``<sequence>/<number>.npz``. The files are the
+    truth. The index of their summaries, ``index.jsonl``, only avoids opening all of them. A line
+    does not count if its file has changed or is gone. Trials without a line are read from their
+    files. All methods raise an ArchiveError where a file that they need is missing or damaged.
     """
 
     def __init__(self, folder: Path):
@@ -199,13 +178,7 @@ class Archive:
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
     def tidy(self) -> None:
-        """Remove unfinished files and repair the index. No process may be writing.
-
-        Raises
-        ------
-        ArchiveError
-            If a trial that the index lacks is damaged.
-        """
+        """Remove unfinished files and repair the index. No process may be writing."""
         for unfinished in (*self.folder.glob("*/.*.npz"), *self.folder.glob(".index.*")):
             unfinished.unlink()
         index = "".join(entry.dump() for entry in self._entries())
@@ -216,11 +189,6 @@ class Archive:
         """The finished trials on a sequence by number, without the whole runs.
 
         It grows as trials are written.
-
-        Raises
-        ------
-        ArchiveError
-            If a trial that the index lacks is damaged.
         """
         if self._finished is None:
             self._finished = {}
@@ -235,9 +203,8 @@ class Archive:
         }
         for path in sorted(self.folder.glob("*/")):
             with os.scandir(path) as files:
-                trials = sorted(
-                    (int(f.name[:-4]), f.stat()) for f in files if _TRIAL.fullmatch(f.name)
-                )
+                found = [file for file in files if _TRIAL.fullmatch(file.name)]
+            trials = sorted((int(file.name[:-4]), file.stat()) for file in found)
             for number, status in trials:
                 key = (path.name, number, status.st_size, status.st_mtime_ns)
                 yield indexed.get(key) or _Entry(*key, summarise(self.read(path.name, number)))
@@ -269,12 +236,7 @@ class Archive:
             )
 
     def read_frames(self, sequence: str) -> Frames:
-        """Read the data that all trials on a sequence share.
-
-        Raises
-        ------
-        ArchiveError
-        """
+        """Read the data that all trials on a sequence share."""
         path = self.folder / sequence / "frames.npz"
         data = _read(path)
         try:
@@ -282,17 +244,18 @@ class Archive:
                 data["stamps"],
                 data["T_ref_sensor"],
                 data["descriptors"].astype(np.float32),
-                dict(json.loads(data["blocks"].tobytes())),
+                dict(_unpacked(data["blocks"])),
                 data["elevations"],
             )
         except KeyError as error:
             raise ArchiveError(f"{path}: lacks {error}; run `adaptune offline`") from error
         except (ValueError, TypeError) as error:
-            raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error
+            raise _damaged(path, error) from error
 
     def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
         """Write a trial."""
         path = self.trial_path(sequence, number, whole)
+        plain: dict[str, Any] = {name: _packed(getattr(trial, name)) for name in _PLAIN}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
@@ -302,11 +265,7 @@ class Archive:
                 restarted=trial.restarted,
                 registered=trial.registered,
                 seconds=trial.seconds.astype(np.float32),
-                faults=_packed(trial.faults),
-                metrics=_packed(trial.metrics),
-                usage=_packed(trial.usage),
-                repeats=_packed(trial.repeats),
-                unhealthy=_packed(trial.unhealthy),
+                **plain,
             )
         if whole:
             return
@@ -319,31 +278,25 @@ class Archive:
             self._finished.setdefault(sequence, {})[number] = summary
 
     def read(self, sequence: str, number: int, whole: bool = False) -> Trial:
-        """Read a trial.
-
-        Raises
-        ------
-        ArchiveError
-        """
+        """Read a trial."""
         path = self.trial_path(sequence, number, whole)
         data = _read(path)
+        # Older files have none.
+        data.setdefault("unhealthy", _packed({}))
         try:
+            plain = {name: _unpacked(data[name]) for name in _PLAIN}
+            plain |= {name: tuple(plain[name]) for name in ("faults", "repeats")}
             return Trial(
-                json.loads(data["parameters"].tobytes()),
+                _unpacked(data["parameters"]),
                 data["T_odom_sensor"],
                 data["errors"].astype(np.float64),
                 data["restarted"],
                 data["registered"],
                 data["seconds"].astype(np.float64),
-                tuple(json.loads(data["faults"].tobytes())),
-                json.loads(data["metrics"].tobytes()),
-                json.loads(data["usage"].tobytes()),
-                tuple(json.loads(data["repeats"].tobytes())),
-                # Older files have none.
-                json.loads(data["unhealthy"].tobytes()) if "unhealthy" in data else {},
+                **plain,
             )
         except (KeyError, ValueError) as error:
-            raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error
+            raise _damaged(path, error) from error
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials).
@@ -363,10 +316,8 @@ class Archive:
             if read is None:
                 read = np.full((len(errors), len(numbers)), np.nan, np.float32)
             if len(errors) != len(read):
-                raise ArchiveError(
-                    f"{self.folder / sequence}: trials are of recordings of different lengths; "
-                    f"remove the folder and run again"
-                )
+                what = "trials are of recordings of different lengths; remove the folder"
+                raise ArchiveError(f"{self.folder / sequence}: {what} and run again")
             read[:, i] = errors
         return np.empty((0, 0), np.float32) if read is None else read
 
@@ -383,6 +334,14 @@ def _packed(value: Any) -> NDArray[np.uint8]:
     return np.frombuffer(json.dumps(value).encode(), np.uint8)
 
 
+def _unpacked(array: NDArray[np.uint8]) -> Any:
+    return json.loads(array.tobytes())
+
+
+def _damaged(path: Path, error: Exception) -> ArchiveError:
+    return ArchiveError(f"{path}: is damaged ({error}); remove it and run again")
+
+
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
     """Arrays of a file: those named, or all."""
     try:
@@ -391,4 +350,4 @@ def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[A
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: there is no such file; run `adaptune offline`") from error
     except DAMAGED_NPZ as error:
-        raise ArchiveError(f"{path}: is damaged ({error}); remove it and run again") from error
+        raise _damaged(path, error) from error

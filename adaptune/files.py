@@ -12,13 +12,8 @@ from pathlib import Path
 from adaptune.errors import AdaptuneError
 
 DAMAGED_NPZ = (
-    OSError,
-    ValueError,
-    TypeError,
-    EOFError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
+    *(OSError, ValueError, TypeError, EOFError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error),
 )
 """What numpy and zipfile raise on damaged ``.npz`` files."""
 
@@ -29,48 +24,27 @@ class FullError(AdaptuneError, OSError):
 
 @contextmanager
 def needing_room(path: Path) -> Iterator[None]:
-    """Name the file for which there is no room.
-
-    Raises
-    ------
-    FullError
-        If the disk or a quota is full in the block, or the file is too large.
-    """
+    """Raise a FullError that names the file for which there is no room in the block."""
     try:
         yield
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
-        raise FullError(
-            f"{path}: cannot be written ({error.strerror}); make room, and run the same command "
-            f"again"
-        ) from error
+        help_ = "make room, and run the same command again"
+        raise FullError(f"{path}: cannot be written ({error.strerror}); {help_}") from error
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Write a temporary file and rename it into place when the block ends well.
 
-    Parameters
-    ----------
-    path
-        Where the file belongs. Its folder is made if it does not exist.
-
-    Yields
-    ------
-    Path
-        An unused name in the same folder with the same suffix. The file there replaces `path` in
-        one step when the block ends. It is removed if the block raises.
-
-    Raises
-    ------
-    FullError
-        If there is no room for it.
+    The block receives an unused name in the same folder, which is made if needed, with the same
+    suffix. The file there replaces `path` in one step. It is removed if the block raises. See
+    `needing_room`.
     """
     with needing_room(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        stem, suffix = f".{path.stem}.", path.suffix
-        handle, name = tempfile.mkstemp(prefix=stem, suffix=suffix, dir=path.parent)
+        handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}.", path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -87,17 +61,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Fill a temporary folder and rename it into place when the block ends well.
+    """Rename a folder into place, also over an existing one, when the block ends well.
 
-    Parameters
-    ----------
-    path
-        Where the folder belongs. An existing one is replaced.
-
-    Yields
-    ------
-    Path
-        An unused name. The block makes a folder of this name.
+    The block receives an unused name and makes a folder of this name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:

@@ -10,18 +10,7 @@ Poses = NDArray[np.float64]
 
 
 def invert(T_target_source: Poses) -> Poses:
-    """Invert rigid transforms.
-
-    Parameters
-    ----------
-    T_target_source
-        Transforms of shape (..., 4, 4).
-
-    Returns
-    -------
-    ndarray of shape (..., 4, 4)
-        ``T_source_target``.
-    """
+    """Invert rigid transforms: ``T_source_target``, of shape (..., 4, 4)."""
     R_source_target = np.swapaxes(T_target_source[..., :3, :3], -1, -2)
     T_source_target = np.zeros_like(T_target_source)
     T_source_target[..., :3, :3] = R_source_target
@@ -35,15 +24,6 @@ def rectify(T_target_source: Poses) -> Poses:
 
     Chained motions amplify them. Where each pose is predicted from the two before it, they more
     than double with every scan.
-
-    Parameters
-    ----------
-    T_target_source
-        Transforms of shape (..., 4, 4), rigid but for rounding errors.
-
-    Returns
-    -------
-    ndarray of shape (..., 4, 4)
     """
     T = T_target_source.copy()
     R = T[..., :3, :3]
@@ -65,59 +45,28 @@ def count_within(points: NDArray[Any], low: float, high: float) -> int:
 
 
 def steps(T_world_sensor: Poses) -> Poses:
-    """Motions between consecutive poses.
-
-    Parameters
-    ----------
-    T_world_sensor
-        Poses of shape (n, 4, 4).
-
-    Returns
-    -------
-    ndarray of shape (n - 1, 4, 4)
-        ``T_previous_current`` of every pose but the first.
-    """
+    """Motions ``T_previous_current``, of shape (n - 1, 4, 4), of every pose but the first."""
     return invert(T_world_sensor[:-1]) @ T_world_sensor[1:]
 
 
 def scale(T_previous_current: Poses, share: float) -> Poses:
-    """Scale a motion in time, at the same velocities.
+    """Scale a motion, of shape (4, 4), to a share of its time, at the same velocities.
 
-    Parameters
-    ----------
-    T_previous_current
-        The motion, of shape (4, 4).
-    share
-        Share of its time.
-
-    Returns
-    -------
-    ndarray of shape (4, 4)
-        The exponential of `share` times its logarithm.
+    The result is the exponential of `share` times the motion's logarithm.
     """
     if share == 1.0:
         return T_previous_current
     from scipy.spatial.transform import RigidTransform
 
     screw = RigidTransform.from_matrix(T_previous_current).as_exp_coords()
-    T: Poses = RigidTransform.from_exp_coords(share * screw).as_matrix()
-    return T
+    return np.asarray(RigidTransform.from_exp_coords(share * screw).as_matrix())
 
 
 def mean_motion(T_previous_current: Poses, weights: NDArray[np.float64]) -> Poses:
-    """Weighted mean of motions that are nearly the same.
+    """Weighted mean of motions that are nearly the same: of translations and rotation vectors.
 
-    Parameters
-    ----------
-    T_previous_current
-        Motions of shape (..., n, 4, 4), turning by much less than half a turn.
-    weights
-        Of shape (..., n), not all of them zero.
-
-    Returns
-    -------
-    ndarray of shape (..., 4, 4)
-        Translations and rotation vectors are averaged.
+    Motions of shape (..., n, 4, 4) turn by much less than half a turn. Weights of shape (..., n)
+    are not all zero. The mean is of shape (..., 4, 4).
     """
     from scipy.spatial.transform import Rotation
 
@@ -147,18 +96,9 @@ def rotation_angle(T_target_source: Poses) -> Any:
 
 
 def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
-    """Poses from translations and unit quaternions.
+    """Poses of shape (n, 4, 4) from translations (n, 3) and quaternions x, y, z, w (n, 4).
 
-    Parameters
-    ----------
-    translations
-        Metres, of shape (n, 3).
-    quaternions
-        In the order x, y, z, w, of shape (n, 4); normalised here.
-
-    Returns
-    -------
-    ndarray of shape (n, 4, 4)
+    Quaternions are normalised.
     """
     translations = np.asarray(translations, np.float64).reshape(-1, 3)
     T = np.tile(np.eye(4), (len(translations), 1, 1))
@@ -176,10 +116,7 @@ def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
         return np.empty((0, 4))
     from scipy.spatial.transform import Rotation
 
-    quaternions: NDArray[np.float64] = Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(
-        canonical=True
-    )
-    return quaternions
+    return np.asarray(Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(canonical=True))
 
 
 def interpolate(

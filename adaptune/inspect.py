@@ -15,6 +15,7 @@ from adaptune.sequence import Scan, SequenceConfig, SequenceError
 from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, BagSource
 from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.opening import open_sequence
+from adaptune.sequence.pointcloud2 import DATATYPES
 from adaptune.sequence.pose_messages import POSES
 from adaptune.sequence.recorded import RecordedSequence
 from adaptune.sequence.serialized import header_stamp
@@ -28,109 +29,59 @@ _KITTI_FOLDERS = ("velodyne", "velodyne_points")
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic, or the scans of a folder.
-
-    Attributes
-    ----------
-    name, type : str
-    count : int
-        Messages.
-    rate : float, optional
-        Messages per second of their stamps; for topics without stamps, of their recording.
-    first, last : int, optional
-        Nanoseconds of the first and the last stamp.
-    gap : float, optional
-        Longest time between one message and the next, in seconds.
-    oddities : tuple of str
-        What is wrong with the stamps.
-    """
+    """A topic, or the scans of a folder."""
 
     name: str
     type: str
-    count: int
+    count: int  # messages
+    # Messages per second of their stamps; for topics without stamps, of their recording.
     rate: float | None = None
+    # Nanoseconds of the first and the last stamp.
     first: int | None = None
     last: int | None = None
-    gap: float | None = None
-    oddities: tuple[str, ...] = ()
+    gap: float | None = None  # longest time between one message and the next, in seconds
+    oddities: tuple[str, ...] = ()  # what is wrong with the stamps
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSummary:
-    """The first scan.
-
-    Attributes
-    ----------
-    scan : Scan
-    recorded : int
-        Points in the message, those without a measurement included.
-    ranges : tuple of float
-        Least, median and greatest distance in metres.
-    span : float, optional
-        Seconds from the first point to the last.
-    rings : int, optional
-        How many rings there are.
-    """
+    """The first scan."""
 
     scan: Scan
-    recorded: int
-    ranges: tuple[float, float, float] | None
-    span: float | None
-    rings: int | None
+    recorded: int  # points in the message, those without a measurement included
+    ranges: tuple[float, float, float] | None  # least, median and greatest distance in metres
+    span: float | None  # seconds from the first point to the last
+    rings: int | None  # how many rings there are
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Content of a recording.
-
-    Attributes
-    ----------
-    path : Path
-    topics : tuple of Topic
-    layout : Layout
-        Of the first cloud.
-    scan : ScanSummary, optional
-        None where no scan could be read.
-    reference : Trajectory, optional
-    problems : tuple of str
-        What is odd or unreadable.
-    missing : dict
-        What each stage still needs, by stage; empty if it can run.
-    entry : str
-        YAML for the `sequences:` of a study.
-    """
+    """Content of a recording."""
 
     path: Path
     topics: tuple[Topic, ...]
-    layout: Layout
-    scan: ScanSummary | None
+    layout: Layout  # of the first cloud
+    scan: ScanSummary | None  # none where no scan could be read
     reference: Trajectory | None
-    problems: tuple[str, ...]
+    problems: tuple[str, ...]  # what is odd or unreadable
+    # What each stage still needs, by stage; empty if it can run.
     missing: dict[str, tuple[str, ...]]
-    entry: str
+    entry: str  # YAML for the `sequences:` of a study
 
 
 def inspect(path: Path) -> Inspection:
     """Read a whole recording and report what it holds.
 
-    Parameters
-    ----------
-    path
-        A bag, a folder with bags, a KITTI sequence or drive, or a folder of scans.
-
-    Raises
-    ------
-    SequenceError
-        If it cannot be opened at all. Later failures are among the problems.
+    It is a bag, a folder with bags, a KITTI sequence or drive, or a folder of scans. A
+    SequenceError says that it cannot be opened at all. Later failures are among the problems.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
-    given: dict[str, Any] = {}
     topics: tuple[Topic, ...] = ()
     layout: Layout = ()
     problems: list[str] = []
     kind = _kind(path)
-    given[kind] = str(path)
+    given: dict[str, Any] = {kind: str(path)}
     if kind == "bag":
         source = _any_bag(path)
         topics, read = _topics(source)
@@ -142,8 +93,8 @@ def inspect(path: Path) -> Inspection:
         poses = [t for t in topics if t.type in POSES and t.count and "tf" not in t.type.lower()]
         if poses:
             given["reference"] = max(poses, key=lambda t: t.count).name
-        if any(t.type in IMU_TYPES for t in topics):
-            given["imu"] = {"topic": next(t.name for t in topics if t.type in IMU_TYPES)}
+        if imus := [t.name for t in topics if t.type in IMU_TYPES]:
+            given["imu"] = {"topic": imus[0]}
     scan, reference = None, None
     if kind != "bag" or "points" in given:
         scan, reference, layout, found, more = _first_scan(given)
@@ -153,17 +104,8 @@ def inspect(path: Path) -> Inspection:
         problems += [f"{topic.name}: {oddity}" for oddity in topic.oddities]
     if reference is not None:
         problems += _reference_problems(reference)
-    missing = _missing(scan, reference)
-    return Inspection(
-        path,
-        topics,
-        layout,
-        scan,
-        reference,
-        tuple(problems),
-        missing,
-        _entry(path, given, reference),
-    )
+    missing, entry = _missing(scan, reference), _entry(path, given, reference)
+    return Inspection(path, topics, layout, scan, reference, tuple(problems), missing, entry)
 
 
 def _kind(path: Path) -> str:
@@ -187,21 +129,17 @@ def _topics(source: BagSource) -> tuple[tuple[Topic, ...], list[str]]:
     problems = []
     with source.open() as reader:
         kinds = {c.topic: c.msgtype for c in reader.connections}
-        counts = dict.fromkeys(kinds, 0)
         stamps: dict[str, list[int]] = {topic: [] for topic in kinds}
         recorded: dict[str, list[int]] = {topic: [] for topic in kinds}
-        definitions = reader.typestore.fielddefs
+        first = {kind: fields[:1] for kind, (_, fields) in reader.typestore.fielddefs.items()}
         stamped = {
             topic
             for topic, kind in kinds.items()
-            if kind in definitions
-            and definitions[kind][1]
-            and definitions[kind][1][0][1][1] == "std_msgs/msg/Header"
+            if [field[1][1] for field in first.get(kind, ())] == ["std_msgs/msg/Header"]
         }
         try:
             for connection, when, data in source.read(reader):
                 topic = connection.topic
-                counts[topic] += 1
                 recorded[topic].append(when)
                 stamp = header_stamp(data, reader.is2) if topic in stamped else None
                 if stamp is not None:
@@ -209,17 +147,15 @@ def _topics(source: BagSource) -> tuple[tuple[Topic, ...], list[str]]:
         except SequenceError as error:
             problems.append(str(error))
     topics = tuple(
-        _topic(topic, kinds[topic], counts[topic], stamps[topic], recorded[topic])
-        for topic in sorted(kinds)
+        _topic(name, kinds[name], stamps[name], recorded[name]) for name in sorted(kinds)
     )
     return topics, problems
 
 
-def _topic(
-    name: str, kind: str, count: int, stamps: Items[int], recorded: Items[int] = ()
-) -> Topic:
-    times = np.array(stamps or recorded, np.int64)
-    if not count or len(times) < 1:
+def _topic(name: str, kind: str, stamps: Items[int], recorded: Items[int] = ()) -> Topic:
+    """Topic of messages with these stamps, recorded at these times if they are of a bag."""
+    times, count = np.array(stamps or recorded, np.int64), len(recorded or stamps)
+    if not count:
         return Topic(name, kind, count)
     steps = np.diff(times) * 1e-9
     positive = steps[steps > 0]
@@ -232,18 +168,16 @@ def _topic(
 def _oddities(
     stamps: NDArray[np.int64], recorded: Items[int], gap: float | None, rate: float | None
 ) -> tuple[str, ...]:
-    found = []
-    steps = np.diff(stamps)
     if len(stamps) > 1 and stamps.max() == 0:
         return ("all stamps are zero",)
-    for what, number in (
-        ("stamps repeat the one before", np.count_nonzero(steps == 0)),
-        ("stamps go back in time", np.count_nonzero(steps < 0)),
+    steps = np.diff(stamps)
+    counts = {
+        "stamps repeat the one before": np.count_nonzero(steps == 0),
+        "stamps go back in time": np.count_nonzero(steps < 0),
         # Recordings that count from zero begin with it.
-        ("stamps are zero", np.count_nonzero(stamps[1:] == 0)),
-    ):
-        if number:
-            found.append(f"{number} {what}")
+        "stamps are zero": np.count_nonzero(stamps[1:] == 0),
+    }
+    found = [f"{number} {what}" for what, number in counts.items() if number]
     if gap is not None and rate is not None and gap * rate > 3.5 and gap > 0.2:
         lost = np.count_nonzero(steps * 1e-9 * rate > 3.5)
         found.append(f"{lost} gaps, the longest of {gap:.2f} s")
@@ -263,7 +197,7 @@ def _first_scan(
 ) -> tuple[ScanSummary | None, Trajectory | None, Layout, tuple[Topic, ...], list[str]]:
     """First scan and reference, read as the stages read them."""
     problems = []
-    scan, reference = None, None
+    scan, reference, count = None, None, 0
     layout: Layout = ()
     topics: tuple[Topic, ...] = ()
     options = {key: value for key, value in given.items() if key != "imu"}
@@ -275,13 +209,12 @@ def _first_scan(
         return None, None, (), (), [str(error)]
     assert isinstance(sequence, RecordedSequence)
     source = sequence.source
-    count = 0
     try:
         if isinstance(source, BagSource):
             layout, count = _layout(source)
         else:
             stamps = [frame.stamp for frame in source.frames()]
-            topics = (_topic(str(source.name), "scans", len(stamps), stamps),)
+            topics = (_topic(str(source.name), "scans", stamps),)
         scan = _summary(next(iter(sequence)), count)
     except AdaptuneError as error:
         problems.append(str(error))
@@ -299,28 +232,22 @@ def _layout(source: BagSource) -> tuple[Layout, int]:
         points = list(getattr(message, "points", ()))
         names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
         return tuple((name, "", 0) for name in names), len(points)
-    kinds = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32"}
-    kinds |= {7: "float32", 8: "float64"}
-    fields = tuple(
-        (
-            field.name,
-            kinds.get(field.datatype, "?") + (f"[{field.count}]" if field.count > 1 else ""),
-            int(field.offset),
-        )
-        for field in sorted(message.fields, key=lambda field: field.offset)
-    )
-    return fields, int(message.height) * int(message.width)
+    layout = []
+    for field in sorted(message.fields, key=lambda field: field.offset):
+        kind = np.dtype(DATATYPES[field.datatype]).name if field.datatype in DATATYPES else "?"
+        kind += f"[{field.count}]" if field.count > 1 else ""
+        layout.append((field.name, kind, int(field.offset)))
+    return tuple(layout), int(message.height) * int(message.width)
 
 
 def _summary(scan: Scan, recorded: int) -> ScanSummary:
-    ranges = np.linalg.norm(scan.points, axis=1)
-    return ScanSummary(
-        scan,
-        max(recorded, len(scan)),
-        (float(ranges.min()), float(np.median(ranges)), float(ranges.max())) if len(scan) else None,
-        None if scan.times is None or not len(scan) else float(np.ptp(scan.times)),
-        None if scan.rings is None else len(np.unique(scan.rings)),
-    )
+    ranges, span = None, None
+    if len(scan):
+        away = np.linalg.norm(scan.points, axis=1)
+        ranges = (float(away.min()), float(np.median(away)), float(away.max()))
+        span = None if scan.times is None else float(np.ptp(scan.times))
+    rings = None if scan.rings is None else len(np.unique(scan.rings))
+    return ScanSummary(scan, max(recorded, len(scan)), ranges, span, rings)
 
 
 def _reference_problems(reference: Trajectory) -> Iterator[str]:
@@ -356,10 +283,9 @@ def _missing(scan: ScanSummary | None, reference: Trajectory | None) -> dict[str
 
 def _entry(path: Path, given: dict[str, Any], reference: Trajectory | None) -> str:
     name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in path.stem).lstrip(".-")
-    entry = dict(given)
-    text = yaml.dump({"sequences": {name or "recording": entry}})
-    if reference is None and "reference" not in entry:
+    text = yaml.dump({"sequences": {name or "recording": given}})
+    if reference is None and "reference" not in given:
         text += "    # reference: its poses - a topic, or a TUM, KITTI or EuRoC file\n"
-    if "points" in entry and "stamp" not in entry:
+    if "points" in given:
         text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
     return text

@@ -31,19 +31,8 @@ def window_ends(T_world_sensor: Poses, length: float) -> NDArray[np.intp]:
     """End of the sub-trajectory of `length` metres that starts at each pose.
 
     The end is the first pose further along the path than `length` from the start, as in KITTI's
-    development kit.
-
-    Parameters
-    ----------
-    T_world_sensor
-        Reference poses of shape (n, 4, 4).
-    length
-        Metres.
-
-    Returns
-    -------
-    ndarray of shape (n,)
-        Index of the end; -1 where the path ends before, or where a pose on the way is NaN.
+    development kit: its index, of shape (n,); -1 where the path ends before, or where a pose on the
+    way is NaN.
     """
     distance = travelled(T_world_sensor)
     ends = np.searchsorted(distance, distance + length, side="right")
@@ -70,9 +59,22 @@ def sub_trajectory_rte(
     length: float,
     restarted: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """Relative translation error of the sub-trajectory that starts at every frame.
+    """Relative translation error of the sub-trajectory that starts at every frame, of shape (n,).
 
     After Koide et al., *Adaptive Hyperparameter Tuning for Black-box LiDAR Odometry*, IROS 2021.
+    In percent of the length: the lengths of `sub_trajectory_vectors`.
+    """
+    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, restarted)
+    return np.asarray(np.linalg.norm(vectors, axis=1))
+
+
+def sub_trajectory_vectors(
+    T_ref_sensor: Poses,
+    T_odom_sensor: Poses,
+    length: float,
+    restarted: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Error vector at the end of the sub-trajectory that starts at every frame.
 
     Parameters
     ----------
@@ -87,31 +89,10 @@ def sub_trajectory_rte(
 
     Returns
     -------
-    ndarray of shape (n,)
-        Percent of `length`: NaN for frames without a full sub-trajectory, infinity for those
-        whose sub-trajectory contains a lost track or poses that are not finite.
-    """
-    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, restarted)
-    return np.asarray(np.linalg.norm(vectors, axis=1))
-
-
-def sub_trajectory_vectors(
-    T_ref_sensor: Poses,
-    T_odom_sensor: Poses,
-    length: float,
-    restarted: NDArray[np.bool_] | None = None,
-) -> NDArray[np.float64]:
-    """Error vector at the end of each sub-trajectory.
-
-    Parameters
-    ----------
-    T_ref_sensor, T_odom_sensor, length, restarted
-        See `sub_trajectory_rte`, whose errors are the lengths of these vectors.
-
-    Returns
-    -------
     ndarray of shape (n, 3)
-        Percent of `length`, in the frame of the sub-trajectory's start; NaN and infinite as there.
+        Percent of `length`, in the frame of the sub-trajectory's start: NaN for frames without a
+        full sub-trajectory, infinity for those whose sub-trajectory contains a lost track or poses
+        that are not finite.
     """
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
@@ -130,20 +111,11 @@ def sub_trajectory_vectors(
 
 
 class KittiError(NamedTuple):
-    """Mean errors over sub-trajectories of several lengths.
+    """Mean errors over sub-trajectories of several lengths."""
 
-    Attributes
-    ----------
-    translation : float
-        Percent; NaN when the path is shorter than every length.
-    rotation : float
-        Degrees a metre.
-    lengths : tuple of float
-        The lengths in metres for which there was at least one sub-trajectory.
-    """
-
-    translation: float
-    rotation: float
+    translation: float  # percent; NaN when the path is shorter than every length
+    rotation: float  # degrees a metre
+    # The lengths in metres for which there was at least one sub-trajectory.
     lengths: tuple[float, ...]
 
 
@@ -153,16 +125,9 @@ def kitti_error(
     lengths: Sequence[float] = KITTI_LENGTHS,
     stride: int = 10,
 ) -> KittiError:
-    """Error of KITTI's odometry benchmark (Geiger et al., CVPR 2012).
+    """Error of KITTI's odometry benchmark (Geiger et al., CVPR 2012) over lengths in metres.
 
-    Parameters
-    ----------
-    T_ref_sensor, T_odom_sensor
-        Reference and estimated poses, of shape (n, 4, 4).
-    lengths
-        Metres.
-    stride
-        Frames from one start of a sub-trajectory to the next.
+    `stride` is the number of frames from one start of a sub-trajectory to the next.
     """
     translations, rotations, used = [], [], []
     for length in lengths:
@@ -189,13 +154,7 @@ def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     """Absolute pose error: root mean square of the distances after alignment, in metres.
 
     As ``evo_ape -a`` computes it: the translation part, after the least-squares alignment of the
-    positions (Umeyama, PAMI 1991).
-
-    Parameters
-    ----------
-    T_ref_sensor, T_odom_sensor
-        Reference and estimated poses, of shape (n, 4, 4). Poses without reference (NaN) do not
-        count.
+    positions (Umeyama, PAMI 1991). Poses without reference (NaN) do not count.
     """
     known = ~np.isnan(T_ref_sensor[:, 0, 0])
     ref, odom = T_ref_sensor[known, :3, 3], T_odom_sensor[known, :3, 3]
@@ -208,13 +167,8 @@ def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
 def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     """Relative pose error: root mean square of the steps' translation errors, in metres.
 
-    As ``evo_rpe`` computes it by default: from each frame to the next.
-
-    Parameters
-    ----------
-    T_ref_sensor, T_odom_sensor
-        Reference and estimated poses, of shape (n, 4, 4); steps without reference (NaN) do not
-        count.
+    As ``evo_rpe`` computes it by default: from each frame to the next. Steps without reference
+    (NaN) do not count.
     """
     E = invert(steps(T_ref_sensor)) @ steps(T_odom_sensor)
     known = ~np.isnan(E[:, 0, 0])
@@ -266,21 +220,12 @@ def bootstrap(
         sums = np.concatenate([[0.0], np.cumsum(values)])
         means.append((sums[starts + block] - sums[starts]).sum(axis=1) / (n_blocks * block))
     ratios = means[0] / np.maximum(means[1], 1e-12)
-    low, high = np.percentile(means[0], [2.5, 97.5])
-    ratio_low, ratio_high = np.percentile(ratios, [2.5, 97.5])
+    (low, high), (ratio_low, ratio_high) = np.percentile([means[0], ratios], [2.5, 97.5], axis=1).T
     return (float(low), float(high)), (float(ratio_low), float(ratio_high))
 
 
 def span(T_ref_sensor: Poses, length: float) -> int:
-    """Median number of frames in a sub-trajectory.
-
-    Parameters
-    ----------
-    T_ref_sensor
-        Reference poses of shape (n, 4, 4); NaN where there is none.
-    length
-        Metres. A shorter path counts whole.
-    """
+    """Median number of frames in a sub-trajectory of a length; a shorter path counts whole."""
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
     return int(np.median(ends[starts] - starts)) if len(starts) else max(1, len(ends))

@@ -7,15 +7,9 @@ from typing import Any
 
 @cache
 def load() -> Any:
-    """Import Open3D.
+    """Import ``open3d``, which takes about a second, and let it report errors only.
 
-    Its compiled part needs ``libusb-1.0.so.0``, which a fresh machine does not have. The import
-    takes about a second.
-
-    Returns
-    -------
-    module
-        ``open3d``, which reports errors only.
+    Its compiled part needs ``libusb-1.0.so.0``, which a fresh machine does not have.
     """
     import libusb_package
 

@@ -29,29 +29,19 @@ def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -
         Of entry points.
     sort
         Of Python object: ``Class``, or ``function``.
-
-    Raises
-    ------
-    PluginError
-        Naming the nearest valid name, or the module that cannot be imported.
     """
     path = ours.get(name) or (name if ":" in name else None)
     if path is None:
         announced = {point.name: point.value for point in entry_points(group=group)}
         if name not in announced:
-            help_ = nearest(name, [*ours, *announced])
-            raise PluginError(
-                f"there is no {kind} {name!r}: {help_} (a {sort.lower()} of your own is "
-                f"module:{sort})"
-            )
+            help_ = f"{nearest(name, [*ours, *announced])} (a {sort.lower()} of your own is"
+            raise PluginError(f"there is no {kind} {name!r}: {help_} module:{sort})")
         path = announced[name]
     module, _, attribute = path.partition(":")
     try:
         return getattr(import_module(module), attribute)
     except ImportError as error:
-        raise PluginError(
-            f"{name}: cannot import {module} ({error}); install it, or name its folder in "
-            f"PYTHONPATH"
-        ) from error
+        help_ = "install it, or name its folder in PYTHONPATH"
+        raise PluginError(f"{name}: cannot import {module} ({error}); {help_}") from error
     except AttributeError as error:
         raise PluginError(f"{name}: {module} has no {attribute or sort.lower()}") from error

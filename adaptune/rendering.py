@@ -19,10 +19,8 @@ from adaptune.trajectory import Trajectory
 
 def render_inspection(inspection: Inspection) -> RenderableType:
     """The inspection for a terminal."""
-    parts: list[RenderableType] = [
-        Text(str(inspection.path), style="bold"),
-        _topic_table(inspection),
-    ]
+    parts: list[RenderableType] = [Text(str(inspection.path), style="bold")]
+    parts.append(_topic_table(inspection))
     if inspection.layout:
         parts.append(Text(f"point: {_layout_text(inspection.layout)}"))
     if inspection.scan is not None:
@@ -43,15 +41,15 @@ def _topic_table(inspection: Inspection) -> Table:
         numeric = column not in ("topic", "type")
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
     for topic in inspection.topics:
-        seconds = None
+        seconds = ""
         if topic.first is not None and topic.last is not None:
-            seconds = (topic.last - topic.first) * 1e-9
+            seconds = f"{(topic.last - topic.first) * 1e-9:.2f}"
         table.add_row(
             topic.name,
             topic.type.replace("/msg/", "/"),
             str(topic.count),
             "" if topic.rate is None else f"{topic.rate:.2f} Hz",
-            "" if seconds is None else f"{seconds:.2f}",
+            seconds,
             "" if topic.gap is None else f"{topic.gap:.3f} s",
         )
     return table
@@ -89,16 +87,9 @@ def _reference_text(reference: Trajectory) -> str:
 
 
 def write_inspection_png(inspection: Inspection, path: Path) -> None:
-    """Draw the first scan from above and from the side.
-
-    Raises
-    ------
-    SequenceError
-        If no scan could be read.
-    """
+    """Draw the first scan from above and from the side; a SequenceError if there is none."""
     if inspection.scan is None:
         raise SequenceError(f"{inspection.path}: no scan can be drawn, none could be read")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     points = inspection.scan.scan.points
@@ -106,16 +97,13 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
     reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
     low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
     figure = Figure(figsize=(9, 12), layout="constrained")
-    FigureCanvasAgg(figure)
     above, side = figure.subplots(2, 1, height_ratios=(3, 1))
     for axes, (i, j), names in ((above, (0, 1), "xy"), (side, (0, 2), "xz")):
         order = np.argsort(points[:, 2])
         x, y, z = points[order, i], points[order, j], points[order, 2]
         dots = axes.scatter(x, y, c=z, s=0.4, cmap="viridis", vmin=low, vmax=high)
+        axes.set(aspect="equal", xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
         axes.set_xlim(-reach, reach)
-        axes.set_aspect("equal")
-        axes.set_xlabel(f"{names[0]} (m)")
-        axes.set_ylabel(f"{names[1]} (m)")
     above.set_ylim(-reach, reach)
     above.plot(0, 0, "r+", markersize=10)
     figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6, extend="both")
@@ -133,7 +121,5 @@ def render_cache() -> RenderableType:
     for entry in entries:
         used = datetime.datetime.fromtimestamp(entry.used).strftime("%Y-%m-%d %H:%M")
         table.add_row(entry.name, str(entry.n_scans), f"{entry.size / 1e6:,.1f} MB", used)
-    total = sum(entry.size for entry in entries) / 1e9
-    return Group(
-        table, Text(f"{cache.folder()}: {total:.2f} GB of at most {cache.cap() / 1e9:g} GB")
-    )
+    total, most = sum(entry.size for entry in entries) / 1e9, cache.cap() / 1e9
+    return Group(table, Text(f"{cache.folder()}: {total:.2f} GB of at most {most:g} GB"))

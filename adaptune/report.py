@@ -27,25 +27,13 @@ _FEW = 10
 
 
 class Track(NamedTuple):
-    """Errors and selections of one mode along a sequence.
+    """Errors and selections of one mode along a sequence."""
 
-    Attributes
-    ----------
-    seconds : ndarray of shape (n,)
-        Since the first scan.
-    errors : ndarray of shape (n,)
-        Sub-trajectory RTE in percent.
-    restarted : ndarray of shape (n,)
-    choice_seconds : ndarray of shape (m,)
-    choices : dict
-        For every parameter its values, of shape (m,).
-    """
-
-    seconds: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    restarted: NDArray[np.bool_]
-    choice_seconds: NDArray[np.float64]
-    choices: Mapping[str, Sequence[Any]]
+    seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
+    errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
+    restarted: NDArray[np.bool_]  # of shape (n,)
+    choice_seconds: NDArray[np.float64]  # of shape (m,)
+    choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
@@ -54,21 +42,14 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
     Numbers are aligned to the right. A gap separates groups of equal first columns. Keys that
     start with an underscore are for files only.
     """
-    made = Table(
-        title=title,
-        title_justify="left",
-        caption=caption,
-        caption_justify="left",
-        box=rich.box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )
+    space: Any = {"box": rich.box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
+    made = Table(title=title, caption=caption, **space)
+    made.title_justify = made.caption_justify = "left"
     keys = [key for key in (rows[0] if rows else {}) if not key.startswith("_")]
     for key in keys:
         numbers = all(isinstance(row[key], int | float | None) for row in rows)
-        made.add_column(
-            key, justify="right" if numbers else "left", no_wrap=key == keys[0], overflow="fold"
-        )
+        side: Any = "right" if numbers else "left"
+        made.add_column(key, justify=side, no_wrap=key == keys[0], overflow="fold")
     grouped = bool(rows) and len({row[keys[0]] for row in rows}) < len(rows)
     for i, row in enumerate(rows):
         if i and grouped and rows[i - 1][keys[0]] != row[keys[0]]:
@@ -113,20 +94,9 @@ def draw_tracks(
     tracks: Mapping[str, Track],
     logarithmic: Collection[str] = (),
 ) -> None:
-    """Draw errors and selected parameters over time, as PNG.
+    """Draw errors and selected parameters of each mode over time, as PNG.
 
-    Parameters
-    ----------
-    path
-        The picture.
-    title
-        What it shows.
-    length
-        Metres of a sub-trajectory.
-    tracks
-        By mode.
-    logarithmic
-        Names of the parameters to draw in log scale.
+    `length` is that of a sub-trajectory in metres; `logarithmic` are the parameters in log scale.
     """
     from matplotlib.figure import Figure
 
@@ -174,16 +144,8 @@ def draw_front(
 ) -> None:
     """Draw the Pareto front and all sets, one panel for each two consecutive objectives, as PNG.
 
-    Parameters
-    ----------
-    path
-        The picture.
-    names
-        Of the objectives.
-    values
-        Of all sets, of shape (n, n_objectives).
-    front
-        Of the sets on the front, of shape (m, n_objectives).
+    `names` are those of the objectives; `values` are of all sets, `front` of those on the front, of
+    shape (n, n_objectives).
     """
     from matplotlib.figure import Figure
 
@@ -197,44 +159,28 @@ def draw_front(
         axis.grid(alpha=0.3)
     axis.legend(frameon=False)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 class LeftOutResults(NamedTuple):
-    """Results on the sequences that were left out of training.
+    """Results on the sequences that were left out of training."""
 
-    Attributes
-    ----------
-    ratios : dict
-        By mode, the ratio to the fixed set's error on each sequence.
-    sequences : sequence of str
-        Their names.
-    familiarity, gain : ndarray of shape (n,)
-        Of every frame; the gain is the ratio to the fixed set's error.
-    portfolio : ndarray
-        Ratio if the best of 1, 2, ... sets were known.
-    learning : sequence of dict
-        Rows of a learning curve, or none.
-    banks : sequence of dict
-        Rows of banks of several sizes, or none.
-    """
-
+    # By mode, the ratio to the fixed set's error on each sequence.
     ratios: Mapping[str, NDArray[np.float64]]
-    sequences: Sequence[str]
+    sequences: Sequence[str]  # their names
+    # Of every frame; the gain is the ratio to the fixed set's error, of shape (n,).
     familiarity: NDArray[np.float64]
     gain: NDArray[np.float64]
-    portfolio: NDArray[np.float64]
-    learning: Sequence[Mapping[str, Any]]
-    banks: Sequence[Mapping[str, Any]]
+    portfolio: NDArray[np.float64]  # ratio if the best of 1, 2, ... sets were known.
+    learning: Sequence[Mapping[str, Any]]  # rows of a learning curve, or none
+    banks: Sequence[Mapping[str, Any]]  # rows of banks of several sizes, or none
 
 
 def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
     """Draw results on the sequences left out, as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(f"{title}: error over the fixed set's on sequences left out")
     by_sequence, by_novelty, by_size = figure.subplots(1, 3, width_ratios=(2, 1, 1))
     default = "bank" if "bank" in found.ratios else "paired"
@@ -283,17 +229,17 @@ def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
     label = "of so many sets the best, if known"
     sizes = np.arange(1, len(found.portfolio) + 1)
     axes.plot(sizes, found.portfolio, "s--", color="#bbbbbb", label=label)
-    counted = ["sets"]
+    counted = "sets"
     for rows, column, colour, what, label in (
         (found.banks, "instances", COLOURS["bank"], "instances", "bank, by its instances"),
         (found.learning, "sequences", "#555555", "training sequences", f"{default}, by sequences"),
     ):
         if not rows:
             continue
-        counted.append(what)
+        counted += f"; {what}"
         middle = np.array([row["geometric"] for row in rows])
         error = np.abs([[row[key] for row in rows] for key in ("low", "high")] - middle)
         x = [row[column] for row in rows]
         axes.errorbar(x, middle, error, fmt="o-", color=colour, capsize=3, label=label)
-    axes.set_xlabel("; ".join(counted))
+    axes.set_xlabel(counted)
     axes.legend(fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))

@@ -48,10 +48,8 @@ class _Range(_Parameter):
         if not self.low < self.high:
             raise ValueError(f"low ({self.low:g}) must be less than high ({self.high:g})")
         if not self.low <= self.baseline <= self.high:
-            raise ValueError(
-                f"baseline ({self.baseline:g}) must lie between low ({self.low:g}) "
-                f"and high ({self.high:g})"
-            )
+            what = f"between low ({self.low:g}) and high ({self.high:g})"
+            raise ValueError(f"baseline ({self.baseline:g}) must lie {what}")
         if self.log and self.low <= 0:
             raise ValueError(f"a log scale needs low ({self.low:g}) above 0")
         return self
@@ -132,13 +130,15 @@ class Categorical(_Parameter):
 
     def contains(self, value: object) -> bool:
         """Whether `value` is one of the choices, of the same type."""
-        return any(type(value) is type(choice) and value == choice for choice in self.choices)
+        return any(self._alike(value))
 
     def index(self, value: object) -> int:
         """Index of a choice."""
-        # Not the index of the tuple: True is equal to 1.
-        alike = [type(value) is type(choice) and value == choice for choice in self.choices]
-        return alike.index(True)
+        return self._alike(value).index(True)
+
+    def _alike(self, value: object) -> list[bool]:
+        # Types are compared because True is equal to 1.
+        return [type(value) is type(choice) and value == choice for choice in self.choices]
 
     def to_unit(self, value: Any) -> float:
         """Map a choice to the middle of its share of [0, 1]."""
@@ -155,13 +155,7 @@ _adapter: TypeAdapter[Float | Integer | Categorical] = TypeAdapter(Parameter)
 
 
 class ParameterSpace:
-    """The tuned parameters in their order.
-
-    Parameters
-    ----------
-    parameters
-        By name.
-    """
+    """The tuned parameters by name, in their order."""
 
     def __init__(self, parameters: Mapping[str, Float | Integer | Categorical]):
         self.parameters = dict(parameters)
@@ -172,9 +166,8 @@ class ParameterSpace:
         return cls(parameters)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, ParameterSpace) and (
-            list(self.parameters.items()) == list(other.parameters.items())
-        )
+        mine = list(self.parameters.items())
+        return isinstance(other, ParameterSpace) and mine == list(other.parameters.items())
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -192,12 +185,7 @@ class ParameterSpace:
         return {name: parameter.baseline for name, parameter in self.parameters.items()}
 
     def check(self, parameters: Mapping[str, object]) -> None:
-        """Refuse a set with missing, unknown or out-of-range parameters.
-
-        Raises
-        ------
-        SpaceError
-        """
+        """Raise a SpaceError for a set with missing, unknown or out-of-range parameters."""
         for name, value in parameters.items():
             if name not in self.parameters:
                 raise SpaceError(f"unknown parameter {name!r}: {nearest(name, self.names)}")
@@ -208,10 +196,9 @@ class ParameterSpace:
 
     def to_unit(self, sets: Sequence[Mapping[str, Value]]) -> NDArray[np.float64]:
         """Map parameter sets to the unit cube, of shape (n_sets, n_parameters)."""
-        return np.array(
-            [[p.to_unit(s[name]) for name, p in self.parameters.items()] for s in sets],
-            np.float64,
-        ).reshape(len(sets), len(self))
+        parameters = self.parameters.items()
+        unit = [[p.to_unit(given[name]) for name, p in parameters] for given in sets]
+        return np.array(unit, np.float64).reshape(len(sets), len(self))
 
     def from_unit(self, unit: NDArray[np.float64]) -> list[ParameterSet]:
         """Map points of the unit cube, of shape (n_sets, n_parameters), to parameter sets."""
@@ -227,12 +214,7 @@ class ParameterSpace:
 
     @classmethod
     def load(cls, data: Mapping[str, Any]) -> Self:
-        """Make a space from the result of `dump`.
-
-        Raises
-        ------
-        pydantic.ValidationError
-        """
+        """Make a space from the result of `dump`; a pydantic.ValidationError if it is none."""
         return cls({name: _adapter.validate_python(p) for name, p in data.items()})
 
 

@@ -1,4 +1,8 @@
-"""Trajectories, and their files in the TUM, KITTI, EuRoC and OXTS formats."""
+"""Trajectories, and their files in the TUM, KITTI, EuRoC and OXTS formats.
+
+All readers raise a TrajectoryError that names the file and the line that is not a pose, or whose
+stamp does not come after the one before.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -38,10 +42,8 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         if self.T_world_sensor.shape != (len(self.stamps), 4, 4):
-            raise ValueError(
-                f"{len(self.stamps)} stamps do not go with poses of shape "
-                f"{self.T_world_sensor.shape}"
-            )
+            shape = self.T_world_sensor.shape
+            raise ValueError(f"{len(self.stamps)} stamps do not go with poses of shape {shape}")
         if np.any(np.diff(self.stamps) <= 0):
             raise ValueError("stamps are not strictly increasing")
 
@@ -49,19 +51,9 @@ class Trajectory:
         return len(self.stamps)
 
     def at(self, stamps: NDArray[np.int64], max_gap: float | None = None) -> Poses:
-        """Interpolated poses.
+        """Interpolated poses of shape (m, 4, 4) at m stamps; NaN where there is no pose.
 
-        Parameters
-        ----------
-        stamps
-            Nanoseconds, of shape (m,).
-        max_gap
-            Seconds, in place of the trajectory's own.
-
-        Returns
-        -------
-        ndarray of shape (m, 4, 4)
-            NaN where the trajectory has no pose.
+        `max_gap` is in seconds, in place of the trajectory's own.
         """
         gap = self.max_gap if max_gap is None else max_gap
         return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
@@ -89,10 +81,8 @@ def _rows(path: Path, columns: int, kind: str, or_more: bool = False) -> list[Ro
     rows = []
     for number, fields in _lines(path):
         if len(fields) != columns and not (or_more and len(fields) > columns):
-            raise TrajectoryError(
-                f"{path}, line {number}: a {kind} line has {columns} numbers, this has "
-                f"{len(fields)}"
-            )
+            what = f"a {kind} line has {columns} numbers, this has {len(fields)}"
+            raise TrajectoryError(f"{path}, line {number}: {what}")
         rows.append((number, fields[:columns]))
     if not rows:
         raise TrajectoryError(f"{path}: holds no pose")
@@ -120,68 +110,52 @@ def _stamps(
         try:
             stamps[i] = parse(fields[0])
         except (InvalidOperation, ValueError, OverflowError) as error:
-            raise TrajectoryError(
-                f"{path}, line {number}: {fields[0]!r} is not a time in {unit}"
-            ) from error
+            what = f"{fields[0]!r} is not a time in {unit}"
+            raise TrajectoryError(f"{path}, line {number}: {what}") from error
         if i and stamps[i] <= stamps[i - 1]:
-            raise TrajectoryError(
-                f"{path}, line {number}: its stamp does not come after the line before"
-            )
+            what = "its stamp does not come after the line before"
+            raise TrajectoryError(f"{path}, line {number}: {what}")
     return stamps
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Read ``timestamp tx ty tz qx qy qz qw`` lines, exact to the nanosecond.
-
-    Raises
-    ------
-    TrajectoryError
-        Naming the file and the line that is not a pose, or does not come after the one before.
-    """
-    rows = _rows(path, 8, "TUM")
+def _with_stamps(
+    path: Path, rows: list[Row], parse: Callable[[str], int], unit: str, order: list[int]
+) -> Trajectory:
+    """Trajectory of rows of a stamp, a translation and a quaternion whose x y z w `order` finds."""
     values = _numbers(path, [(number, fields[1:]) for number, fields in rows])
-    # A double holds seconds since 1970 to 0.2 microseconds only.
-    stamps = _stamps(
-        path, rows, lambda text: int(Decimal(text).scaleb(9).to_integral_value()), "seconds"
-    )
-    _check_quaternions(path, rows, values[:, 3:])
-    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], values[:, 3:]))
-
-
-def _check_quaternions(path: Path, rows: list[Row], quaternions: NDArray[np.float64]) -> None:
+    stamps, quaternions = _stamps(path, rows, parse, unit), values[:, order]
     norms = np.linalg.norm(quaternions, axis=1)
     worst = int(np.argmax(np.abs(norms - 1.0)))
     if abs(norms[worst] - 1.0) > 1e-2:
-        raise TrajectoryError(
-            f"{path}, line {rows[worst][0]}: its quaternion has length {norms[worst]:.3g}, not 1"
-        )
+        what = f"its quaternion has length {norms[worst]:.3g}, not 1"
+        raise TrajectoryError(f"{path}, line {rows[worst][0]}: {what}")
+    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], quaternions))
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read ``timestamp tx ty tz qx qy qz qw`` lines, exact to the nanosecond."""
+
+    def nanoseconds(text: str) -> int:
+        # A double holds seconds since 1970 to 0.2 microseconds only.
+        return int(Decimal(text).scaleb(9).to_integral_value())
+
+    return _with_stamps(path, _rows(path, 8, "TUM"), nanoseconds, "seconds", [3, 4, 5, 6])
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write ``timestamp tx ty tz qx qy qz qw`` lines, stamps to the nanosecond."""
     quaternions = geometry.to_quaternions(trajectory.T_world_sensor)
+    values = np.hstack([trajectory.T_world_sensor[:, :3, 3], quaternions])
     lines = []
-    for stamp, T, q in zip(
-        trajectory.stamps.tolist(), trajectory.T_world_sensor, quaternions, strict=True
-    ):
+    for stamp, row in zip(trajectory.stamps.tolist(), values, strict=True):
         sign, (seconds, nanoseconds) = "-" if stamp < 0 else "", divmod(abs(stamp), 10**9)
-        numbers = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *q))
+        numbers = " ".join(f"{value:.9f}" for value in row)
         lines.append(f"{sign}{seconds}.{nanoseconds:09d} {numbers}\n")
     write_text(path, "".join(lines))
 
 
 def read_kitti(path: Path) -> Poses:
-    """Read poses of 12 numbers a line, the rows of a 3x4 matrix.
-
-    Returns
-    -------
-    ndarray of shape (n, 4, 4)
-
-    Raises
-    ------
-    TrajectoryError
-        Naming the file and the line that is not a pose.
-    """
+    """Read poses, of shape (n, 4, 4), from lines of 12 numbers, the rows of a 3x4 matrix."""
     values = _numbers(path, _rows(path, 12, "KITTI"))
     T = np.tile(np.eye(4), (len(values), 1, 1))
     T[:, :3] = values.reshape(-1, 3, 4)
@@ -195,24 +169,12 @@ def write_kitti(path: Path, T_world_sensor: Poses) -> None:
 
 
 def is_kitti(path: Path) -> bool:
-    """Whether a file's first pose has 12 numbers, and no stamp.
-
-    Raises
-    ------
-    TrajectoryError
-        If the file cannot be read.
-    """
+    """Whether a file's first pose has 12 numbers, and no stamp."""
     return path.suffix != ".csv" and len(next(_lines(path), (0, []))[1]) == 12
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read poses with stamps: ``.csv`` as EuRoC writes them, all else as TUM.
-
-    Raises
-    ------
-    TrajectoryError
-        Naming the file and the line that is not a pose.
-    """
+    """Read poses with stamps: ``.csv`` as EuRoC writes them, all else as TUM."""
     return read_euroc(path) if path.suffix == ".csv" else read_tum(path)
 
 
@@ -220,18 +182,9 @@ def read_euroc(path: Path) -> Trajectory:
     """Read ``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...`` lines, nanoseconds and metres.
 
     Numbers after the pose (velocities, biases) are ignored.
-
-    Raises
-    ------
-    TrajectoryError
-        Naming the file and the line that is not a pose, or does not come after the one before.
     """
     rows = _rows(path, 8, "EuRoC", or_more=True)
-    values = _numbers(path, [(number, fields[1:]) for number, fields in rows])
-    stamps = _stamps(path, rows, int, "nanoseconds")
-    quaternions = values[:, [4, 5, 6, 3]]
-    _check_quaternions(path, rows, quaternions)
-    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], quaternions))
+    return _with_stamps(path, rows, int, "nanoseconds", [4, 5, 6, 3])
 
 
 _EARTH_RADIUS = 6378137.0
@@ -241,36 +194,20 @@ def read_oxts(files: list[Path]) -> Poses:
     """Poses of a GPS/IMU from KITTI's OXTS files, one a file.
 
     Latitude, longitude, altitude (degrees, metres), roll, pitch and yaw (radians) are mapped by a
-    Mercator projection true at the first file's latitude; the first position is the origin.
-
-    Returns
-    -------
-    ndarray of shape (n, 4, 4)
-        x points east, y north and z up.
-
-    Raises
-    ------
-    TrajectoryError
-        Naming the file that cannot be read.
+    Mercator projection true at the first file's latitude; the first position is the origin. Poses
+    are of shape (n, 4, 4); x points east, y north and z up.
     """
     from scipy.spatial.transform import Rotation
 
     values = np.empty((len(files), 6))
     for i, path in enumerate(files):
-        rows = _rows(path, 6, "OXTS", or_more=True)
-        values[i] = _numbers(path, rows)[0]
-    latitude, longitude, altitude = values[:, 0], values[:, 1], values[:, 2]
+        values[i] = _numbers(path, _rows(path, 6, "OXTS", or_more=True))[0]
+    latitude, longitude, altitude = values[:, :3].T
     if np.any(np.abs(latitude) >= 90.0):
         raise TrajectoryError(f"{files[int(np.argmax(np.abs(latitude)))]}: no such latitude")
     scale = np.cos(np.deg2rad(latitude[0])) * _EARTH_RADIUS
-    position = np.stack(
-        [
-            scale * np.deg2rad(longitude),
-            scale * np.log(np.tan(np.deg2rad(90.0 + latitude) / 2.0)),
-            altitude,
-        ],
-        axis=1,
-    )
+    north = scale * np.log(np.tan(np.deg2rad(90.0 + latitude) / 2.0))
+    position = np.column_stack([scale * np.deg2rad(longitude), north, altitude])
     T = np.tile(np.eye(4), (len(files), 1, 1))
     T[:, :3, :3] = Rotation.from_euler("ZYX", values[:, [5, 4, 3]]).as_matrix()
     T[:, :3, 3] = position - position[0]

@@ -36,20 +36,10 @@ class TrialsError(AdaptuneError):
 def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     """A row for every trial that is finished on at least one of the sequences.
 
-    Parameters
-    ----------
-    archive
-        The trials.
-    names
-        The sequences.
-
-    Returns
-    -------
-    list of dict
-        Number, parameters, mean error in percent (None before the trial is finished on all
-        sequences), mean error on each sequence, then over all sequences how often it lost track,
-        how often its process ended and how often the health check would have found a fault, and
-        its other metrics (None if a sequence is too short for one).
+    It has number, parameters, mean error in percent (None before the trial is finished on all
+    sequences), mean error on each sequence, then over all sequences how often it lost track, how
+    often its process ended and how often the health check would have found a fault, and its other
+    metrics (None if a sequence is too short for one).
     """
     finished = {name: archive.finished(name) for name in names}
     # A dictionary keeps their order.
@@ -81,43 +71,27 @@ def select(
     sort: str | None = None,
     top: int | None = None,
 ) -> list[Row]:
-    """The rows that meet all conditions, in order.
+    """The first `top` rows that meet all conditions, in order.
 
-    Parameters
-    ----------
-    table
-        Rows.
-    where
-        Conditions, as ``mean < 1``: a column, one of ``< <= > >= == !=``, and a value in YAML.
-    sort
-        A column; with ``-`` before it, the largest first. Unknown values come last.
-    top
-        How many rows at most.
-
-    Raises
-    ------
-    TrialsError
+    A condition, as ``mean < 1``, is a column, one of ``< <= > >= == !=``, and a value in YAML. With
+    ``-`` before the column to sort by, the largest value comes first; unknown values come last.
     """
     chosen = list(table)
     for condition in where:
+        option = f"--where {condition!r}"
         match = _CONDITION.fullmatch(condition)
         if match is None:
-            raise TrialsError(
-                f"--where {condition!r}: give a column, one of < <= > >= == !=, and a value, as in "
-                f"'mean < 1'"
-            )
-        column, sign, text = match.groups()
-        column = _COLUMN.get(column, column)
+            help_ = "give a column, one of < <= > >= == !=, and a value, as in 'mean < 1'"
+            raise TrialsError(f"{option}: {help_}")
+        name, sign, text = match.groups()
         try:
             value = yaml.scalar(text)
         except yaml.YamlError as error:
-            raise TrialsError(f"--where {condition!r}: {error}") from error
-        _check_column(chosen, column, f"--where {condition!r}")
-        chosen = [row for row in chosen if _meets(row[column], sign, value, condition)]
+            raise TrialsError(f"{option}: {error}") from error
+        column = _column(chosen, name, option)
+        chosen = [row for row in chosen if _meets(row[column], sign, value, option)]
     if sort is not None:
-        column = sort.removeprefix("-")
-        column = _COLUMN.get(column, column)
-        _check_column(chosen, column, f"--sort {sort}")
+        column = _column(chosen, sort.removeprefix("-"), f"--sort {sort}")
         known = [row for row in chosen if row[column] is not None]
         unknown = [row for row in chosen if row[column] is None]
         known.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
@@ -125,38 +99,24 @@ def select(
     return chosen[:top]
 
 
-def _check_column(table: Sequence[Row], column: str, where: str) -> None:
+def _column(table: Sequence[Row], name: str, option: str) -> str:
+    column = _COLUMN.get(name, name)
     if table and column not in table[0]:
-        raise TrialsError(f"{where}: there is no column {column!r}: {nearest(column, table[0])}")
+        raise TrialsError(f"{option}: there is no column {column!r}: {nearest(column, table[0])}")
+    return column
 
 
-def _meets(given: Any, sign: str, value: Any, condition: str) -> bool:
-    if given is None:
-        return False
+def _meets(given: Any, sign: str, value: Any, option: str) -> bool:
     try:
-        return _OPERATORS[sign](given, value)
+        return given is not None and _OPERATORS[sign](given, value)
     except TypeError as error:
-        raise TrialsError(
-            f"--where {condition!r}: {given!r} and {value!r} cannot be compared"
-        ) from error
+        raise TrialsError(f"{option}: {given!r} and {value!r} cannot be compared") from error
 
 
 def export(archive: Archive, names: Sequence[str], numbers: Sequence[int], folder: Path) -> int:
     """Write trajectories as TUM: ``<sequence>/<number>.tum``, and ``<sequence>/reference.tum``.
 
-    Parameters
-    ----------
-    archive
-        The trials.
-    names, numbers
-        Sequences and trials to export. Unfinished trials are left out.
-    folder
-        Where to write.
-
-    Returns
-    -------
-    int
-        How many trajectories of trials were written.
+    Unfinished trials are left out. Returns the number of trials' trajectories.
     """
     written = 0
     for name in names:

@@ -1,4 +1,4 @@
-"""YAML as people mean it: PyYAML's safe loader without YAML 1.1's surprises."""
+"""YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers."""
 
 import re
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from adaptune.errors import AdaptuneError
 
 
 class YamlError(AdaptuneError):
-    """Text that is not YAML, or says a key twice."""
+    """Text that is not YAML, or gives a key twice."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -22,7 +22,7 @@ class _Loader(yaml.SafeLoader):
     }
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Construct a mapping, refusing a key that comes twice."""
+        """Construct a mapping; refuse a key that comes twice."""
         seen: dict[Any, int] = {}
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
@@ -55,22 +55,9 @@ _Loader.add_constructor(_PREFIX + "int", _int)
 
 
 class Document:
-    """A YAML text as plain data, and where in the text each part of it stands.
+    """A YAML text as plain data (`data`), and where in the text each part of it stands.
 
-    Parameters
-    ----------
-    text
-        One YAML document.
-
-    Attributes
-    ----------
-    data
-        Mappings, lists and scalars.
-
-    Raises
-    ------
-    YamlError
-        Naming the line.
+    A YamlError names the line that is wrong.
     """
 
     def __init__(self, text: str):
@@ -84,38 +71,32 @@ class Document:
             what = ", ".join(part for part in (error.context, error.problem) if part)
             raise YamlError(f"{where}{what}") from error
         except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
-            # What PyYAML's constructors raise on tags that do not suit their values.
+            # PyYAML's constructors raise these on tags that do not fit their values.
             raise YamlError(f"{type(error).__name__}: {error}") from error
 
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""
-        node = self._node
-        line = None
+        node, line = self._node, None
         for part in path:
+            found: list[tuple[Any, Any]] = []
             if isinstance(node, yaml.MappingNode):
-                for key, value in node.value:
-                    if key.value == str(part):
-                        line, node = key.start_mark.line + 1, value
-                        break
-                else:
-                    return line
+                found = [entry for entry in node.value if entry[0].value == str(part)]
             elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
-                if part >= len(node.value):
-                    return line
-                node = node.value[part]
-                line = node.start_mark.line + 1
-            else:
-                return line
+                found = [(value, value) for value in node.value[part : part + 1]]
+            if not found:
+                break
+            begin, node = found[0]
+            line = begin.start_mark.line + 1
         return line
 
 
 def scalar(text: str) -> Any:
-    """Value of one line of YAML, as given on a command line."""
+    """Value of one line of YAML from the command line."""
     return Document(text).data
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what either version of YAML would not read back as a string, and repeats lists."""
+    """Quotes what YAML 1.1 or 1.2 does not read back as a string, and repeats lists."""
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
         """Write everything out."""

@@ -32,17 +32,10 @@ class DescriptorError(AdaptuneError):
 
 
 def descriptor(name: str) -> Descriptor:
-    """Function of a descriptor.
+    """Function of a descriptor; a DescriptorError if there is none.
 
-    Parameters
-    ----------
-    name
-        One of `DESCRIPTORS`, one that an installed package announces in the entry-point group
-        ``adaptune.descriptors``, or ``module:function``.
-
-    Raises
-    ------
-    DescriptorError
+    `name` is one of `DESCRIPTORS`, one that an installed package announces in the entry-point group
+    ``adaptune.descriptors``, or ``module:function``.
     """
     try:
         found = plugins.load(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
@@ -55,34 +48,20 @@ def descriptor(name: str) -> Descriptor:
 
 
 def check_descriptor(name: str) -> None:
-    """Refuse a name that leads to no descriptor, without importing one of `DESCRIPTORS`.
-
-    Raises
-    ------
-    DescriptorError
-    """
+    """Refuse a name that leads to no descriptor, without importing one of `DESCRIPTORS`."""
     if name not in DESCRIPTORS:
         descriptor(name)
 
 
 class Describer:
-    """Describes scans by one or several descriptors.
+    """Describes scans by one or several descriptors, of these names (see `descriptor`).
 
     The motion descriptor stays zero. `adaptune.descriptor.motion.fill_in` fills it in.
-
-    Parameters
-    ----------
-    names
-        Of the descriptors, see `descriptor`.
 
     Attributes
     ----------
     blocks : dict
         By name, in order, how many numbers each descriptor has.
-
-    Raises
-    ------
-    DescriptorError
     """
 
     def __init__(self, names: Iterable[str]):
@@ -95,10 +74,7 @@ class Describer:
     def __call__(self, scan: Scan) -> NDArray[np.float32]:
         """The descriptors one after the other, of shape (n_features,).
 
-        Raises
-        ------
-        DescriptorError
-            If one of them is not finite or has another shape than for other scans.
+        A DescriptorError names one that is not finite or has another shape than for other scans.
         """
         return np.concatenate([self._describe(name, scan) for name in self._functions])
 
@@ -106,25 +82,18 @@ class Describer:
         found = np.asarray(self._functions[name](scan), np.float32)
         if found.ndim != 1 or len(found) != self.blocks.get(name, len(found)):
             want = f"({self.blocks[name]},)" if name in self.blocks else "one axis"
-            raise DescriptorError(
-                f"{name}: described scan {scan.stamp} by an array of shape {found.shape}, "
-                f"instead of {want}"
-            )
+            what = f"by an array of shape {found.shape}, instead of {want}"
+            raise DescriptorError(f"{name}: described scan {scan.stamp} {what}")
         if not np.isfinite(found).all():
             raise DescriptorError(f"{name}: described scan {scan.stamp} by NaN or infinity")
         return found
 
 
 def lowest_elevation(scan: Scan) -> float:
-    """Elevation below which one point in a hundred lies.
+    """Elevation in degrees below which one point in a hundred lies; NaN for an empty scan.
 
     The lowest beam ends on the ground almost everywhere. Its elevation thus identifies the sensor
     and its mount, not the place.
-
-    Returns
-    -------
-    float
-        Degrees; NaN for an empty scan.
     """
     if not len(scan):
         return math.nan

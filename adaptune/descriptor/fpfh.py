@@ -16,12 +16,9 @@ N_BINS = 33
 
 
 def fpfh(scan: Scan) -> NDArray[np.float64]:
-    """Mean and standard deviation over a thinned scan's points of their histograms.
+    """Mean and standard deviation of the histograms of a thinned scan's points, of shape (66,).
 
-    Returns
-    -------
-    ndarray of shape (66,)
-        Zeros where there are too few points.
+    Zeros where there are too few points.
     """
     o3d = open3d.load()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scan.points.astype(np.float64)))

@@ -13,27 +13,15 @@ N_QUANTILES = 9
 
 
 def intensity(scan: Scan) -> NDArray[np.float64]:
-    """Deciles of all intensities, and their mean and standard deviation in each ring.
+    """Deciles of all intensities, and mean and standard deviation in ten rings of 3 m: (29,).
 
     They are on the scale of the sensor: train and run with the same one.
-
-    Returns
-    -------
-    ndarray of shape (29,)
-        The rings are ten of 3 m.
-
-    Raises
-    ------
-    DescriptorError
-        If the scan's points have no intensities.
     """
     if not len(scan):
         return np.zeros(N_QUANTILES + 2 * N_RINGS)
     if scan.intensities is None:
-        raise DescriptorError(
-            f"the points of scan {scan.stamp} have no intensity to be described by: leave "
-            f"`intensity` out of `descriptor`"
-        )
+        help_ = "leave `intensity` out of `descriptor`"
+        raise DescriptorError(f"the points of scan {scan.stamp} have no intensity: {help_}")
     deciles = np.arange(1, N_QUANTILES + 1) / (N_QUANTILES + 1)
     rings = (np.hypot(scan.points[:, 0], scan.points[:, 1]) / RING).astype(np.intp)
     inside = rings < N_RINGS

@@ -20,19 +20,10 @@ def unknown(scan: Scan) -> NDArray[np.float64]:  # noqa: ARG001 - poses give it
 
 
 def speed_and_turn_rate(stamps: NDArray[np.int64], T_odom_sensor: Poses) -> NDArray[np.float64]:
-    """Motion over the last second before each pose.
+    """Metres and radians a second over the last second before each pose, of shape (n, 2).
 
-    Parameters
-    ----------
-    stamps
-        Nanoseconds, rising, of shape (n,).
-    T_odom_sensor
-        Of shape (n, 4, 4); NaN for unknown poses, which take the motion of the last known one.
-
-    Returns
-    -------
-    ndarray of shape (n, 2)
-        Metres and radians a second; zero at the first pose.
+    Stamps are rising nanoseconds. The motion is zero at the first pose. Unknown poses (NaN) take
+    the motion of the last known one.
     """
     known = np.flatnonzero(np.isfinite(T_odom_sensor).all(axis=(1, 2)))
     if not len(known):
@@ -50,16 +41,9 @@ def speed_and_turn_rate(stamps: NDArray[np.int64], T_odom_sensor: Poses) -> NDAr
 def fill_in(
     descriptors: NDArray[np.float32], blocks: Mapping[str, int], motion: NDArray[np.float64]
 ) -> None:
-    """Write the motion into the block of the motion descriptor, if there is one.
+    """Write the motion (..., 2) into the block of the motion descriptor, if there is one.
 
-    Parameters
-    ----------
-    descriptors
-        Of shape (..., n_features).
-    blocks
-        Numbers of each descriptor by its name, in order.
-    motion
-        Of shape (..., 2).
+    Descriptors are of shape (..., n_features); `blocks` are their numbers by name, in order.
     """
     begin = 0
     for name, size in blocks.items():

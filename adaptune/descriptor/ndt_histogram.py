@@ -73,12 +73,8 @@ def _tilt(c: NDArray[np.float64], value: float) -> float:
 def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sum up the points of every cell.
 
-    Returns
-    -------
-    sums : ndarray of shape (n_cells, 10)
-        Count, x, y, z, xx, yy, zz, xy, xz, yz, about the cell's centre.
-    keys : ndarray of shape (n_cells,)
-        Number of each cell.
+    Returns (n_cells, 10) sums of 1, x, y, z, xx, yy, zz, xy, xz, yz about the cell's centre, and
+    the number of each cell.
     """
     n = len(points)
     size = 1024
@@ -175,20 +171,14 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     Cells are linear (l2/l1 < 0.1), planar (l3/l2 < 0.1) or spherical, where l1 >= l2 >= l3 are the
     eigenvalues of the points' covariance. Linear cells are classified by thirds of abs(z) of their
     direction, planar cells by thirds of abs(z) of their normal, spherical cells by l2/l1. A turn
-    of the sensor about z changes nothing.
-
-    Parameters
-    ----------
-    points
-        Metres in the sensor's frame, of shape (n, 3). Points that are not finite do not count.
+    of the sensor about z changes nothing. Points (n, 3) that are not finite do not count.
 
     Returns
     -------
     ndarray of shape (90,)
         Nine classes for each of ten distances, the distance running slowest.
     """
-    histogram: NDArray[np.float64] = _histogram(np.ascontiguousarray(points, np.float32))
-    return histogram
+    return np.asarray(_histogram(np.ascontiguousarray(points, np.float32)))
 
 
 def describe(scan: Scan) -> NDArray[np.float64]:

@@ -13,15 +13,8 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Principal components, divided by the mean of their standard deviations.
 
     One divisor for all keeps the components' shares in a distance, and gives distances a size that
-    does not depend on the sensor's number of points.
-
-    Parameters
-    ----------
-    n_components
-        At most; fewer where there are fewer scans.
-    blocks
-        Lengths of the descriptors of which each scan's consists; each has components and a divisor
-        of its own. One block when left out.
+    does not depend on the sensor's number of points. Each of the `blocks` of a descriptor (one if
+    left out) has up to `n_components` components and a divisor of its own.
 
     Attributes
     ----------
@@ -57,5 +50,4 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def transform(self, X: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map descriptors to shape (n_scans, n_components)."""
-        projected: NDArray[np.float64] = (X - self.mean_) @ self.components_.T / self.scale_
-        return projected
+        return np.asarray((X - self.mean_) @ self.components_.T / self.scale_)

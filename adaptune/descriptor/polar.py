@@ -62,10 +62,7 @@ def _columns(points: NDArray[np.float64], n: int) -> NDArray[np.int64]:
 def ring_heights(scan: Scan) -> NDArray[np.float64]:
     """Heights of what stands around the sensor: the highest point of each sector of each ring.
 
-    Returns
-    -------
-    ndarray of shape (40,)
-        Of ten rings of 3 m, metres above the sensor.
+    `_statistics` of ten rings of 3 m, in metres above the sensor, of shape (40,).
     """
     points = scan.points.astype(np.float64)
     rings = (np.hypot(points[:, 0], points[:, 1]) / RING).astype(np.int64)
@@ -76,10 +73,7 @@ def ring_heights(scan: Scan) -> NDArray[np.float64]:
 def range_image(scan: Scan) -> NDArray[np.float64]:
     """Logarithms of the ranges to what is nearest in each direction.
 
-    Returns
-    -------
-    ndarray of shape (64,)
-        Of 16 rows from 0.5 rad below the horizon to 0.5 rad above it.
+    `_statistics` of 16 rows from 0.5 rad below the horizon to 0.5 rad above it, of shape (64,).
     """
     points = scan.points.astype(np.float64)
     distance = np.linalg.norm(points, axis=1)

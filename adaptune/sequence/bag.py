@@ -34,15 +34,16 @@ IMU_TYPES = ("sensor_msgs/msg/Imu",)
 def _typestore() -> Any:
     """Message definitions for ROS 2 bags that contain none."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types: Any = {}
     for name, text in livox.DEFINITIONS.items():
-        types.update(get_types_from_msg(text, name))
-    store.register(types)
+        store.register(get_types_from_msg(text, name))
     return store
 
 
 class BagSource:
     """Scans, IMU and poses of one or more bags that follow each other.
+
+    All methods raise a SequenceError where the bags cannot be opened or read, lack a topic, or hold
+    no usable message on it. It names the bags and the message, or the topics that there are.
 
     Parameters
     ----------
@@ -54,11 +55,6 @@ class BagSource:
         Meaning of the stamps.
     about
         Result of `about` when they were opened before; the bags are then not opened now.
-
-    Raises
-    ------
-    SequenceError
-        If a bag cannot be opened or has no such topic.
     """
 
     random_access: ClassVar[bool] = False
@@ -85,12 +81,9 @@ class BagSource:
         self.points = self.topic(points, POINTS_TYPES, "point clouds")
         self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
         self._duration = max(reader.end_time - reader.start_time, 0)
-        self._begins = {}
-        for topic, kind in self.topics.items():
-            if topic == self.points or kind in POSES:
-                stamp = self._begin(reader, topic)
-                if stamp is not None:
-                    self._begins[topic] = stamp
+        known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
+        begins = {topic: self._begin(reader, topic) for topic in known}
+        self._begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
         # Opening reads the whole index: once for this and the first pass.
         self._ready = reader
 
@@ -112,24 +105,16 @@ class BagSource:
         return f"{self.paths[0]}{more}"
 
     def frames(self) -> Iterator[Frame]:
-        """All scans in the order of their recording.
-
-        Raises
-        ------
-        SequenceError
-            If the bags cannot be read on.
-        """
-        number = 0
+        """All scans in the order of their recording."""
         with self.open() as reader:
             decode = self._decoder(reader)
-            for _, recorded, data in self.read(reader, self.points):
-                number += 1
+            messages = enumerate(self.read(reader, self.points), start=1)
+            for number, (_, recorded, data) in messages:
+                what = f"{self.name}: message {number} on {self.points}"
                 stamp = header_stamp(data, reader.is2)
                 if stamp is None:
-                    raise SequenceError(
-                        f"{self.name}: message {number} on {self.points} is cut short"
-                    )
-                yield Frame(stamp, recorded, partial(self._load, decode, data, number))
+                    raise SequenceError(f"{what} is cut short")
+                yield Frame(stamp, recorded, partial(_load, decode, data, what))
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
         """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
@@ -148,24 +133,13 @@ class BagSource:
         return None if first is None else (first, first + self._duration)
 
     def first_pose(self, name: str) -> int | None:
-        """Stamp of the first pose on a topic.
-
-        Raises
-        ------
-        SequenceError
-            If the topic is not there.
-        """
+        """Stamp of the first pose on a topic."""
         return self._begins.get(self.topic(name, POSES, "poses"))
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
 
         Poses that are not finite or whose quaternion has no length are left out and counted.
-
-        Raises
-        ------
-        SequenceError
-            If the topic is not there, or holds no usable pose.
         """
         if name is None:
             return None
@@ -177,23 +151,16 @@ class BagSource:
         if not found:
             raise SequenceError(f"{self.name}: no pose on {name}")
         trajectory, unusable = usable(found)
+        unfit = f"poses on {name} that are not finite or have no rotation"
         if trajectory is None:
-            raise SequenceError(
-                f"{self.name}: every pose on {name} is not finite or has no rotation"
-            )
+            raise SequenceError(f"{self.name}: holds only {unfit}")
         repairs = Repairs()
-        repairs.add(f"poses on {name} that are not finite or have no rotation", unusable)
+        repairs.add(unfit, unusable)
         repairs.report(self.name)
         return trajectory
 
     def imu(self, name: str | None) -> Imu | None:
-        """Measurements on a topic, as they were recorded.
-
-        Raises
-        ------
-        SequenceError
-            If the topic is not there, or its measurements are not finite.
-        """
+        """Measurements on a topic, as they were recorded."""
         name = self.topic(name, IMU_TYPES, "an IMU's measurements")
         stamps, values = [], []
         for message in self.messages(name):
@@ -209,40 +176,25 @@ class BagSource:
         return Imu(unique, measured[:, :3], measured[:, 3:])
 
     def topic(self, name: str | None, types: Iterable[str], what: str) -> str:
-        """The topic of this name, or the only one of these types.
-
-        Raises
-        ------
-        SequenceError
-            Naming the topics in the bags.
-        """
+        """The topic of this name, or the only one of these types."""
         types = tuple(types)
         fitting = sorted(t for t, kind in self.topics.items() if kind in types)
         if name is None:
             # Packets are often recorded together with the points that were made of them.
             fitting = [t for t in fitting if self.topics[t] not in velodyne.TYPES] or fitting
             if len(fitting) != 1:
-                raise SequenceError(
-                    f"{self.name}: {len(fitting)} topics with {what}"
-                    + (f", name one of them: {', '.join(fitting)}" if fitting else self._list())
-                )
+                help_ = f", name one of them: {', '.join(fitting)}" if fitting else self._list()
+                raise SequenceError(f"{self.name}: {len(fitting)} topics with {what}{help_}")
             return fitting[0]
         if name in fitting:
             return name
         if name in self.topics:
             raise SequenceError(f"{self.name}: {name} is {self.topics[name]}, not {what}")
-        raise SequenceError(
-            f"{self.name}: no topic {name}; {nearest(name, self.topics)}{self._list()}"
-        )
+        help_ = nearest(name, self.topics) + self._list()
+        raise SequenceError(f"{self.name}: no topic {name}; {help_}")
 
     def check(self, reference: str | None, imu: str | None) -> None:
-        """Make sure that the named topics are there, and that the points can be decoded.
-
-        Raises
-        ------
-        SequenceError
-            Naming the topics in the bags, or the package to install.
-        """
+        """Make sure that the named topics are there, and that the points can be decoded."""
         if self.topics[self.points] in velodyne.TYPES and find_spec("velodyne_decoder") is None:
             raise SequenceError(
                 f"{self.name}: {self.points} holds raw packets of a Velodyne; install "
@@ -258,13 +210,7 @@ class BagSource:
         return f"; it holds {', '.join(topics) or 'nothing'}"
 
     def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
-        """Deserialised messages of a topic, or its last one only.
-
-        Raises
-        ------
-        SequenceError
-            Naming the message that cannot be read.
-        """
+        """Deserialised messages of a topic, or its last one only."""
         with self.open() as reader:
             messages: Iterable[Any] = enumerate(self.read(reader, topic), start=1)
             if last:
@@ -279,13 +225,7 @@ class BagSource:
 
     @contextmanager
     def open(self) -> Iterator[AnyReader]:
-        """Open the bags for reading.
-
-        Raises
-        ------
-        SequenceError
-            If they cannot be opened.
-        """
+        """Open the bags for reading."""
         reader, self._ready = self._ready or self._opened(), None
         try:
             yield reader
@@ -307,13 +247,7 @@ class BagSource:
     def read(
         self, reader: AnyReader, topic: str | None = None
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Serialised messages of a topic, or of all topics.
-
-        Raises
-        ------
-        SequenceError
-            If the bags cannot be read on.
-        """
+        """Serialised messages of a topic, or of all topics."""
         messages = reader.messages([c for c in reader.connections if topic in (None, c.topic)])
         while True:
             try:
@@ -347,21 +281,17 @@ class BagSource:
             _, found = definitions.get(name, ((), ()))
             fields = [field for field in found if cdr or field[0] != "seq"]
             if fields != standard[name][1]:
-                raise SequenceError(
-                    f"{self.name}: its {name} is not as ROS defines it "
-                    f"({', '.join(field for field, _ in fields)})"
-                )
+                names = ", ".join(field for field, _ in fields)
+                raise SequenceError(f"{self.name}: its {name} is not as ROS defines it ({names})")
 
-    def _load(self, decode: Callable[[bytes], Scan], data: bytes, number: int) -> Scan:
-        try:
-            return decode(data)
-        except Exception as error:
-            reason = (
-                str(error) if isinstance(error, PointCloudError) else f"damaged ({_say(error)})"
-            )
-            raise SequenceError(
-                f"{self.name}: message {number} on {self.points}: {reason}"
-            ) from error
+
+def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:
+    try:
+        return decode(data)
+    except PointCloudError as error:
+        raise SequenceError(f"{what}: {error}") from error
+    except Exception as error:
+        raise SequenceError(f"{what}: damaged ({_say(error)})") from error
 
 
 def _close(reader: AnyReader) -> None:

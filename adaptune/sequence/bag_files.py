@@ -11,10 +11,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 def bag_paths(given: Sequence[str]) -> list[Path]:
     """Bags to open for the paths, folders and patterns that a user gives.
 
-    Raises
-    ------
-    SequenceError
-        Naming what does not exist or holds no bag.
+    A SequenceError names what does not exist or holds no bag.
     """
     paths: list[Path] = []
     for text in given:

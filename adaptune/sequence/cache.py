@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 import numpy as np
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from adaptune.sequence.scan import Scan
 
 _log = logging.getLogger(__name__)
+_NOT_KEPT = "%s: not kept in the cache (%s)"
 
 _VERSION = 3
 _SAMPLE = 1 << 16
@@ -59,15 +59,10 @@ def cap() -> int:
 
 
 def key(paths: Sequence[Path], settings: Any) -> str:
-    """Digest of files and settings.
+    """Digest of files and settings; an OSError if a file cannot be read.
 
     A file counts by its size, its time of change, its beginning and its end, not by its name. A
     folder counts by its files.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be read.
     """
     digest = hashlib.blake2b(f"{_VERSION} {settings!r}".encode(), digest_size=16)
     for path in paths:
@@ -83,21 +78,11 @@ def key(paths: Sequence[Path], settings: Any) -> str:
 
 
 class CachedScans:
-    """The scans of an entry, in any order.
-
-    Parameters
-    ----------
-    path
-        Folder of the entry.
-
-    Attributes
-    ----------
-    about : dict
-        Notes on the sequence from when it was decoded.
-    """
+    """The scans in the folder of an entry, in any order."""
 
     def __init__(self, path: Path):
         self.path = path
+        # Notes on the sequence from when it was decoded.
         self.about: dict[str, Any] = json.loads((path / "about.json").read_text("utf-8"))
         self._index = np.load(path / "index.npy")
         self._ends: list[int] = self._index["end"].tolist()
@@ -123,15 +108,12 @@ class CachedScans:
     @property
     def stamps(self) -> NDArray[np.int64]:
         """Stamps of the scans, of shape (n,)."""
-        stamps: NDArray[np.int64] = self._index["stamp"]
-        return stamps
+        return np.asarray(self._index["stamp"])
 
     def _map(self, name: str) -> NDArray[Any]:
-        path = self.path / f"{name}.npy"
         # An empty file cannot be mapped.
-        array: NDArray[Any] = np.load(
-            path, mmap_mode="r" if self._ends and self._ends[-1] else None
-        )
+        mode: Any = "r" if self._ends and self._ends[-1] else None
+        array: NDArray[Any] = np.load(self.path / f"{name}.npy", mmap_mode=mode)
         # A view of the base class: slices of memmap itself are slow to make.
         return array.view(np.ndarray)
 
@@ -168,25 +150,14 @@ class _Growing:
 
     def _header(self) -> None:
         # numpy leaves room for the first axis to grow, so the header keeps its size.
-        npy.write_array_header_1_0(
-            self._file,
-            {
-                "descr": npy.dtype_to_descr(self._dtype),
-                "fortran_order": False,
-                "shape": (self.length, *self._shape),
-            },
-        )
+        header = {"descr": npy.dtype_to_descr(self._dtype), "fortran_order": False}
+        npy.write_array_header_1_0(self._file, header | {"shape": (self.length, *self._shape)})
 
 
 class Writer:
     """Writes an entry scan by scan, as a context: it is there when the block ends well.
 
-    Parameters
-    ----------
-    key
-        Digest of the entry.
-    about
-        Notes on the sequence; plain data.
+    `key` is the entry's digest, `about` notes on the sequence (plain data).
     """
 
     def __init__(self, key: str, about: dict[str, Any]):
@@ -224,12 +195,7 @@ class Writer:
         self._about |= about
         self._done = True
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
             for array in self._arrays.values():
                 array.close()
@@ -242,7 +208,7 @@ class Writer:
                 if not (folder() / self._key).exists():
                     self._temporary.rename(folder() / self._key)
         except OSError as problem:
-            _log.warning("%s: not kept in the cache (%s)", self._about.get("name"), problem)
+            _log.warning(_NOT_KEPT, self._about.get("name"), problem)
         finally:
             shutil.rmtree(self._temporary, ignore_errors=True)
 
@@ -252,7 +218,7 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
     try:
         writer = Writer(key, about)
     except OSError as error:
-        _log.warning("%s: not kept in the cache (%s)", about.get("name"), error)
+        _log.warning(_NOT_KEPT, about.get("name"), error)
         yield from scans
         return
     with writer:
@@ -260,13 +226,13 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
         for scan in scans:
             total += scan.points.nbytes
             if keeping and total > cap():
-                _log.warning("%s: larger than the cache may grow, not kept", about.get("name"))
+                _log.warning(_NOT_KEPT, about.get("name"), "larger than the cache may grow")
                 keeping = False
             if keeping:
                 try:
                     writer.append(scan)
                 except OSError as error:
-                    _log.warning("%s: not kept in the cache (%s)", about.get("name"), error)
+                    _log.warning(_NOT_KEPT, about.get("name"), error)
                     keeping = False
             yield scan
         if keeping:
@@ -275,35 +241,19 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """A decoded sequence on disk.
+    """A decoded sequence on disk."""
 
-    Attributes
-    ----------
-    name : str
-        The recording.
-    path : Path
-        Folder of the entry.
-    size : int
-        Bytes.
-    used : float
-        When it was last opened, in seconds since 1970.
-    n_scans : int
-    """
-
-    name: str
-    path: Path
-    size: int
-    used: float
+    name: str  # the recording
+    path: Path  # folder of the entry
+    size: int  # bytes
+    used: float  # when it was last opened, in seconds since 1970
     n_scans: int
 
 
 def list_cache() -> list[CacheEntry]:
     """All entries, the last used first."""
     entries = []
-    root = folder()
-    for path in root.iterdir() if root.is_dir() else ():
-        if path.name.startswith("."):
-            continue
+    for path in folder().glob("[!.]*"):
         try:
             about = path / "about.json"
             name = json.loads(about.read_text("utf-8"))["name"]
@@ -316,16 +266,9 @@ def list_cache() -> list[CacheEntry]:
 
 
 def clear_cache() -> int:
-    """Remove all entries and the remains of dead writers.
-
-    Returns
-    -------
-    int
-        Freed bytes.
-    """
+    """Remove all entries and the remains of dead writers, and return the freed bytes."""
     freed = 0
-    root = folder()
-    for path in root.iterdir() if root.is_dir() else ():
+    for path in folder().glob("*"):
         # Other files in a shared folder stay.
         if path.name.startswith(".writing-") or (path / "index.npy").exists():
             freed += _size(path)

@@ -24,22 +24,10 @@ _FAR = 1.0
 
 
 def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
-    """Undo a motion of constant velocity.
+    """Undo a motion of constant velocity: the points as seen from the sensor at the scan's stamp.
 
-    Parameters
-    ----------
-    scan
-        A scan whose points have times; one without is returned as it is.
-    T_start_end
-        Pose of the sensor `duration` after the scan's stamp, seen from where it was at the stamp;
-        of shape (4, 4).
-    duration
-        Seconds.
-
-    Returns
-    -------
-    Scan
-        Its points in the sensor's frame at the stamp.
+    `T_start_end` is the sensor's pose `duration` seconds after the stamp, seen from where it was at
+    the stamp. A scan whose points have no times is returned as it is.
     """
     if scan.times is None or not len(scan):
         return scan
@@ -58,8 +46,7 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
     Yields
     ------
     scan : Scan
-    T_before_scan : ndarray of shape (4, 4) or None
-        None where it is not known.
+    T_before_scan : ndarray of shape (4, 4), or None where it is not known
     seconds : float
         Between their stamps; negative where scans are read backwards.
     """
@@ -70,20 +57,15 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
     for scan in scans:
         now = None
         if len(scan) >= _FEWEST:
-            now = small_gicp.preprocess_points(
-                scan.points.astype(np.float64), downsampling_resolution=_CELL, num_threads=1
-            )
+            points = scan.points.astype(np.float64)
+            now = small_gicp.preprocess_points(points, downsampling_resolution=_CELL, num_threads=1)
             now = now if now[0].size() >= _FEWEST else None
         seconds = (scan.stamp - last) * 1e-9
         T_before_scan = None
         if before is not None and now is not None and 0 < abs(seconds) <= _FAR:
+            options = {"max_correspondence_distance": _REACH, "num_threads": 1}
             result = small_gicp.align(
-                before[0],
-                now[0],
-                before[1],
-                init_T_target_source=guess,
-                max_correspondence_distance=_REACH,
-                num_threads=1,
+                before[0], now[0], before[1], init_T_target_source=guess, **options
             )
             if result.converged and result.num_inliers > now[0].size() / 2:
                 T_before_scan = geometry.rectify(result.T_target_source)
@@ -120,12 +102,7 @@ def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
     """Undo the rotation that a gyroscope measured during the scan.
 
     Translation stays. A scan without times, or without measurements around it, is returned as it
-    is.
-
-    Parameters
-    ----------
-    scan, imu
-        On the same clock.
+    is. Both are on the same clock.
     """
     if scan.times is None or not len(scan):
         return scan
@@ -159,5 +136,4 @@ def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Rotation) -> ND
     share = (place - low)[:, None]
     before = np.einsum("nij,nj->ni", matrices[low], scan.points)
     after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
-    rotated: NDArray[np.float32] = before + share * (after - before)
-    return rotated
+    return np.asarray(before + share * (after - before))

@@ -27,26 +27,14 @@ _SOURCES = ("bag", "kitti", "folder", "evalio")
 
 
 def expand(text: str) -> str:
-    """Replace ``${VARIABLE}`` by the value of the environment variable.
-
-    Raises
-    ------
-    ValueError
-        Naming the environment variable that is not set.
-    """
+    """Replace ``${VARIABLE}`` by its value; a ValueError names the variable that is not set."""
     if unset := [v for v in re.findall(r"\$\{(\w+)\}", text) if v not in os.environ]:
         raise ValueError(f"the environment variable {unset[0]} is not set")
     return os.path.expandvars(text)
 
 
 def resolve(path: str, info: ValidationInfo) -> str:
-    """Make a path absolute: variables and ~ replaced, relative to the folder of the study's file.
-
-    Raises
-    ------
-    ValueError
-        Naming the environment variable that is not set.
-    """
+    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
     folder = (info.context or {}).get("folder", Path())
     return str((Path(folder) / Path(expand(path)).expanduser()).resolve())
 
@@ -74,13 +62,7 @@ def _check_transform(given: Any) -> Any:
 
 
 def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
-    """Pose of shape (4, 4) from ``x y z qx qy qz qw``, or from the rows of a matrix.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
     values = np.array(given, np.float64) if len({np.size(row) for row in given}) == 1 else None
     if values is not None and values.shape == (7,):
         if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
@@ -143,37 +125,22 @@ class NoiseConfig(_Section):
 
 
 class ViewConfig(_Section):
-    """One view, by its name; views apply in the order of the list.
+    """One view, by its name; views apply in the order of the list."""
 
-    Attributes
-    ----------
-    cut : list of (start, stop)
-        Only these parts, in seconds since the first scan.
-    drop : DropConfig
-    speed : SpeedConfig
-    reverse : true
-    rings : int
-        Keep one ring in so many.
-    noise : NoiseConfig
-    transform : Transform
-        Pose of the LiDAR in the frame from which to see it.
-    """
-
+    # Only these parts, in seconds since the first scan.
     cut: tuple[tuple[float, float], ...] | None = Field(None, min_length=1)
     drop: DropConfig | None = None
     speed: SpeedConfig | None = None
     reverse: Literal[True] | None = None
-    rings: int | None = Field(None, ge=2)
+    rings: int | None = Field(None, ge=2)  # keep one ring in so many
     noise: NoiseConfig | None = None
-    transform: Transform | None = None
+    transform: Transform | None = None  # pose of the LiDAR in the frame from which to see it
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if len(self._given()) != 1:
-            raise ValueError(
-                f"each view is an entry of its own, `- name: ...` with one of "
-                f"{', '.join(type(self).model_fields)}"
-            )
+            names = ", ".join(type(self).model_fields)
+            raise ValueError(f"each view is an entry of its own, `- name: ...` with one of {names}")
         if self.cut and (bad := [part for part in self.cut if not 0 <= part[0] < part[1]]):
             raise ValueError(f"a part goes from a start to a later stop, not {list(bad[0])}")
         return self
@@ -200,101 +167,54 @@ class NoiseDensities(_Section):
 
 
 class ImuConfig(_Section):
-    """An IMU.
+    """An IMU."""
 
-    Attributes
-    ----------
-    topic : str, optional
-        May be left out where there is only one.
-    extrinsic : Transform, optional
-        Its pose in the LiDAR's frame.
-    unit : {"m/s2", "g"}
-        Of its accelerometer.
-    noise : NoiseDensities
-        For odometries that weigh it against the LiDAR.
-    """
-
-    topic: str | None = None
-    extrinsic: Transform | None = None
-    unit: Literal["m/s2", "g"] = "m/s2"
-    noise: NoiseDensities = NoiseDensities()
+    topic: str | None = None  # may be left out where there is only one
+    extrinsic: Transform | None = None  # its pose in the LiDAR's frame
+    unit: Literal["m/s2", "g"] = "m/s2"  # of its accelerometer
+    noise: NoiseDensities = NoiseDensities()  # for odometries that weigh it against the LiDAR
 
 
 class SequenceConfig(_Part):
-    """A recording and what of it to use.
+    """A recording, from one of `bag`, `kitti`, `folder` and `evalio`, and what of it to use."""
 
-    Attributes
-    ----------
-    bag : str or list of str, optional
-        Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
-    kitti : str, optional
-        In place of `bag`, the folder of a KITTI odometry sequence, or of a drive of KITTI raw or
-        KITTI-360.
-    folder : str, optional
-        In place of `bag`, a folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
-    evalio : str, optional
-        In place of `bag`, the name of one of evalio's sequences, as ``newer_college_2020/short``.
-    points : str, optional
-        Topic of the point clouds.
-    stamp : {"auto", "start", "end"}
-        Whether a stamp marks the start or the end of its scan.
-    time_unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the points' times.
-    period : float
-        Seconds a scan takes; used if neither points nor files have times.
-    start, stop : float
-        Seconds since the first scan.
-    stride : int
-        Use every stride-th scan.
-    reference : str, optional
-        Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
-    child_frame : str, optional
-        Where `reference` is a topic of transforms, the frame whose poses to take.
-    extrinsic : Transform, optional
-        The LiDAR's pose in the frame that the reference poses are of.
-    clock_offset : float
-        Seconds to add to the reference's stamps.
-    max_gap : float
-        Seconds. The reference is unknown between poses further apart.
-    imu : ImuConfig, optional
-    elevation : float, optional
-        Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
-        benchmark and the raw drives when left out.
-    compensate : {"constant_velocity", "gyro"}, optional
-        Compensate every scan for the motion since the scan before, or for the rotation that the
-        IMU measured.
-    views : list of ViewConfig
-    cache : bool
-        Whether to keep decoded bags in the cache.
-    """
-
+    # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
+    # Folder of a KITTI odometry sequence, or of a drive of KITTI raw or KITTI-360.
     kitti: Annotated[str, AfterValidator(resolve)] | None = None
+    # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
     folder: Annotated[str, AfterValidator(resolve)] | None = None
-    evalio: str | None = None
-    points: str | None = None
-    stamp: Literal["auto", "start", "end"] = "auto"
-    time_unit: Unit | None = None
+    evalio: str | None = None  # one of evalio's sequences, as ``newer_college_2020/short``
+    points: str | None = None  # topic of the point clouds
+    stamp: Literal["auto", "start", "end"] = "auto"  # what a stamp marks of its scan
+    time_unit: Unit | None = None  # of the points' times
+    # Seconds a scan takes; used if neither points nor files have times.
     period: float = Field(0.1, gt=0, allow_inf_nan=False)
-    stride: int = Field(1, ge=1)
+    stride: int = Field(1, ge=1)  # use every stride-th scan
+    # Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
-    child_frame: str | None = None
-    extrinsic: Transform | None = None
-    clock_offset: float = Field(0.0, allow_inf_nan=False)
+    child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
+    extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
+    clock_offset: float = Field(
+        0.0, allow_inf_nan=False
+    )  # seconds to add to the reference's stamps
+    # Seconds. The reference is unknown between poses further apart.
     max_gap: float = Field(1.0, gt=0, allow_inf_nan=False)
     imu: ImuConfig | None = None
+    # Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
+    # benchmark and the raw drives when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
+    # Undo the motion since the scan before, or the rotation that the IMU measured.
     compensate: Literal["constant_velocity", "gyro"] | None = None
     views: tuple[ViewConfig, ...] = ()
-    cache: bool = True
+    cache: bool = True  # whether to keep decoded bags in the cache
 
     @model_validator(mode="after")
     def _check_source(self) -> Self:
         given = [name for name in _SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(
-                f"give one of {', '.join(_SOURCES)}, not {' and '.join(given) or 'none'}"
-            )
+            found = " and ".join(given) or "none"
+            raise ValueError(f"give one of {', '.join(_SOURCES)}, not {found}")
         if self.points is not None and given[0] != "bag":
             raise ValueError(f"`points` names a topic of a bag; {given[0]} has none")
         if self.elevation is not None and given[0] != "kitti":
@@ -304,13 +224,7 @@ class SequenceConfig(_Part):
         return self
 
     def paths(self) -> list[Path]:
-        """Files and folders that it is read from.
-
-        Raises
-        ------
-        SequenceError
-            If there is no such bag.
-        """
+        """Files and folders that it is read from; a SequenceError if there is no such bag."""
         paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
         paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
         if self.reference is not None and self.reference.endswith(REFERENCE_FILES):

@@ -1,6 +1,7 @@
 """Sequences of the public data sets that evalio knows, by name."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from itertools import count
@@ -24,28 +25,23 @@ def evalio_source(name: str) -> Source:
     """Scans, poses and IMU of a sequence such as ``newer_college_2020/short_experiment``.
 
     evalio knows where the files are (in its data folder, ``$EVALIO_DATA``), what their stamps mean
-    and the frames of the poses. adaptune reads bags itself; evalio converts all other files.
-
-    Raises
-    ------
-    SequenceError
-        If evalio is not installed, or does not know or have the sequence.
+    and the frames of the poses. adaptune reads bags itself; evalio converts all other files. A
+    SequenceError says that evalio is not installed, or does not know or have the sequence.
     """
     try:
         datasets: Any = import_module("evalio.datasets")
     except ImportError as error:
-        raise SequenceError(
-            f"{name}: evalio's data sets need evalio: `pip install evalio` ({error})"
-        ) from error
+        what = f"evalio's data sets need evalio: `pip install evalio` ({error})"
+        raise SequenceError(f"{name}: {what}") from error
     try:
         dataset: Any = datasets.get_sequence(name)
     except Exception as error:
-        raise SequenceError(
-            f"{name}: evalio knows no such sequence ({error or type(error).__name__}); "
-            f"`evalio ls` lists them"
-        ) from error
+        dataset = error
     if isinstance(dataset, Exception):
-        raise SequenceError(f"{name}: evalio knows no such sequence; `evalio ls` lists them")
+        raise SequenceError(
+            f"{name}: evalio knows no such sequence ({dataset or type(dataset).__name__}); "
+            f"`evalio ls` lists them"
+        ) from dataset
     if not dataset.is_downloaded():
         raise SequenceError(
             f"{name}: not in evalio's data folder ({dataset.folder}); fetch it with "
@@ -78,14 +74,12 @@ class EvalioBag(BagSource):
     """A data set in bags. evalio knows the topics, the meaning of the stamps and the poses."""
 
     def __init__(self, dataset: Any, recording: Any):
-        at_end = str(recording.lidar_format.stamp) == "end"
-        period = float(recording.lidar_params.delta_time().to_sec())
         self._dataset, self._imu_topic = dataset, recording.imu_topic
         paths = bag_paths([str(path) for path in recording.path])
         recording.reader.close()
-        super().__init__(
-            paths, recording.lidar_topic, Timing("end" if at_end else "start", period=period)
-        )
+        stamp: Any = "end" if str(recording.lidar_format.stamp) == "end" else "start"
+        timing = Timing(stamp, period=float(recording.lidar_params.delta_time().to_sec()))
+        super().__init__(paths, recording.lidar_topic, timing)
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """The data set's poses, or those of a topic."""
@@ -94,11 +88,7 @@ class EvalioBag(BagSource):
     def imu(self, name: str | None) -> Imu | None:
         """The data set's IMU."""
         found = super().imu(name or self._imu_topic)
-        if found is None:
-            return None
-        return Imu(
-            found.stamps, found.angular_velocity, found.acceleration, _place_of_imu(self._dataset)
-        )
+        return None if found is None else replace(found, T_sensor_imu=_place_of_imu(self._dataset))
 
 
 class EvalioFiles:
@@ -128,9 +118,8 @@ class EvalioFiles:
             except StopIteration:
                 return
             except Exception as error:
-                raise SequenceError(
-                    f"{self.name}: scan {number} cannot be read ({error})"
-                ) from error
+                what = f"scan {number} cannot be read ({error})"
+                raise SequenceError(f"{self.name}: {what}") from error
             stamp = measurement.stamp.to_nsec()
             yield Frame(stamp, stamp, partial(_scan, measurement))
 

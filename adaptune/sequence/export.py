@@ -1,6 +1,7 @@
 """Sequences as bags and folders, for programs that read nothing else."""
 
 import heapq
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -30,21 +31,14 @@ _KINDS = {"<f4": 7, "<u2": 4}
 
 
 class Messages:
-    """Makes ROS messages.
-
-    Parameters
-    ----------
-    version
-        Of ROS.
-    """
+    """Makes messages of a version of ROS."""
 
     def __init__(self, version: Literal[1, 2]) -> None:
-        store = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
         self.version = version
-        self.typestore = get_typestore(store)
+        self.typestore = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
         self.types = self.typestore.types
         # Only a ROS 1 header counts its messages.
-        self._counts: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
 
     def header(self, topic: str, stamp: int, frame: str) -> Any:
         """A header with nanoseconds and frame, counted by topic in ROS 1."""
@@ -52,8 +46,9 @@ class Messages:
         header = self.types["std_msgs/msg/Header"]
         if self.version == 2:
             return header(stamp=time, frame_id=frame)
-        self._counts[topic] = self._counts.get(topic, -1) + 1
-        return header(seq=self._counts[topic], stamp=time, frame_id=frame)
+        number = self._counts[topic]
+        self._counts[topic] += 1
+        return header(seq=number, stamp=time, frame_id=frame)
 
     def cloud(self, header: Any, cloud: NDArray[Any]) -> Any:
         """A cloud of points in a structured array of shape (n,) of float32 and uint16."""
@@ -77,15 +72,12 @@ class Messages:
 
     def imu(self, header: Any, gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> Any:
         """A measurement without an orientation."""
-        t = self.types
-        vector = t["geometry_msgs/msg/Vector3"]
-        unknown = np.zeros(9)
-        # As the message's definition has it: no orientation is estimated.
-        unoriented = np.array([-1.0, *np.zeros(8)])
-        return t["sensor_msgs/msg/Imu"](
+        vector, unknown = self.types["geometry_msgs/msg/Vector3"], np.zeros(9)
+        return self.types["sensor_msgs/msg/Imu"](
             header=header,
-            orientation=t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-            orientation_covariance=unoriented,
+            orientation=self.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            # As the message's definition has it: no orientation is estimated.
+            orientation_covariance=np.array([-1.0, *np.zeros(8)]),
             angular_velocity=vector(*gyro.tolist()),
             angular_velocity_covariance=unknown,
             linear_acceleration=vector(*accel.tolist()),
@@ -99,12 +91,12 @@ class Messages:
         messages: Iterable[Message],
         storage: StoragePlugin = StoragePlugin.SQLITE3,
     ) -> None:
-        """Write a bag: a file of ROS 1, or a folder of ROS 2.
+        """Write a bag where nothing is yet: a file of ROS 1, or a folder of ROS 2.
 
         Parameters
         ----------
         path
-            Where nothing is yet.
+            The file or the folder.
         types
             Of the messages on each topic.
         messages
@@ -112,18 +104,15 @@ class Messages:
         storage
             Format of a ROS 2 bag's files.
         """
-        store = self.typestore
-        writer = (
-            Writer1(path) if self.version == 1 else Writer2(path, version=9, storage_plugin=storage)
-        )
-        serialize = store.serialize_ros1 if self.version == 1 else store.serialize_cdr
-        with writer:
+        store, writer = self.typestore, Writer1(path) if self.version == 1 else None
+        serialize = store.serialize_cdr if writer is None else store.serialize_ros1
+        with writer or Writer2(path, version=9, storage_plugin=storage) as bag:
             topics: dict[str, Any] = {
-                topic: writer.add_connection(topic, kind, typestore=store)
+                topic: bag.add_connection(topic, kind, typestore=store)
                 for topic, kind in types.items()
             }
             for topic, stamp, message in messages:
-                writer.write(topics[topic], stamp, serialize(message, types[topic]))
+                bag.write(topics[topic], stamp, serialize(message, types[topic]))
 
 
 def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -> None:
@@ -131,18 +120,7 @@ def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -
 
     Bags hold `POINTS` (x, y, z, intensity, which is 0 where the scans have none, and ring and time
     where they have them) and `IMU`. A KITTI folder holds sequence 00, its camera in the LiDAR's
-    frame.
-
-    Parameters
-    ----------
-    scans
-        In order of time.
-    imu
-        On the clock of the scans.
-    path
-        Where nothing is yet.
-    layout
-        What to write.
+    frame. Scans are in order of time, the IMU is on their clock, and nothing is at `path` yet.
     """
     if layout == "kitti":
         _write_kitti(scans, path)
@@ -159,35 +137,25 @@ def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -
 def _clouds(messages: Messages, scans: Iterable[Scan]) -> Iterator[Message]:
     """Each cloud when its scan is over."""
     for scan in scans:
-        over = 0.0 if scan.times is None or not len(scan) else float(scan.times.max())
         header = messages.header(POINTS, scan.stamp, "lidar")
-        message = messages.cloud(header, _structured(scan))
-        yield POINTS, scan.stamp + max(round(over * 1e9), 0), message
+        yield POINTS, scan.stamp + max(scan.span, 0), messages.cloud(header, _structured(scan))
 
 
 def _structured(scan: Scan) -> NDArray[Any]:
-    kinds = [(name, "<f4") for name in ("x", "y", "z", "intensity")]
-    if scan.rings is not None:
-        kinds.append(("ring", "<u2"))
-    if scan.times is not None:
-        kinds.append(("time", "<f4"))
-    cloud = np.zeros(len(scan), kinds)
-    cloud["x"], cloud["y"], cloud["z"] = scan.points.T
-    if scan.intensities is not None:
-        cloud["intensity"] = scan.intensities
-    if scan.rings is not None:
-        cloud["ring"] = scan.rings
-    if scan.times is not None:
-        cloud["time"] = scan.times
+    x, y, z = scan.points.T
+    light = np.zeros(len(scan)) if scan.intensities is None else scan.intensities
+    columns = {"x": x, "y": y, "z": z, "intensity": light, "ring": scan.rings, "time": scan.times}
+    given = {name: values for name, values in columns.items() if values is not None}
+    cloud = np.empty(len(scan), [(name, "<u2" if name == "ring" else "<f4") for name in given])
+    for name, values in given.items():
+        cloud[name] = values
     return cloud
 
 
 def _measurements(messages: Messages, imu: Imu) -> Iterator[Message]:
-    for stamp, gyro, accel in zip(
-        imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True
-    ):
-        header = messages.header(IMU, stamp, "imu")
-        yield IMU, stamp, messages.imu(header, gyro, accel)
+    measured = zip(imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True)
+    for stamp, gyro, accel in measured:
+        yield IMU, stamp, messages.imu(messages.header(IMU, stamp, "imu"), gyro, accel)
 
 
 def _write_kitti(scans: Iterable[Scan], path: Path) -> None:
@@ -205,16 +173,9 @@ def _write_kitti(scans: Iterable[Scan], path: Path) -> None:
 
 
 def write_kitti_times(sequence: Path, seconds: NDArray[np.float64], T_camera_lidar: Poses) -> None:
-    """Write ``times.txt`` and ``calib.txt`` of a KITTI odometry sequence.
+    """Write ``times.txt`` and ``calib.txt`` into the folder of a KITTI odometry sequence.
 
-    Parameters
-    ----------
-    sequence
-        Its folder.
-    seconds
-        Of each scan, of shape (n,).
-    T_camera_lidar
-        The LiDAR's pose in the frame that KITTI's poses are of, of shape (4, 4).
+    `seconds` of each scan are of shape (n,). KITTI's poses are those of the camera.
     """
     write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
     rows = " ".join(f"{v:.12e}" for v in T_camera_lidar[:3].ravel())

@@ -1,4 +1,7 @@
-"""Recordings with one file for each scan."""
+"""Recordings with one file for each scan.
+
+All functions raise a SequenceError that names the file or folder that is missing or unfit.
+"""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -28,29 +31,15 @@ _ELEVATION = 0.205
 
 @dataclass(frozen=True, eq=False)
 class FileSource:
-    """Scans in files of their own.
+    """Scans in files of their own."""
 
-    Attributes
-    ----------
-    name : str
-        The folder.
-    files : sequence of Path
-    stamps : ndarray of shape (n,)
-        Nanoseconds of each file.
-    timing : Timing
-        What the stamps mean.
-    own_poses : callable, optional
-        Reads the LiDAR's poses stored with the files.
-    elevation : float
-        Degrees by which every ray is to be turned up.
-    """
-
-    name: str
+    name: str  # the folder
     files: Sequence[Path]
-    stamps: NDArray[np.int64]
-    timing: Timing = AUTO
+    stamps: NDArray[np.int64]  # nanoseconds of each file, of shape (n,)
+    timing: Timing = AUTO  # what the stamps mean
+    # Reads the LiDAR's poses stored with the files.
     own_poses: Callable[[], Trajectory] | None = None
-    elevation: float = 0.0
+    elevation: float = 0.0  # degrees by which every ray is to be turned up
 
     random_access: ClassVar[bool] = True
 
@@ -79,15 +68,7 @@ class FileSource:
         return (int(self.stamps[0]), int(self.stamps[-1])) if len(self.stamps) else None
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """The LiDAR's poses stored with the files.
-
-        Raises
-        ------
-        SequenceError
-            If a topic is asked for.
-        TrajectoryError
-            If they cannot be read.
-        """
+        """The LiDAR's poses stored with the files; a TrajectoryError if they cannot be read."""
         if name is not None or child_frame is not None:
             raise SequenceError(
                 f"{self.name}: has no topics; `reference` must be a file of poses, or be left out"
@@ -107,13 +88,7 @@ class FileSource:
 
 
 def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
-    """Read one file: ``.bin`` as KITTI writes them, ``.npy``, ``.pcd`` or ``.ply``.
-
-    Raises
-    ------
-    SequenceError
-        Naming the file.
-    """
+    """Read one file: ``.bin`` as KITTI writes them, ``.npy``, ``.pcd`` or ``.ply``."""
     try:
         return from_fields(_fields(path), stamp, timing)
     except FileNotFoundError as error:
@@ -123,15 +98,10 @@ def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
 
 
 def turn_up(points: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
-    """Turn every ray up by an angle, in the vertical plane in which it lies.
+    """Turn every ray up by `degrees`, in the vertical plane in which it lies.
 
-    Parameters
-    ----------
-    points
-        Of shape (n, 3).
-    degrees
-        Those of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018; KISS-ICP
-        corrects it likewise).
+    The rays of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018; KISS-ICP corrects
+    it likewise). `points` are of shape (n, 3).
     """
     sine, cosine = np.sin(np.deg2rad(degrees)), np.cos(np.deg2rad(degrees))
     distance = np.hypot(points[:, 0], points[:, 1])
@@ -183,11 +153,6 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
 
     Stamps are the lines of ``times.txt`` (seconds) where there is one; else the files' names
     where these are seconds with a fraction or nanoseconds since 1970; else one `period` a file.
-
-    Raises
-    ------
-    SequenceError
-        If there is no scan, or the stamps do not go with the files.
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
@@ -226,19 +191,8 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
 
     The content of the folder shows the kind: ``velodyne/`` with ``times.txt`` and ``calib.txt``
     (poses in ``poses.txt``, or ``poses/`` two folders up), or ``velodyne_points/data/`` (poses
-    from ``oxts/``, or from ``data_poses/`` two folders up).
-
-    Parameters
-    ----------
-    folder
-        Of the sequence or the drive.
-    elevation
-        Degrees by which to turn up every ray; 0.205 when left out, and 0 for KITTI-360.
-
-    Raises
-    ------
-    SequenceError
-        If it holds neither, or files are missing.
+    from ``oxts/``, or from ``data_poses/`` two folders up). Every ray is turned up by `elevation`
+    degrees: 0.205 when left out, and 0 for KITTI-360.
     """
     if (folder / "velodyne").is_dir():
         return _kitti_odometry(folder, _ELEVATION if elevation is None else elevation)
@@ -246,9 +200,8 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
         return _kitti_drive(folder, elevation)
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    raise SequenceError(
-        f"{folder}: not a KITTI sequence; it has neither velodyne/ nor velodyne_points/data/"
-    )
+    what = "not a KITTI sequence; it has neither velodyne/ nor velodyne_points/data/"
+    raise SequenceError(f"{folder}: {what}")
 
 
 def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
@@ -269,13 +222,8 @@ def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
         return Trajectory(stamps, T)
 
     # Files may be missing from the front or the middle: their numbers give the stamps.
-    return FileSource(
-        str(folder),
-        files,
-        _by_number(files, stamps),
-        own_poses=poses if found else None,
-        elevation=elevation,
-    )
+    of_files, own_poses = _by_number(files, stamps), poses if found else None
+    return FileSource(str(folder), files, of_files, own_poses=own_poses, elevation=elevation)
 
 
 def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
@@ -319,23 +267,15 @@ def _kitti_360_poses(record: Path, stamps: NDArray[np.int64]) -> Trajectory:
     folder = record.parent.parent / "calibration"
     T_body_camera = calibration(folder / "calib_cam_to_pose.txt", "image_00")
     T_sensor_camera = _matrix(folder / "calib_cam_to_velo.txt")
-    T_world_body = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_world_body[:, :3] = rows[:, 1:].reshape(-1, 3, 4)
-    return Trajectory(
-        stamps[frames], T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
-    )
+    T_world_body = _pose(rows[:, 1:].reshape(-1, 3, 4))
+    T_world_sensor = T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
+    return Trajectory(stamps[frames], T_world_sensor)
 
 
 def calibration(path: Path, key: str) -> Poses:
-    """A 3x4 matrix of KITTI's ``key: 12 numbers`` files, as a pose of shape (4, 4).
-
-    Raises
-    ------
-    SequenceError
-        Naming the key that is missing.
-    """
-    numbers = _entries(path).get(key)
-    if numbers is None or len(numbers) != 12:
+    """A 3x4 matrix of KITTI's ``key: 12 numbers`` files, as a pose of shape (4, 4)."""
+    numbers = _entries(path).get(key, [])
+    if len(numbers) != 12:
         raise SequenceError(f"{path}: no line `{key}:` with 12 numbers")
     return _pose(np.array(numbers).reshape(3, 4))
 
@@ -359,8 +299,9 @@ def _matrix(path: Path) -> Poses:
 
 
 def _pose(rows: NDArray[np.float64]) -> Poses:
-    T = np.eye(4)
-    T[:3] = rows
+    """Complete matrices of shape (..., 3, 4)."""
+    T = np.zeros((*rows.shape[:-2], 4, 4))
+    T[..., :3, :], T[..., 3, 3] = rows, 1.0
     return T
 
 
@@ -376,22 +317,18 @@ def _entries(path: Path) -> dict[str, list[float]]:
 
 
 def _scans(folder: Path) -> list[Path]:
-    files = sorted(folder.glob("*.bin"))
-    if not files:
-        raise SequenceError(f"{folder}: holds no .bin files")
-    return files
+    if files := sorted(folder.glob("*.bin")):
+        return files
+    raise SequenceError(f"{folder}: holds no .bin files")
 
 
 def _by_number(files: Sequence[Path], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
     """Stamp of each file by the number that its name is."""
     try:
-        numbers = np.array([int(path.stem) for path in files])
-        of_files: NDArray[np.int64] = stamps[numbers]
+        return np.asarray(stamps[[int(path.stem) for path in files]])
     except (ValueError, IndexError) as error:
-        raise SequenceError(
-            f"{files[0].parent}: the files' numbers do not go with {len(stamps)} stamps"
-        ) from error
-    return of_files
+        what = f"the files' numbers do not go with {len(stamps)} stamps"
+        raise SequenceError(f"{files[0].parent}: {what}") from error
 
 
 def _seconds(path: Path) -> NDArray[np.int64]:
@@ -409,8 +346,7 @@ def _dates(path: Path) -> NDArray[np.int64]:
         dates = np.array([line or "NaT" for line in lines], "datetime64[ns]")
     except ValueError as error:
         raise SequenceError(f"{path}: a line is not a date and time ({error})") from error
-    stamps: NDArray[np.int64] = dates.astype(np.int64)
-    return stamps
+    return np.asarray(dates.astype(np.int64))
 
 
 def _text(path: Path) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,27 +12,16 @@ from adaptune.geometry import Poses
 from adaptune.trajectory import Trajectory
 
 _CORRELATION = 0.8
+_MEASURED = ("stamps", "angular_velocity", "acceleration")
 
 
 class ImuNoise(NamedTuple):
-    """White noise of an IMU and the random walk of its biases; the defaults are a fair MEMS IMU's.
+    """White noise and random walk of the biases of an IMU; by default those of a fair MEMS IMU."""
 
-    Attributes
-    ----------
-    gyroscope : float
-        rad/s for a root hertz.
-    accelerometer : float
-        m/s^2 for a root hertz.
-    gyroscope_walk : float
-        rad/s^2 for a root hertz.
-    accelerometer_walk : float
-        m/s^3 for a root hertz.
-    """
-
-    gyroscope: float = 2e-4
-    accelerometer: float = 2e-3
-    gyroscope_walk: float = 2e-5
-    accelerometer_walk: float = 2e-4
+    gyroscope: float = 2e-4  # rad/s for a root hertz
+    accelerometer: float = 2e-3  # m/s^2 for a root hertz
+    gyroscope_walk: float = 2e-5  # rad/s^2 for a root hertz
+    accelerometer_walk: float = 2e-4  # m/s^3 for a root hertz
 
 
 USUAL = ImuNoise()
@@ -71,22 +60,14 @@ class Imu:
 
     def part(self, first: int, last: int) -> "Imu":
         """Measurements from number `first` to before number `last`."""
-        return replace(
-            self,
-            stamps=self.stamps[first:last],
-            angular_velocity=self.angular_velocity[first:last],
-            acceleration=self.acceleration[first:last],
-        )
+        return replace(self, **{name: getattr(self, name)[first:last] for name in _MEASURED})
 
 
 def joined(parts: Sequence[Imu]) -> Imu:
     """Measurements of one IMU, one part after the other."""
-    return replace(
-        parts[0],
-        stamps=np.concatenate([part.stamps for part in parts]),
-        angular_velocity=np.concatenate([part.angular_velocity for part in parts]),
-        acceleration=np.concatenate([part.acceleration for part in parts]),
-    )
+    whole: dict[str, Any]
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _MEASURED}
+    return replace(parts[0], **whole)
 
 
 def clock_offset(
@@ -148,13 +129,11 @@ def _correlation(
     """Pearson's coefficient of the overlap of `a`, moved to start at each sample of `b`."""
     from scipy.signal import correlate
 
+    def slide(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(correlate(y, x, mode="full", method="fft"))
+
     lags = np.arange(-(len(a) - 1), len(b))
     ones_a, ones_b = np.ones_like(a), np.ones_like(b)
-
-    def slide(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        result: NDArray[np.float64] = correlate(y, x, mode="full", method="fft")
-        return result
-
     n = np.maximum(slide(ones_a, ones_b).round(), 1.0)
     mean_a, mean_b = slide(a, ones_b) / n, slide(ones_a, b) / n
     covariance = slide(a, b) / n - mean_a * mean_b

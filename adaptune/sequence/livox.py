@@ -16,22 +16,15 @@ from adaptune.sequence.timing import Timing
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 
+_POINT = """uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z
+uint8 reflectivity\nuint8 tag\nuint8 line\n"""
+_MESSAGE = """std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id
+uint8[3] rsvd\nCustomPoint[] points\n"""
 # For ROS 2 bags without definitions; all others bring their own.
 DEFINITIONS = {
     f"{package}/msg/{name}": text
     for package in ("livox_ros_driver", "livox_ros_driver2")
-    for name, text in (
-        (
-            "CustomPoint",
-            "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
-            "uint8 reflectivity\nuint8 tag\nuint8 line\n",
-        ),
-        (
-            "CustomMsg",
-            "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
-            "uint8[3] rsvd\nCustomPoint[] points\n",
-        ),
-    )
+    for name, text in (("CustomPoint", _POINT), ("CustomMsg", _MESSAGE))
 }
 
 _Fields = Sequence[tuple[str, Any]]
@@ -44,12 +37,10 @@ def decode(
 
     Parameters
     ----------
-    data
-        The message as it lies in the bag.
+    data, cdr
+        The message as it lies in the bag, and whether it is serialised as in ROS 2.
     message, point
         Fields of the message and of one point, as rosbags gives them.
-    cdr
-        Whether it is serialised as in ROS 2.
     timing
         Meaning of its stamps. The points' offsets count from the time base. The stamp marks the
         same moment, unless it is set to mark the scan's end.
@@ -97,8 +88,8 @@ def _point_dtype(point: _Fields, cdr: bool, order: str) -> tuple[np.dtype[Any], 
     names, formats, offsets, at, widest = [], [], [], 0, 1
     for name, description in point:
         size, number = _extent(description)
-        kind = {"u": "u", "i": "i", "f": "f"}.get(description[1][0][:1])
-        if number != 1 or kind is None:
+        kind = description[1][0][:1]
+        if number != 1 or kind not in ("u", "i", "f"):
             raise ValueError(f"a point's {name} is not a number")
         at = _aligned(at, size if cdr else 1)
         widest = max(widest, size)

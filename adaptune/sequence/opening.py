@@ -33,10 +33,7 @@ _VIEWS: dict[str, Callable[[Reversible, Any], Reversible]] = {
 def open_sequence(config: SequenceConfig) -> Sequence:
     """Open what a study describes; scans are not read before they are asked for.
 
-    Raises
-    ------
-    SequenceError
-        If it cannot be opened as described.
+    A SequenceError says why it cannot be opened as described.
     """
     sequence: Reversible = _recorded(config)
     if config.compensate == "constant_velocity":
@@ -51,11 +48,8 @@ def open_sequence(config: SequenceConfig) -> Sequence:
 def check_sequence(config: SequenceConfig) -> None:
     """Find what would fail while it is read, without reading its scans.
 
-    Raises
-    ------
-    SequenceError
-        If it cannot be opened as described, ends before its `start`, or its reference is of
-        another time.
+    A SequenceError says that it cannot be opened as described, ends before its `start`, or that its
+    reference is of another time.
     """
     _recorded(config).check()
 
@@ -72,19 +66,11 @@ def _recorded(config: SequenceConfig) -> RecordedSequence:
         source.check(topic, None if config.imu is None else config.imu.topic)
         if config.imu is not None and config.bag is not None:
             source.topic(config.imu.topic, IMU_TYPES, "an IMU's measurements")
-    return RecordedSequence(
-        source,
-        _section(config),
-        ReferenceSettings(
-            reference,
-            config.child_frame,
-            None if config.extrinsic is None else to_pose(config.extrinsic),
-            config.clock_offset,
-            config.max_gap,
-        ),
-        _imu(config.imu),
-        key,
+    T = None if config.extrinsic is None else to_pose(config.extrinsic)
+    settings = ReferenceSettings(
+        reference, config.child_frame, T, config.clock_offset, config.max_gap
     )
+    return RecordedSequence(source, _section(config), settings, _imu(config.imu), key)
 
 
 def _source(config: SequenceConfig) -> tuple[Source, str | None]:

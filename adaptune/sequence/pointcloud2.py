@@ -14,7 +14,7 @@ from adaptune.sequence.serialized import Serialized
 from adaptune.sequence.timing import AUTO, TIME_FIELDS, Timing, TimingError
 
 # The numbers of sensor_msgs/PointField's datatypes.
-_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
 INTENSITY_FIELDS = ("intensity", "reflectivity")
@@ -42,19 +42,9 @@ class PointCloud2(NamedTuple):
 
 
 def parse(data: bytes | memoryview, cdr: bool) -> PointCloud2:
-    """Read a serialised message without a copy of its points.
+    """Read a message, serialised as in ROS 2 if `cdr`, without a copy of its points.
 
-    Parameters
-    ----------
-    data
-        The message as it lies in the bag.
-    cdr
-        Whether it is serialised as in ROS 2.
-
-    Raises
-    ------
-    PointCloudError
-        If it is cut short, or longer than it declares.
+    A PointCloudError reports a message that is cut short, or longer than it declares.
     """
     try:
         body = Serialized(data, cdr)
@@ -80,22 +70,16 @@ def parse(data: bytes | memoryview, cdr: bool) -> PointCloud2:
 
 @lru_cache(maxsize=64)
 def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) -> np.dtype[Any]:
-    """Structured type of one point.
-
-    Raises
-    ------
-    PointCloudError
-        If fields are of an unknown type, repeat themselves or lie outside the point.
-    """
+    """Structured type of one point; a PointCloudError where its fields cannot be."""
     if point_step > _LARGEST_POINT:
         raise PointCloudError(f"a point of {point_step} bytes is none")
     names, formats, offsets = [], [], []
     for name, offset, datatype, count in fields:
-        if datatype not in _DATATYPES:
+        if datatype not in DATATYPES:
             raise PointCloudError(f"field {name!r} has unknown datatype {datatype}")
         if name in names:
             raise PointCloudError(f"field {name!r} appears twice")
-        single = np.dtype((">" if is_bigendian else "<") + _DATATYPES[datatype])
+        single = np.dtype((">" if is_bigendian else "<") + DATATYPES[datatype])
         # Some drivers leave the count at zero.
         if offset + single.itemsize * max(count, 1) > point_step:
             raise PointCloudError(f"field {name!r} ends beyond the point's {point_step} bytes")
@@ -104,9 +88,8 @@ def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) 
             formats.append(single if count <= 1 else (single, (count,)))
             offsets.append(offset)
     if missing := [axis for axis in "xyz" if axis not in names]:
-        raise PointCloudError(
-            f"no field {', '.join(missing)}; there is {', '.join(names) or 'none at all'}"
-        )
+        there = ", ".join(names) or "none at all"
+        raise PointCloudError(f"no field {', '.join(missing)}; there is {there}")
     return np.dtype(
         {"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step}
     )
@@ -115,10 +98,7 @@ def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) 
 def read_points(cloud: PointCloud2) -> NDArray[Any]:
     """All points of a message as a structured array of shape (height * width,), without a copy.
 
-    Raises
-    ------
-    PointCloudError
-        If the message lacks x, y or z, or holds fewer bytes than it declares.
+    A PointCloudError reports a message without x, y or z, or with too few bytes.
     """
     height, width, size = cloud.height, cloud.width, len(cloud.data)
     dtype = point_dtype(cloud.fields, cloud.is_bigendian, cloud.point_step)
@@ -127,10 +107,8 @@ def read_points(cloud: PointCloud2) -> NDArray[Any]:
     row_step = max(cloud.row_step, width * dtype.itemsize)
     needed = (height - 1) * row_step + width * dtype.itemsize
     if size < needed:
-        raise PointCloudError(
-            f"{height} x {width} points of {dtype.itemsize} bytes need {needed} bytes, "
-            f"there are {size}"
-        )
+        what = f"{height} x {width} points of {dtype.itemsize} bytes"
+        raise PointCloudError(f"{what} need {needed} bytes, there are {size}")
     rows = np.ndarray((height, width), dtype, cloud.data, strides=(row_step, dtype.itemsize))
     return rows.reshape(-1)
 
@@ -139,21 +117,7 @@ def decode(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
     """Decode a serialised sensor_msgs/PointCloud2.
 
     Points that are not finite are dropped, and so are those at the very origin, by which drivers
-    mark rays that did not come back.
-
-    Parameters
-    ----------
-    data
-        The message as it lies in the bag.
-    cdr
-        Whether it is serialised as in ROS 2.
-    timing
-        Meaning of its stamps.
-
-    Raises
-    ------
-    PointCloudError
-        If the message is malformed, lacks x, y or z, or has times that cannot be.
+    mark rays that did not come back. See `parse` and `from_fields`.
     """
     cloud = parse(data, cdr)
     return from_fields(read_points(cloud), cloud.stamp, timing)
@@ -206,13 +170,8 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         start, seconds = timing.resolve(stamp, None if time is None else times, (low, high))
     except TimingError as error:
         raise PointCloudError(str(error)) from error
-    return Scan(
-        start,
-        points,
-        seconds,
-        None if ring is None else rings,
-        intensities=None if intensity is None else intensities,
-    )
+    given_rings, lights = rings if ring else None, intensities if intensity else None
+    return Scan(start, points, seconds, given_rings, intensities=lights)
 
 
 _NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
@@ -308,12 +267,8 @@ def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     types: Any = numba.types
     real, whole, time = numba.float32, numba.uint16, numba.from_dtype(np.dtype(kind))
-    scan = (
-        types.Array(real, 2, "C"),
-        types.Array(time, 1, "C"),
-        types.Array(whole, 1, "C"),
-        types.Array(real, 1, "C"),
-    )
+    kinds = ((real, 2), (time, 1), (whole, 1), (real, 1))
+    scan = tuple(types.Array(scalar, axes, "C") for scalar, axes in kinds)
     result = types.Tuple((numba.int64, time, time))
     compiled = partial(numba.njit, nogil=True, cache=True)
     given = types.Tuple((column(time), column(whole), column(real)))

@@ -47,13 +47,7 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]:
-    """Poses of one child frame; of the only one if `frame` is None.
-
-    Raises
-    ------
-    SequenceError
-        Naming the frames on the topic.
-    """
+    """Poses of one child frame; of the only one if `frame` is None, else a SequenceError."""
     frames = sorted({name for _, name, *_ in poses})
     if frame is None and len(frames) > 1:
         raise SequenceError(
@@ -66,14 +60,9 @@ def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]
 
 
 def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
-    """Trajectory of the poses that are finite and have a rotation, each stamp once.
+    """Trajectory of the usable poses, each stamp once, and the number of the others.
 
-    Returns
-    -------
-    trajectory : Trajectory or None
-        None if no pose is usable.
-    unusable : int
-        How many are not.
+    Poses are usable if they are finite and have a rotation. The trajectory is None if none is.
     """
     stamps = np.array([stamp for stamp, *_ in poses], np.int64)
     values: NDArray[np.float64] = np.array(

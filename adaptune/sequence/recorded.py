@@ -31,47 +31,23 @@ _FASTEST = 100.0
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSettings:
-    """Where reference poses come from and how they become those of the LiDAR.
+    """Where reference poses come from and how they become those of the LiDAR."""
 
-    Attributes
-    ----------
-    source : str or Path, optional
-        A topic or a file; the recording's own poses if left out.
-    child_frame : str, optional
-        On a topic of transforms, the frame whose poses to take.
-    T_reference_sensor : ndarray of shape (4, 4), optional
-        The LiDAR's pose in the frame that the poses are of.
-    clock_offset : float
-        Seconds to add to the poses' stamps.
-    max_gap : float
-        Seconds. Between poses further apart the reference is unknown.
-    """
-
-    source: str | Path | None = None
-    child_frame: str | None = None
+    source: str | Path | None = None  # a topic or a file; the recording's own poses if left out
+    child_frame: str | None = None  # on a topic of transforms, the frame whose poses to take
+    # The LiDAR's pose in the frame that the poses are of, of shape (4, 4).
     T_reference_sensor: Poses | None = None
-    clock_offset: float = 0.0
-    max_gap: float = 1.0
+    clock_offset: float = 0.0  # seconds to add to the poses' stamps
+    max_gap: float = 1.0  # seconds. Between poses further apart the reference is unknown.
 
 
 @dataclass(frozen=True, eq=False)
 class ImuSettings:
-    """Which IMU, and how its measurements become SI units.
+    """Which IMU, and how its measurements become SI units."""
 
-    Attributes
-    ----------
-    topic : str, optional
-        The only one when left out.
-    T_sensor_imu : ndarray of shape (4, 4), optional
-        The IMU's pose in the LiDAR's frame.
-    scale : float
-        Metres per second squared in a unit of its accelerometer.
-    noise : ImuNoise
-    """
-
-    topic: str | None = None
-    T_sensor_imu: Poses | None = None
-    scale: float = 1.0
+    topic: str | None = None  # the only one when left out
+    T_sensor_imu: Poses | None = None  # the IMU's pose in the LiDAR's frame, of shape (4, 4)
+    scale: float = 1.0  # metres per second squared in a unit of its accelerometer
     noise: ImuNoise = USUAL
 
 
@@ -81,6 +57,8 @@ _OWN = ReferenceSettings()
 
 class RecordedSequence:
     """A part of a recording, with its reference.
+
+    Its methods raise a SequenceError where the recording cannot be read as described.
 
     Parameters
     ----------
@@ -120,11 +98,6 @@ class RecordedSequence:
 
         Scans whose stamps do not come after the one before are left out, counted, and reported in
         the log.
-
-        Raises
-        ------
-        SequenceError
-            Naming the message that cannot be decoded, or if the section holds no scan.
         """
         repairs = Repairs()
         if self.key is None:
@@ -150,13 +123,7 @@ class RecordedSequence:
             raise SequenceError(f"{self.name}: no scan {self.section}")
 
     def backward(self) -> Iterator[Scan]:
-        """Read the scans, the last one first. A bag is decoded to the cache before.
-
-        Raises
-        ------
-        SequenceError
-            If a bag is not kept in the cache, or does not fit.
-        """
+        """Read the scans, the last one first. A bag is decoded to the cache before."""
         if self.source.random_access:
             frames = list(self.section.of(in_order(self.source.frames(), Repairs())))
             yield from (frame.load() for frame in reversed(frames))
@@ -177,34 +144,17 @@ class RecordedSequence:
         return stamps
 
     def imu(self) -> Imu | None:
-        """Measurements of the IMU in SI units, if one is set.
-
-        Raises
-        ------
-        SequenceError
-            If its topic cannot be read.
-        """
-        if self._imu is None:
+        """Measurements of the IMU in SI units, if one is set."""
+        settings = self._imu
+        imu = None if settings is None else self.source.imu(settings.topic)
+        if settings is None or imu is None:
             return None
-        imu = self.source.imu(self._imu.topic)
-        if imu is None:
-            return None
-        T = imu.T_sensor_imu if self._imu.T_sensor_imu is None else self._imu.T_sensor_imu
-        return replace(
-            imu,
-            acceleration=imu.acceleration * self._imu.scale,
-            T_sensor_imu=T,
-            noise=self._imu.noise,
-        )
+        T = imu.T_sensor_imu if settings.T_sensor_imu is None else settings.T_sensor_imu
+        acceleration = imu.acceleration * settings.scale
+        return replace(imu, acceleration=acceleration, T_sensor_imu=T, noise=settings.noise)
 
     def reference(self) -> Trajectory | None:
-        """Poses of the LiDAR, if they are known.
-
-        Raises
-        ------
-        SequenceError
-            If they cannot be read, or do not cover the time of the scans.
-        """
+        """Poses of the LiDAR, if they are known."""
         settings = self._reference
         if isinstance(settings.source, Path):
             trajectory: Trajectory | None = self._from_file(settings.source)
@@ -223,21 +173,16 @@ class RecordedSequence:
     def check(self) -> None:
         """Find early what would fail while reading the scans, without reading them.
 
-        Raises
-        ------
-        SequenceError
-            If the section begins after the end, or the reference cannot be read or is of another
-            time. For poses on a topic, only the first one is checked.
+        The section may begin after the end; the reference may be unreadable or of another time. Of
+        poses on a topic, only the first one is checked.
         """
         span = self.source.span()
         if span is None:
             return
-        seconds = (span[1] - span[0]) * 1e-9
-        if self.section.start > seconds:
-            raise SequenceError(
-                f"{self.name}: start = {self.section.start:g} s is beyond its end, it lasts "
-                f"{seconds:.1f} s"
-            )
+        seconds, start = (span[1] - span[0]) * 1e-9, self.section.start
+        if start > seconds:
+            what = f"start = {start:g} s is beyond its end, it lasts {seconds:.1f} s"
+            raise SequenceError(f"{self.name}: {what}")
         settings = self._reference
         if isinstance(settings.source, str):
             first = self.source.first_pose(settings.source)
@@ -276,10 +221,11 @@ class RecordedSequence:
         if begin <= span[1] and end >= span[0]:
             _warn_of_jumps(self.name, trajectory)
             return
+        times = [f"{stamp * 1e-9:.3f} s" for stamp in (begin, end, *span)]
         raise SequenceError(
-            f"{self.name}: the reference covers {_seconds(begin, end)}, the scans cover "
-            f"{_seconds(*span)}: set `clock_offset` to the seconds to add to the reference's "
-            f"stamps{self._proposal(trajectory)}"
+            f"{self.name}: the reference covers {times[0]} to {times[1]}, the scans cover "
+            f"{times[2]} to {times[3]}: set `clock_offset` to the seconds to add to the "
+            f"reference's stamps{self._proposal(trajectory)}"
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:
@@ -289,18 +235,16 @@ class RecordedSequence:
         except AdaptuneError:
             imu = None
         if imu is not None:
-            turning = np.linalg.norm(imu.angular_velocity, axis=1)
-            found = clock_offset(trajectory, imu.stamps, turning)
-            return self._offset("gyroscope measured", found)
-        _log.info("%s: comparing how its scans turn with the reference", self.name)
-        try:
-            stamps, turning = turning_of(islice(self._decode(Repairs()), _MOST_SCANS))
-        except AdaptuneError:
-            return ""
+            stamps, turning = imu.stamps, np.linalg.norm(imu.angular_velocity, axis=1)
+            what = "gyroscope measured"
+        else:
+            _log.info("%s: comparing how its scans turn with the reference", self.name)
+            try:
+                stamps, turning = turning_of(islice(self._decode(Repairs()), _MOST_SCANS))
+            except AdaptuneError:
+                return ""
+            what = "scans show"
         found = clock_offset(trajectory, stamps, turning)
-        return self._offset("scans show", found)
-
-    def _offset(self, what: str, found: float | None) -> str:
         if found is None:
             return ""
         # The stamps already include the offset that is set.
@@ -308,19 +252,11 @@ class RecordedSequence:
         return f" (the {what} the same motion with clock_offset: {offset:.3f})"
 
 
-def _seconds(begin: int, end: int) -> str:
-    return f"{begin * 1e-9:.3f} s to {end * 1e-9:.3f} s"
-
-
 def _warn_of_jumps(name: str, trajectory: Trajectory) -> None:
     steps = geometry.steps(trajectory.T_world_sensor)[:, :3, 3]
     seconds = np.diff(trajectory.stamps) * 1e-9
     jumps = np.flatnonzero(np.linalg.norm(steps, axis=1) > _FASTEST * np.maximum(seconds, 1e-3))
     if len(jumps):
-        _log.warning(
-            "%s: the reference jumps %d times, first at %.3f s, faster than %g m/s",
-            name,
-            len(jumps),
-            trajectory.stamps[jumps[0] + 1] * 1e-9,
-            _FASTEST,
-        )
+        first = trajectory.stamps[jumps[0] + 1] * 1e-9
+        message = "%s: the reference jumps %d times, first at %.3f s, faster than %g m/s"
+        _log.warning(message, name, len(jumps), first, _FASTEST)

@@ -6,33 +6,18 @@ _WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}
 
 
 class Serialized:
-    """Reads a message from its beginning.
+    """Reads a message, as it lies in the bag, from its beginning.
 
+    `cdr` says whether it is serialised as in ROS 2: in either byte order, and with aligned numbers.
     All methods raise ValueError, IndexError or struct.error where the message is not long enough.
-
-    Parameters
-    ----------
-    data
-        The message as it lies in the bag.
-    cdr
-        Whether it is serialised as in ROS 2: in either byte order, and with aligned numbers.
-
-    Attributes
-    ----------
-    data : memoryview
-        The message without its encapsulation.
-    at : int
-        Where to read on.
-    order : str
-        Byte order of its numbers, as numpy and struct write it.
     """
 
     def __init__(self, data: bytes | memoryview, cdr: bool):
         if cdr and bytes(data[:2]) not in (b"\0\0", b"\0\1"):
             raise ValueError("not in CDR")
-        self.order = "<" if not cdr or data[1] else ">"
+        self.order = "<" if not cdr or data[1] else ">"  # of bytes, as numpy and struct write it
         self.data = memoryview(data)[4 if cdr else 0 :]
-        self.at = 0
+        self.at = 0  # where to read on
         self._cdr = cdr
         self._unpack = _WORD[self.order]
 

@@ -13,21 +13,11 @@ _log = logging.getLogger(__name__)
 
 
 class Frame(NamedTuple):
-    """A scan before it is decoded.
+    """A scan before it is decoded."""
 
-    Attributes
-    ----------
-    stamp : int
-        Nanoseconds, as recorded.
-    recorded : int
-        Nanoseconds on the clock of the recorder; the stamp where there is none.
-    load : callable
-        Decodes the scan.
-    """
-
-    stamp: int
-    recorded: int
-    load: Callable[[], Scan]
+    stamp: int  # nanoseconds, as recorded
+    recorded: int  # nanoseconds on the clock of the recorder; the stamp where there is none
+    load: Callable[[], Scan]  # decodes the scan
 
 
 class Source(Protocol):
@@ -135,19 +125,12 @@ def _leap(last: Frame | None, frame: Frame) -> int:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a sequence.
+    """A part of a sequence."""
 
-    Attributes
-    ----------
-    start, stop : float
-        Seconds since the first scan; those in [start, stop) belong to it.
-    stride : int
-        Use every stride-th scan.
-    """
-
+    # Seconds since the first scan; those in [start, stop) belong to it.
     start: float = 0.0
     stop: float | None = None
-    stride: int = 1
+    stride: int = 1  # use every stride-th scan
 
     def of(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames in it; their stamps strictly increase."""

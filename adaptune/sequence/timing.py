@@ -26,22 +26,15 @@ class TimingError(AdaptuneError):
 
 @dataclass(frozen=True)
 class Timing:
-    """Meaning of the time stamps of a recording.
+    """Meaning of the time stamps of a recording."""
 
-    Attributes
-    ----------
-    stamp : {"auto", "start", "end"}
-        Moment of the scan that the header's stamp marks. `auto` follows the points: they come
-        before the stamp or after it. Scans whose points have no time are stamped at their start.
-    unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
-        nanoseconds; the size of absolute times reveals their unit.
-    period : float
-        Seconds a scan takes; only for scans stamped at their end whose points have no time.
-    """
-
+    # Moment of the scan that the header's stamp marks. `auto` follows the points: they come before
+    # the stamp or after it. Scans whose points have no time are stamped at their start.
     stamp: Literal["auto", "start", "end"] = "auto"
+    # Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
+    # nanoseconds; the size of absolute times reveals their unit.
     unit: Unit | None = None
+    # Seconds a scan takes; only for scans stamped at their end whose points have no time.
     period: float = 0.1
 
     def resolve(
@@ -65,11 +58,6 @@ class Timing:
             Nanoseconds.
         times : ndarray of shape (n,)
             float32 seconds since `start`, none below zero.
-
-        Raises
-        ------
-        TimingError
-            If the times span more than any scan takes.
         """
         if values is None or not len(values):
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
@@ -77,15 +65,15 @@ class Timing:
         low, high = extent
         scale, absolute = self._scale(values.dtype, high)
         span = (high - low) * scale
+        what = ""
         if not span <= _LONGEST:
+            what = f"span {span:g} s"
+        elif not absolute and max(abs(low), abs(high)) * scale > _LONGEST:
+            what = f"reach {high * scale:g} s from the scan's stamp"
+        if what:
             raise TimingError(
-                f"the times of the points span {span:g} s; if they are in another unit, name it "
-                f"with `time_unit: s|ms|us|ns`"
-            )
-        if not absolute and max(abs(low), abs(high)) * scale > _LONGEST:
-            raise TimingError(
-                f"the times of the points reach {high * scale:g} s from the scan's stamp; if they "
-                f"are in another unit, name it with `time_unit: s|ms|us|ns`"
+                f"the times of the points {what}; if they are in another unit, name it with "
+                f"`time_unit: s|ms|us|ns`"
             )
         zero, begin = self._start(stamp, extent, scale, absolute)
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:

@@ -13,25 +13,11 @@ _PACKET = 1206
 
 
 def decoder(cdr: bool) -> Callable[[bytes], Scan]:
-    """Make a decoder for the messages of one LiDAR. Its packets contain its model.
+    """Make a decoder for the messages of one LiDAR, serialised as in ROS 2 if `cdr`.
 
-    A scan starts when its first packet was received, whatever the header's stamp marks.
-
-    Parameters
-    ----------
-    cdr
-        Whether they are serialised as in ROS 2.
-
-    Returns
-    -------
-    callable
-        Takes a message as it lies in the bag; raises PointCloudError if it is not whole, or not
-        of a model that is known.
-
-    Raises
-    ------
-    ImportError
-        If velodyne_decoder is not installed.
+    The packets contain the LiDAR's model. A scan starts when its first packet was received,
+    whatever the header's stamp marks. The decoder raises a PointCloudError for a message that is
+    not whole, or of an unknown model. It needs the package velodyne_decoder.
     """
     import velodyne_decoder
 

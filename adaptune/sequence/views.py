@@ -38,20 +38,12 @@ class Reversible(Sequence, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A sequence of which every scan is changed or left out by itself.
+    """A sequence of which every scan is changed or left out by itself."""
 
-    Attributes
-    ----------
-    inner : Reversible
-        What it is a view of.
-    change : callable
-        Gives the scan as seen, or None to leave it out.
-    of_reference, of_imu, of_clock : callable
-        What the view does to poses, to measurements and to the time of arrival.
-    """
-
-    inner: Reversible
+    inner: Reversible  # what it is a view of
+    # Gives the scan as seen, or None to leave it out.
     change: Callable[[Scan], Scan | None] = lambda scan: scan
+    # What the view does to poses, to measurements and to the time of arrival.
     of_reference: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
     of_imu: Callable[[Imu], Imu] = lambda imu: imu
     of_clock: Callable[[NDArray[np.int64]], NDArray[np.int64]] = lambda stamps: stamps
@@ -67,13 +59,7 @@ class View:
         return self.inner.n_messages
 
     def __iter__(self) -> Iterator[Scan]:
-        """Read the scans.
-
-        Raises
-        ------
-        SequenceError
-            If the view leaves none.
-        """
+        """Read the scans; a SequenceError if the view leaves none."""
         return self._changed(self.inner)
 
     def backward(self) -> Iterator[Scan]:
@@ -81,13 +67,12 @@ class View:
         return self._changed(self.inner.backward())
 
     def _changed(self, scans: Iterable[Scan]) -> Iterator[Scan]:
-        none = True
+        seen = None
         for scan in scans:
-            seen = self.change(scan)
-            if seen is not None:
-                none = False
+            if (changed := self.change(scan)) is not None:
+                seen = changed
                 yield seen
-        if none:
+        if seen is None:
             raise SequenceError(f"{self.name}: its views leave no scan")
 
     def reference(self) -> Trajectory | None:
@@ -121,32 +106,28 @@ def without_rotation(sequence: Reversible) -> View:
     imu = once(sequence.imu)
 
     def change(scan: Scan) -> Scan:
-        measured = imu()
-        return (
-            scan if measured is None else compensate_rotation(_timed(sequence.name, scan), measured)
-        )
+        if (measured := imu()) is None:
+            return scan
+        return compensate_rotation(_timed(sequence.name, scan), measured)
 
     return View(sequence, change)
 
 
 def _timed(name: str, scan: Scan) -> Scan:
     if scan.times is None and len(scan):
-        raise SequenceError(
-            f"{name}: its points have no times, by which motion could be taken out; leave "
-            f"`compensate` out"
-        )
+        raise SequenceError(f"{name}: its points have no times; leave `compensate` out")
     return scan
 
 
+@dataclass(frozen=True, eq=False)
 class _First:
     """Stamp of the first scan, read when it is wanted."""
 
-    def __init__(self, sequence: Sequence):
-        self._sequence = sequence
+    sequence: Sequence
 
     @cached_property
     def stamp(self) -> int:
-        return next(iter(self._sequence)).stamp
+        return next(iter(self.sequence)).stamp
 
     def within(self, stamp: int, part: Part) -> bool:
         seconds = (stamp - self.stamp) * 1e-9
@@ -194,22 +175,14 @@ def speed(sequence: Reversible, factor: float, part: Part) -> View:
 
 
 def thin_rings(sequence: Reversible, every: int) -> View:
-    """Keep one ring in `every`, as a LiDAR with fewer lasers sees.
-
-    Raises
-    ------
-    SequenceError
-        While reading, if the points have no rings.
-    """
+    """Keep one ring in `every`, as a LiDAR with fewer lasers sees; points must have rings."""
 
     def thin(scan: Scan) -> Scan:
-        if scan.rings is None:
-            if not len(scan):
-                return scan
-            raise SequenceError(
-                f"{sequence.name}: its points have no ring, so none can be left out"
-            )
-        return scan.select(scan.rings % every == 0)
+        if scan.rings is not None:
+            return scan.select(scan.rings % every == 0)
+        if len(scan):
+            raise SequenceError(f"{sequence.name}: its points have no ring, none can be left out")
+        return scan
 
     return View(sequence, thin)
 
@@ -259,13 +232,10 @@ class Reversed(View):
         return first.stamp + last.stamp + last.span
 
     def _mirror(self, scan: Scan) -> Scan:
-        span = scan.span
-        times = None if scan.times is None else np.float32(span * 1e-9) - scan.times
-        return replace(
-            scan,
-            stamp=self._sum - scan.stamp - span,
-            times=None if times is None else np.maximum(times, np.float32(0.0)),
-        )
+        times, span = scan.times, scan.span
+        if times is not None:
+            times = np.maximum(np.float32(span * 1e-9) - times, np.float32(0.0))
+        return replace(scan, stamp=self._sum - scan.stamp - span, times=times)
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR in mirrored time."""
@@ -294,13 +264,7 @@ class Reversed(View):
 
 
 class WithImu:
-    """A sequence whose scans carry the IMU's measurements.
-
-    Parameters
-    ----------
-    inner
-        Any sequence.
-    """
+    """A sequence whose scans carry the IMU's measurements."""
 
     def __init__(self, inner: Sequence):
         self.inner = inner
@@ -309,24 +273,19 @@ class WithImu:
         self.imu = once(inner.imu)
 
     def __iter__(self) -> Iterator[Scan]:
-        """Read the scans.
-
-        Raises
-        ------
-        SequenceError
-            If there is no IMU, or it measured at another time.
-        """
+        """Read the scans; a SequenceError if there is no IMU, or it measured at another time."""
         imu = self.imu()
         if imu is None or not len(imu):
             raise SequenceError(f"{self.name}: holds no measurements of an IMU")
         first: int | None = None
         for scan in self.inner:
             if first is None:
-                if not imu.stamps[0] - _LATE < scan.stamp < imu.stamps[-1]:
+                begin, end = imu.stamps[0], imu.stamps[-1]
+                if not begin - _LATE < scan.stamp < end:
                     raise SequenceError(
-                        f"{self.name}: the IMU covers {imu.stamps[0] * 1e-9:.3f} s to "
-                        f"{imu.stamps[-1] * 1e-9:.3f} s, the first scan is of "
-                        f"{scan.stamp * 1e-9:.3f} s: they are not on the same clock"
+                        f"{self.name}: the IMU covers {begin * 1e-9:.3f} s to {end * 1e-9:.3f} s, "
+                        f"the first scan is of {scan.stamp * 1e-9:.3f} s: "
+                        f"they are not on the same clock"
                     )
                 # Those during the first scan, and the one before.
                 first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)

@@ -26,19 +26,12 @@ def _known(kind: str, name: str, names: Collection[str]) -> str:
 
 
 class SceneLeg(BaseModel):
-    """One scene of a course.
-
-    Attributes
-    ----------
-    scene
-        A name from `SCENES`.
-    length
-        Metres driven in it; the course's `length` if not given.
-    """
+    """One scene of a course."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    scene: str
+    scene: str  # a name from `SCENES`
+    # Metres driven in it; the course's `length` if not given.
     length: Annotated[float, Field(ge=10.0, le=LONGEST)] | None = None
 
     @field_validator("scene")
@@ -48,46 +41,27 @@ class SceneLeg(BaseModel):
 
 
 class Course(BaseModel):
-    """A simulated recording: its scenes, its sensor and its motion.
-
-    Attributes
-    ----------
-    scenes
-        Scenes in driving order, by name or with a length of their own.
-    length
-        Metres driven in every scene that has no length of its own.
-    sensor
-        A name from `SENSORS`.
-    motion
-        A name from `MOTIONS`.
-    seed
-        Another seed is another world, another drive and other noise.
-    rate
-        Turns of the sensor in a second; the sensor's own if not given.
-    columns
-        Firings in a turn; the sensor's own if not given.
-    imu
-        Hz of the inertial measurements; none are made if not given.
-    moving_objects
-        Whether cars and walkers move about.
-    weather
-        A name from `WEATHERS`.
-    stamp
-        Whether a recording's headers mark the start or the end of each scan.
-    """
+    """A simulated recording: its scenes, its sensor and its motion."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    # Scenes in driving order, by name or with a length of their own.
     scenes: tuple[str | SceneLeg, ...] = Field(min_length=1)
+    # Metres driven in every scene that has no length of its own.
     length: float = Field(default=60.0, ge=10.0, le=LONGEST)
-    sensor: str = "hdl32e"
-    motion: str = "robot"
+    sensor: str = "hdl32e"  # a name from `SENSORS`
+    motion: str = "robot"  # a name from `MOTIONS`
+    # Another seed is another world, another drive and other noise.
     seed: int = Field(default=0, ge=0, lt=2**31)
+    # Turns of the sensor in a second; the sensor's own if not given.
     rate: float | None = Field(default=None, gt=0.0, le=100.0)
+    # Firings in a turn; the sensor's own if not given.
     columns: int | None = Field(default=None, ge=16, le=8192)
+    # Hz of the inertial measurements; none are made if not given.
     imu: Literal[200, 400] | None = None
-    moving_objects: bool = False
-    weather: str = "clear"
+    moving_objects: bool = False  # whether cars and walkers move about
+    weather: str = "clear"  # a name from `WEATHERS`
+    # Whether a recording's headers mark the start or the end of each scan.
     stamp: Literal["start", "end"] = "start"
 
     @field_validator("scenes")
@@ -108,10 +82,8 @@ class Course(BaseModel):
     def _rate_follows_motion(self) -> Self:
         least, rate = MOTIONS[self.motion].least_rate, self.turns
         if rate < least:
-            raise ValueError(
-                f"a {self.motion} moves too fast for {rate:g} scans a second: it needs at least "
-                f"{least:g}"
-            )
+            what = f"a {self.motion} moves too fast for {rate:g} scans a second"
+            raise ValueError(f"{what}: it needs at least {least:g}")
         if sum(length for _, length in self.legs) > LONGEST:
             raise ValueError(f"a course is at most {LONGEST:g} m long")
         return self

@@ -24,15 +24,7 @@ class Inertial(NamedTuple):
 
 
 def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
-    """Measure without any error.
-
-    Parameters
-    ----------
-    ride
-        The LiDAR's trajectory.
-    times
-        Seconds since the recording's start, of shape (n,).
-    """
+    """Measure without any error, at seconds since the recording's start, of shape (n,)."""
     T_lidar_imu = invert(T_IMU_LIDAR)
     R_lidar_imu, lever = T_lidar_imu[:3, :3], T_lidar_imu[:3, 3]
     R_world_lidar = ride.poses(times)[:, :3, :3]
@@ -46,28 +38,18 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
 
 
 def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
-    """Measure with biases that wander, and white noise.
+    """Measure with biases that wander, and white noise, at times that are `rate` a second.
 
-    Parameters
-    ----------
-    ride
-        The LiDAR's trajectory.
-    times
-        Seconds since the recording's start, `rate` of them a second, of shape (n,).
-    rate
-        Hz.
-    seed
-        Seed of the errors.
+    `seed` is that of the errors; see `ideal`.
     """
     rng = np.random.default_rng([seed, 5])
     truth = ideal(ride, times)
-    errors = []
-    for start, walk, noise in (
-        (2e-3, NOISE.gyroscope_walk, NOISE.gyroscope),
-        (2e-2, NOISE.accelerometer_walk, NOISE.accelerometer),
-    ):
-        bias = rng.normal(0.0, start, 3) + np.cumsum(
-            rng.normal(0.0, walk / np.sqrt(rate), (len(times), 3)), axis=0
-        )
-        errors.append(bias + rng.normal(0.0, noise * np.sqrt(rate), (len(times), 3)))
-    return Inertial(truth.gyro + errors[0], truth.accel + errors[1])
+
+    def error(start: float, walk: float, noise: float) -> NDArray[np.float64]:
+        shape = (len(times), 3)
+        bias = rng.normal(0.0, start, 3)
+        bias = bias + np.cumsum(rng.normal(0.0, walk / np.sqrt(rate), shape), axis=0)
+        return np.asarray(bias + rng.normal(0.0, noise * np.sqrt(rate), shape))
+
+    gyro = truth.gyro + error(2e-3, NOISE.gyroscope_walk, NOISE.gyroscope)
+    return Inertial(gyro, truth.accel + error(2e-2, NOISE.accelerometer_walk, NOISE.accelerometer))

@@ -29,30 +29,18 @@ class Material(IntEnum):
     CLOTH = 13
 
 
-REFLECTIVITY = np.array(
-    [0.25, 0.35, 0.15, 0.35, 0.30, 0.60, 0.40, 0.05, 0.50, 0.25, 0.45, 0.02, 0.45, 0.40],
-    np.float32,
-)
-"""Diffuse reflectivity of each material near 905 nm, indexed by `Material`."""
+# Diffuse reflectivity of each material near 905 nm, indexed by `Material`.
+_SHARES = [0.25, 0.35, 0.15, 0.35, 0.30, 0.60, 0.40, 0.05, 0.50, 0.25, 0.45, 0.02, 0.45, 0.40]
+REFLECTIVITY = np.array(_SHARES, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in space.
+    """Triangles in space."""
 
-    Attributes
-    ----------
-    vertices : ndarray of shape (n, 3)
-        float64 metres.
-    triangles : ndarray of shape (m, 3)
-        uint32 indices of vertices.
-    materials : ndarray of shape (m,)
-        uint8 codes of `Material`.
-    """
-
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.uint32]
-    materials: NDArray[np.uint8]
+    vertices: NDArray[np.float64]  # float64 metres, of shape (n, 3)
+    triangles: NDArray[np.uint32]  # uint32 indices of vertices, of shape (m, 3)
+    materials: NDArray[np.uint8]  # uint8 codes of `Material`, of shape (m,)
 
 
 def mesh(vertices: ArrayLike, triangles: ArrayLike, material: ArrayLike) -> Mesh:
@@ -78,23 +66,16 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def place(model: Mesh, at: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0) -> Mesh:
-    """Put copies of a model in the world.
+    """Put copies of a model, whose origin is on the ground, in the world.
 
     Parameters
     ----------
-    model
-        With its origin where it stands on the ground.
     at
         Metres, of shape (3,) or (n, 3).
     yaw
         Radians, one or n.
     scale
         One, n, or of shape (n, 3) for an own factor along each axis.
-
-    Returns
-    -------
-    Mesh
-        All n copies.
     """
     at = np.atleast_2d(np.asarray(at, np.float64))
     n = len(at)
@@ -125,15 +106,12 @@ def grid(vertices: NDArray[np.float64], material: ArrayLike) -> Mesh:
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
     triangles = np.stack([np.stack([a, b, c], -1), np.stack([b, d, c], -1)], axis=-2)
-    materials = np.broadcast_to(
-        np.asarray(material, np.uint8)[..., None], (rows - 1, columns - 1, 2)
-    )
+    codes = np.asarray(material, np.uint8)[..., None]
+    materials = np.broadcast_to(codes, (rows - 1, columns - 1, 2))
     return mesh(vertices.reshape(-1, 3), triangles.reshape(-1, 3), materials.reshape(-1))
 
 
-_BOX = np.array(
-    [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)], np.float64
-)
+_BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 _BOX_TRIANGLES = np.array(
     [
         *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5]),
@@ -152,17 +130,10 @@ def box(
 
 
 def tube(rings: ArrayLike, material: Material, sides: int = 8) -> Mesh:
-    """Make a round body through rings.
+    """Make a round body through rings of some corners (`sides`), from one end to the other.
 
-    Parameters
-    ----------
-    rings
-        Centre and radius x, y, z, r of each ring, of shape (n, 4), from one end to the other;
-        a radius of zero closes the end in a point.
-    material
-        Its material.
-    sides
-        Corners of each ring.
+    `rings` are centre and radius x, y, z, r of each, of shape (n, 4). A radius of zero closes the
+    end in a point.
     """
     rings = np.asarray(rings, np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
@@ -174,12 +145,8 @@ def blob(material: Material, seed: int, roughness: float = 0.35, detail: int = 1
     """Make a lump of unit radius that sits on the ground, uneven by `roughness`."""
     polar = np.linspace(0.0, np.pi, detail)[:, None]
     angle = np.linspace(0.0, 2.0 * np.pi, 2 * detail)[None]
-    unit = np.stack(
-        np.broadcast_arrays(
-            np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)
-        ),
-        axis=-1,
-    )
+    x, y = np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle)
+    unit = np.stack(np.broadcast_arrays(x, y, np.cos(polar)), axis=-1)
     # Noise over positions, not angles: the seam and the poles close.
     radius = 1.0 + roughness * fractal(unit.reshape(-1, 3), 0.8, seed, 2).reshape(unit.shape[:2])
     lump = unit * radius[..., None]
@@ -190,16 +157,7 @@ def blob(material: Material, seed: int, roughness: float = 0.35, detail: int = 1
 def foliage(centres: NDArray[np.float64], radii: ArrayLike, leaf: float, seed: int) -> Mesh:
     """Make loose leaves: triangles turned at random, which let some rays through.
 
-    Parameters
-    ----------
-    centres
-        Where the leaves are, of shape (n, 3).
-    radii
-        Metres each leaf may lie from its centre, along each axis.
-    leaf
-        Size of a leaf in metres.
-    seed
-        Seed of their places.
+    Leaves of `leaf` metres lie up to `radii` metres, along each axis, from centres of shape (n, 3).
     """
     rng = np.random.default_rng(seed)
     n = len(centres)

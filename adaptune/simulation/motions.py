@@ -7,39 +7,18 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Motion:
-    """A way of carrying a sensor.
+    """A way of carrying a sensor."""
 
-    Attributes
-    ----------
-    speed : float
-        Usual speed in m/s.
-    acceleration : float
-        Greatest acceleration and braking in m/s^2.
-    turning : float
-        Greatest lateral acceleration in m/s^2: it goes slower through bends.
-    height : float
-        Metres of the sensor above the ground.
-    base : tuple of float
-        Length and width in metres over which the ground carries it.
-    weave : float
-        Metres by which it strays from the road's middle, about.
-    shift : tuple of float
-        Standard deviation along x, y and z of the mount's shake on a paved road, in metres.
-    turn : tuple of float
-        Standard deviation about x, y and z of the same, in radians.
-    band : tuple of float
-        Least and greatest frequency of the shake in Hz.
-    """
-
-    speed: float
-    acceleration: float
-    turning: float
-    height: float
-    base: tuple[float, float]
-    weave: float
+    speed: float  # usual speed in m/s
+    acceleration: float  # greatest acceleration and braking in m/s^2
+    turning: float  # greatest lateral acceleration in m/s^2: it goes slower through bends
+    height: float  # metres of the sensor above the ground
+    base: tuple[float, float]  # length and width in metres over which the ground carries it
+    weave: float  # metres by which it strays from the road's middle, about
+    # Standard deviation along x, y and z of the mount's shake on a paved road, in metres.
     shift: tuple[float, float, float]
-    turn: tuple[float, float, float]
-    band: tuple[float, float]
+    turn: tuple[float, float, float]  # standard deviation about x, y and z of the same, in radians
+    band: tuple[float, float]  # least and greatest frequency of the shake in Hz
 
     @property
     def least_rate(self) -> float:
@@ -49,38 +28,18 @@ class Motion:
 
 MOTIONS: Mapping[str, Motion] = MappingProxyType(
     {
+        # Speed, acceleration, turning, height, base and weave; shift, turn and band of the shake.
         "robot": Motion(
-            speed=3.0,
-            acceleration=0.8,
-            turning=1.0,
-            height=0.9,
-            base=(0.8, 0.6),
-            weave=0.15,
-            shift=(0.002, 0.003, 0.004),
-            turn=(0.0015, 0.0015, 0.001),
-            band=(0.5, 3.5),
+            *(3.0, 0.8, 1.0, 0.9, (0.8, 0.6), 0.15),
+            *((0.002, 0.003, 0.004), (0.0015, 0.0015, 0.001), (0.5, 3.5)),
         ),
         "car": Motion(
-            speed=10.0,
-            acceleration=2.0,
-            turning=2.5,
-            height=1.75,
-            base=(2.7, 1.6),
-            weave=0.15,
-            shift=(0.003, 0.006, 0.010),
-            turn=(0.0015, 0.0020, 0.0007),
-            band=(0.6, 2.5),
+            *(10.0, 2.0, 2.5, 1.75, (2.7, 1.6), 0.15),
+            *((0.003, 0.006, 0.010), (0.0015, 0.0020, 0.0007), (0.6, 2.5)),
         ),
         "handheld": Motion(
-            speed=1.3,
-            acceleration=0.6,
-            turning=0.8,
-            height=1.5,
-            base=(0.4, 0.4),
-            weave=0.3,
-            shift=(0.012, 0.020, 0.022),
-            turn=(0.012, 0.012, 0.015),
-            band=(0.4, 2.5),
+            *(1.3, 0.6, 0.8, 1.5, (0.4, 0.4), 0.3),
+            *((0.012, 0.020, 0.022), (0.012, 0.012, 0.015), (0.4, 2.5)),
         ),
     }
 )

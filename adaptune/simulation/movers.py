@@ -26,24 +26,14 @@ def model(kind: str) -> Mesh:
 
 @dataclass(frozen=True)
 class Mover:
-    """A car or walker that goes to and fro along the road and slows down to turn back.
+    """A car or walker that goes to and fro along the road and slows down to turn back."""
 
-    Attributes
-    ----------
-    kind
-        "car" or "walker".
-    middle, swing
-        Station about which it moves, and metres to either side.
-    offset
-        Metres to the left of the road's middle.
-    pace, phase
-        Radians in a second and at the start.
-    """
-
-    kind: str
+    kind: str  # "car" or "walker"
+    # Station about which it moves, and metres to either side.
     middle: float
     swing: float
-    offset: float
+    offset: float  # metres to the left of the road's middle
+    # Radians in a second and at the start.
     pace: float
     phase: float
 

@@ -52,25 +52,11 @@ def _fractal(points: Points, wavelength: float, octaves: int, seed: int) -> NDAr
 def fractal(points: Points, wavelength: float, seed: int, octaves: int = 1) -> NDArray[np.float64]:
     """Sum octaves of smooth noise, each of half the wavelength and amplitude of the one before.
 
-    Parameters
-    ----------
-    points
-        Places in metres, of shape (n, 3).
-    wavelength
-        Metres between lattice points of the first octave, whose values lie in -1..1.
-    seed
-        Another seed is another noise.
-    octaves
-        How many to sum.
-
-    Returns
-    -------
-    ndarray of shape (n,)
+    The first octave has its values in -1..1, and `wavelength` metres between lattice points.
+    `points` in metres are of shape (n, 3), the noise of shape (n,).
     """
-    values: NDArray[np.float64] = _fractal(
-        np.ascontiguousarray(points, np.float64), float(wavelength), octaves, seed & 0x7FFFFFFF
-    )
-    return values
+    points = np.ascontiguousarray(points, np.float64)
+    return np.asarray(_fractal(points, float(wavelength), octaves, seed & 0x7FFFFFFF))
 
 
 def fractal_plane(

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -16,13 +15,7 @@ _MAP_SCANS, _MAP_POINTS = 150, 4000
 
 
 class Preview:
-    """Collects the content of the picture scan by scan.
-
-    Parameters
-    ----------
-    drive
-        The drive that is recorded.
-    """
+    """Collects the content of the picture of a drive scan by scan."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
@@ -47,10 +40,8 @@ class Preview:
     def save(self, path: Path) -> None:
         """Draw the map with the path, and the middle scan from above and as a panorama."""
         figure = Figure(figsize=(16.0, 9.0), dpi=110, layout="constrained")
-        FigureCanvasAgg(figure)
-        panels = figure.subplot_mosaic(
-            [["map", "map", "scan"], ["map", "map", "scan"], ["panorama"] * 3]
-        )
+        upper: Any = ["map", "map", "scan"]
+        panels = figure.subplot_mosaic([upper, upper, ["panorama"] * 3])
         course = self._drive.course
         figure.suptitle(
             f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
@@ -70,10 +61,8 @@ class Preview:
             azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
             elevation = np.degrees(np.arcsin(points[:, 2] / away))
             drawn = panel.scatter(azimuth, elevation, s=9.0, marker="s", linewidths=0, **look)
-            panel.set(
-                xlim=(180, -180), facecolor="black", title="the same scan as the sensor sees it"
-            )
-            panel.set(xlabel="azimuth (deg)", ylabel="elevation (deg)")
+            panel.set(xlim=(180, -180), facecolor="black", xlabel="azimuth (deg)")
+            panel.set(ylabel="elevation (deg)", title="the same scan as the sensor sees it")
             figure.colorbar(drawn, ax=panel, label="range (m)", pad=0.01)
         figure.savefig(path, format="png")
 

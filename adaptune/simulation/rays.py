@@ -11,22 +11,12 @@ F64 = NDArray[np.float64]
 
 
 class Cast(NamedTuple):
-    """Rays, and what they hit.
+    """Rays, and what they hit."""
 
-    Attributes
-    ----------
-    rays : ndarray of shape (n, 6)
-        Origins and directions.
-    hits : ndarray of shape (n,)
-        Metres to what each ray hit, infinite where nothing.
-    normals : ndarray of shape (n, 3)
-    reflectivity : ndarray of shape (n,)
-    """
-
-    rays: F32
-    hits: F32
-    normals: F32
-    reflectivity: F32
+    rays: F32  # origins and directions, of shape (n, 6)
+    hits: F32  # metres to what each ray hit, infinite where nothing, of shape (n,)
+    normals: F32  # of shape (n, 3)
+    reflectivity: F32  # of shape (n,)
 
 
 class Receiver(NamedTuple):
@@ -40,21 +30,11 @@ class Receiver(NamedTuple):
 
 @numba.njit(cache=True)
 def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
-    """Send every ray from its own column's pose.
+    """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
 
-    Parameters
-    ----------
-    directions
-        Unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3).
-    T_world_sensor
-        Pose at each column, of shape (n_columns, 4, 4).
-    origin
-        Origin of the rays' coordinates, of shape (3,). Near it, single precision is exact enough.
-
-    Returns
-    -------
-    ndarray of shape (n_columns * n_rings, 6)
-        Origins and directions of the rays.
+    Directions are unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3); poses are
+    one for each column. Near `origin`, that of the rays' coordinates, single precision is exact
+    enough.
     """
     columns, rings = directions.shape[:2]
     rays = np.empty((columns * rings, 6), np.float32)
@@ -75,27 +55,16 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
 def towards(
     rays: F32, rings: int, centres: F64, yaw: F64, radius: float
 ) -> tuple[NDArray[np.int64], F32]:
-    """Pick the rays that pass a moving object, in the frame of the object.
+    """Pick the rays that pass a moving object: their indices, and the rays in the object's frame.
 
     Parameters
     ----------
-    rays
-        Of shape (n_columns * n_rings, 6).
-    rings
-        Rays in a column.
-    centres
-        The object's origin at each column, of shape (n_columns, 3).
-    yaw
-        Its heading at each column in radians, of shape (n_columns,).
+    rays, rings
+        Of shape (n_columns * n_rings, 6), and how many there are in a column.
+    centres, yaw
+        The object's origin (n_columns, 3) and heading in radians (n_columns,) at each column.
     radius
         Metres around its origin within which all of it lies.
-
-    Returns
-    -------
-    picked : ndarray of shape (m,)
-        Indices of the rays.
-    local : ndarray of shape (m, 6)
-        The rays in the object's frame.
     """
     picked = np.empty(len(rays), np.int64)
     local = np.empty((len(rays), 6), np.float32)

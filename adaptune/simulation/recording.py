@@ -27,13 +27,8 @@ Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 
 Progress = Callable[[int, int], None]
 
-CLOUD = np.dtype(
-    [
-        *((name, "<f4") for name in ("x", "y", "z", "intensity")),
-        ("ring", "<u2"),
-        ("time", "<f4"),
-    ]
-)
+_FIELDS = ("x", "y", "z", "intensity", "ring", "time")
+CLOUD = np.dtype([(name, "<u2" if name == "ring" else "<f4") for name in _FIELDS])
 """A point as Velodyne's driver writes it: 22 bytes, time in seconds from the header's stamp."""
 
 _MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
@@ -63,14 +58,9 @@ def record(
         Format. If not given, the name decides: ``.bag`` is ROS 1, ``.mcap`` a ROS 2 file,
         anything else a ROS 2 folder.
     overwrite
-        Whether to replace an existing recording.
+        Whether to replace an existing recording; no other file or folder is replaced.
     progress
         Called after every scan with the numbers of finished and of all scans.
-
-    Raises
-    ------
-    SimulationError
-        If a file of the same name exists that must not be replaced.
     """
     # matplotlib takes a second to import.
     from adaptune.simulation.preview import Preview
@@ -88,15 +78,15 @@ def record(
         temporary_truth = stack.enter_context(replacing(truth))
         temporary_preview = stack.enter_context(replacing(preview))
         scans = _watched(drive, picture := Preview(drive), progress)
+        new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
         if layout == "kitti":
-            _write_kitti(drive, scans, stack.enter_context(replacing_folder(path)))
-        elif layout == "ros1":
-            _write_ros1(drive, scans, stack.enter_context(replacing(path)))
+            _write_kitti(drive, scans, new)
         elif layout == "mcap":
-            _write_mcap(drive, scans, stack.enter_context(replacing(path)))
+            _write_mcap(drive, scans, new)
         else:
-            folder = stack.enter_context(replacing_folder(path))
-            _write_ros2(drive, scans, folder, StoragePlugin.SQLITE3)
+            # The writer makes the file itself.
+            new.unlink(missing_ok=True)
+            _write_bag(drive, scans, new, 1 if layout == "ros1" else 2)
         stamps = drive.stamps()
         write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
         picture.save(temporary_preview)
@@ -115,9 +105,7 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
     if path.is_dir() and (mark is None or not (path / mark).exists()):
         raise SimulationError(f"{path} is a folder, but no recording of this kind: not replaced")
     if mark is not None and not path.is_dir():
-        raise SimulationError(
-            f"{path} is a file, the recording would be a folder: it is not replaced"
-        )
+        raise SimulationError(f"{path} is a file, the recording would be a folder: not replaced")
 
 
 def _watched(
@@ -193,24 +181,21 @@ class _Composer(Messages):
         return self.cloud(self.header(POINTS, stamp, "velodyne"), cloud)
 
 
-def _write_ros1(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
-    composer = _Composer(drive, 1)
-    # The writer makes the file itself.
-    path.unlink()
-    composer.write(path, composer.topics, composer.messages(scans))
-
-
-def _write_ros2(
-    drive: Drive, scans: Iterator[SimulatedScan], folder: Path, storage: StoragePlugin
+def _write_bag(
+    drive: Drive,
+    scans: Iterator[SimulatedScan],
+    path: Path,
+    version: Literal[1, 2],
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
 ) -> None:
-    composer = _Composer(drive, 2)
-    composer.write(folder, composer.topics, composer.messages(scans), storage)
+    composer = _Composer(drive, version)
+    composer.write(path, composer.topics, composer.messages(scans), storage)
 
 
 def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
     with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
         folder = Path(name) / "bag"
-        _write_ros2(drive, scans, folder, StoragePlugin.MCAP)
+        _write_bag(drive, scans, folder, 2, StoragePlugin.MCAP)
         (file,) = folder.glob("*.mcap")
         file.replace(path)
 

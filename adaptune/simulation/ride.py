@@ -21,16 +21,8 @@ class Ride:
     """The sensor's trajectory in continuous time, with its derivatives.
 
     One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
-    vehicle and its shake. Poses, velocities and accelerations thus match exactly.
-
-    Parameters
-    ----------
-    road
-        Where it leads.
-    motion
-        How the sensor is carried.
-    seed
-        Seed of its straying, its speed and its shake.
+    vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
+    of its straying, its speed and its shake.
 
     Attributes
     ----------
@@ -41,7 +33,7 @@ class Ride:
     def __init__(self, road: Road, motion: Motion, seed: int) -> None:
         rng = np.random.default_rng([seed, 2])
         s = np.arange(-10.0, road.length + 10.0, _STEP)
-        lane = np.stack([*_lane(road, motion, s, rng)], axis=1)
+        lane = _lane(road, motion, s, rng)
         times = _schedule(road, motion, s, lane, rng)
         times -= np.interp(0.0, s, times)
         self.duration = float(np.interp(road.length, s, times))
@@ -82,10 +74,8 @@ class Ride:
         return second[:, :3], _angular_acceleration(angles, rates, second[:, 3:])
 
 
-def _lane(
-    road: Road, motion: Motion, s: Floats, rng: np.random.Generator
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Position and attitude at each station of a vehicle that rolls over the ground."""
+def _lane(road: Road, motion: Motion, s: Floats, rng: np.random.Generator) -> Floats:
+    """Position and attitude, (n, 6), at each station of a vehicle that rolls over the ground."""
     stray = gaussian_filter1d(rng.normal(size=len(s)), 8.0 / _STEP, mode="nearest")
     stray *= motion.weave / max(float(stray.std()), 1e-9)
     x, y = road.plane(s, stray)
@@ -103,7 +93,7 @@ def _lane(
     up = np.stack([np.sin(pitch), -np.sin(roll)]) * motion.height
     x = x + np.cos(yaw) * up[0] - np.sin(yaw) * up[1]
     y = y + np.sin(yaw) * up[0] + np.cos(yaw) * up[1]
-    return x, y, z + motion.height, roll, pitch, yaw
+    return np.stack([x, y, z + motion.height, roll, pitch, yaw], axis=1)
 
 
 def _schedule(
@@ -153,16 +143,11 @@ def _rotations(angles: Floats) -> Floats:
 
 
 def _angular_velocity(angles: Floats, rates: Floats) -> Floats:
-    roll, pitch = angles[:, 0], angles[:, 1]
+    (sr, sp), (cr, cp) = np.sin(angles[:, :2]).T, np.cos(angles[:, :2]).T
     d_roll, d_pitch, d_yaw = rates.T
-    return np.stack(
-        [
-            d_roll - d_yaw * np.sin(pitch),
-            d_pitch * np.cos(roll) + d_yaw * np.sin(roll) * np.cos(pitch),
-            -d_pitch * np.sin(roll) + d_yaw * np.cos(roll) * np.cos(pitch),
-        ],
-        axis=1,
-    )
+    x = d_roll - d_yaw * sp
+    y = d_pitch * cr + d_yaw * sr * cp
+    return np.stack([x, y, -d_pitch * sr + d_yaw * cr * cp], axis=1)
 
 
 def _angular_acceleration(angles: Floats, rates: Floats, second: Floats) -> Floats:
@@ -170,19 +155,9 @@ def _angular_acceleration(angles: Floats, rates: Floats, second: Floats) -> Floa
     (sr, sp), (cr, cp) = np.sin(angles[:, :2]).T, np.cos(angles[:, :2]).T
     d_roll, d_pitch, d_yaw = rates.T
     dd_roll, dd_pitch, dd_yaw = second.T
-    return np.stack(
-        [
-            dd_roll - dd_yaw * sp - d_yaw * d_pitch * cp,
-            dd_pitch * cr
-            - d_pitch * d_roll * sr
-            + dd_yaw * sr * cp
-            + d_yaw * d_roll * cr * cp
-            - d_yaw * d_pitch * sr * sp,
-            -dd_pitch * sr
-            - d_pitch * d_roll * cr
-            + dd_yaw * cr * cp
-            - d_yaw * d_roll * sr * cp
-            - d_yaw * d_pitch * cr * sp,
-        ],
-        axis=1,
-    )
+    x = dd_roll - dd_yaw * sp - d_yaw * d_pitch * cp
+    y = dd_pitch * cr - d_pitch * d_roll * sr + dd_yaw * sr * cp
+    y = y + d_yaw * d_roll * cr * cp - d_yaw * d_pitch * sr * sp
+    z = -dd_pitch * sr - d_pitch * d_roll * cr + dd_yaw * cr * cp
+    z = z - d_yaw * d_roll * sr * cp - d_yaw * d_pitch * cr * sp
+    return np.stack([x, y, z], axis=1)

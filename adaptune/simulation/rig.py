@@ -29,20 +29,8 @@ NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
 
 
 def as_sequence(course: Course, path: Path) -> SequenceConfig:
-    """Configuration of the sequence that was recorded of a course.
-
-    Parameters
-    ----------
-    course
-        The simulated course.
-    path
-        The bag.
-    """
-    measured: dict[str, Any] | None = None
-    if course.imu is not None:
-        measured = {
-            "topic": IMU,
-            "extrinsic": geometry.invert(T_IMU_LIDAR).tolist(),
-            "noise": NOISE._asdict(),
-        }
-    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=measured)
+    """Configuration of the sequence in the bag that was recorded of a course."""
+    extrinsic = geometry.invert(T_IMU_LIDAR).tolist()
+    imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": NOISE._asdict()}
+    imu = None if course.imu is None else imu
+    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=imu)

@@ -35,14 +35,7 @@ class Road:
 
     Stations are metres along the line, 0 where the drive starts; offsets are metres to its left.
     It stays within 70 degrees of the x axis and so never meets itself: each x belongs to one
-    station.
-
-    Parameters
-    ----------
-    scenes
-        Each scene with the metres driven in it.
-    seed
-        Seed of its bends and slopes.
+    station. Each scene comes with the metres driven in it; the seed is that of bends and slopes.
 
     Attributes
     ----------
@@ -58,19 +51,16 @@ class Road:
         self.length = self.legs[-1].stop - APRON
         stations = np.arange(self.legs[0].start, self.legs[-1].stop + _STEP, _STEP)
         rng = np.random.default_rng([seed, 1])
-        heading = _bends(
-            [(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs], stations, rng
-        )
+        winding = [(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs]
+        heading = _bends(winding, stations, rng)
         slope = _bends([(leg, leg.scene.slope, 35.0) for leg in self.legs], stations, rng)
         # No vehicle drives sharper: bends of a metre or two are rounded off.
         heading = gaussian_filter1d(heading, 2.0 / _STEP, mode="nearest")
         slope = gaussian_filter1d(slope, 4.0 / _STEP, mode="nearest")
         zero = int(np.searchsorted(stations, 0.0))
         line = np.stack([np.cos(heading), np.sin(heading), slope])
-        line = np.concatenate(
-            [np.zeros((3, 1)), np.cumsum((line[:, 1:] + line[:, :-1]) * (_STEP / 2.0), axis=1)],
-            axis=1,
-        )
+        steps = (line[:, 1:] + line[:, :-1]) * (_STEP / 2.0)
+        line = np.hstack([np.zeros((3, 1)), np.cumsum(steps, axis=1)])
         self._x, self._y, self._z = line - line[:, zero : zero + 1]
         self._stations, self._heading = stations, heading
 

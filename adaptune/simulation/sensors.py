@@ -1,7 +1,7 @@
 """LiDARs: their rays, rates and noise."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from types import MappingProxyType
 from typing import Literal
@@ -12,34 +12,19 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A LiDAR.
+    """A LiDAR."""
 
-    Attributes
-    ----------
-    elevations : ndarray of shape (n_rings,)
-        Radians above the sensor's horizon, by the ring number its driver gives: upwards on
-        Velodynes, downwards on Ousters. On a Livox, the offset of each of its lines.
-    columns : int
-        Firings in a turn; all rings fire at once.
-    rate : float
-        Turns in a second.
-    range : tuple of float
-        Least and greatest range in metres. The greatest holds for a target that reflects a tenth
-        of the light or more and is met squarely.
-    noise : float
-        Standard deviation of a range in metres.
-    dropout : float
-        Share of echoes lost for no reason.
-    pattern : {"spin", "rosette"}
-        Whether it turns about its vertical axis, or draws a rosette ahead which never repeats.
-    """
-
+    # Radians above the sensor's horizon, by the ring number its driver gives: upwards on Velodynes,
+    # downwards on Ousters. On a Livox, the offset of each of its lines, of shape (n_rings,).
     elevations: NDArray[np.float64]
-    columns: int
-    rate: float
+    columns: int  # firings in a turn; all rings fire at once
+    rate: float  # turns in a second
+    # Least and greatest range in metres. The greatest holds for a target that reflects a tenth of
+    # the light or more and is met squarely.
     range: tuple[float, float]
-    noise: float
-    dropout: float
+    noise: float  # standard deviation of a range in metres
+    dropout: float  # share of echoes lost for no reason
+    # Whether it turns about its vertical axis, or draws a rosette ahead which never repeats.
     pattern: Literal["spin", "rosette"] = "spin"
 
     @property
@@ -48,37 +33,25 @@ class Sensor:
         return len(self.elevations)
 
 
-def _hdl64e() -> NDArray[np.float64]:
-    """Two blocks of 32 lasers: a third of a degree apart above, half a degree below."""
-    upper = 2.0 - np.arange(32) / 3.0
-    lower = -8.83 - 0.5 * np.arange(32)
-    elevations: NDArray[np.float64] = np.radians(np.concatenate([upper, lower])[::-1])
-    return elevations
+def _sensor(
+    degrees: NDArray[np.floating], columns: int, reach: tuple[float, float], noise: float = 0.015
+) -> Sensor:
+    return Sensor(np.radians(degrees), columns, 10.0, reach, noise, 0.005)
 
+
+# Two blocks of 32 lasers: a third of a degree apart above, half a degree below.
+_HDL64E = np.concatenate([2.0 - np.arange(32) / 3.0, -8.83 - 0.5 * np.arange(32)])[::-1]
 
 SENSORS: Mapping[str, Sensor] = MappingProxyType(
     {
-        "vlp16": Sensor(
-            np.radians(np.arange(-15.0, 16.0, 2.0)), 1800, 10.0, (0.5, 100.0), 0.015, 0.005
-        ),
+        "vlp16": _sensor(np.arange(-15.0, 16.0, 2.0), 1800, (0.5, 100.0)),
         # 900 columns, half of what it can do, keep a scan at 28,800 rays.
-        "hdl32e": Sensor(
-            np.radians(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1)),
-            900,
-            10.0,
-            (1.0, 100.0),
-            0.015,
-            0.005,
-        ),
-        "hdl64e": Sensor(_hdl64e(), 2083, 10.0, (0.9, 120.0), 0.015, 0.005),
-        "os0-64": Sensor(
-            np.radians(np.linspace(45.0, -45.0, 64)), 1024, 10.0, (0.3, 50.0), 0.015, 0.005
-        ),
-        "os1-128": Sensor(
-            np.radians(np.linspace(22.5, -22.5, 128)), 1024, 10.0, (0.5, 120.0), 0.015, 0.005
-        ),
-        "avia": Sensor(
-            np.radians((np.arange(6) - 2.5) * 0.6), 4000, 10.0, (1.0, 190.0), 0.02, 0.005, "rosette"
+        "hdl32e": _sensor(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1), 900, (1.0, 100.0)),
+        "hdl64e": _sensor(_HDL64E, 2083, (0.9, 120.0)),
+        "os0-64": _sensor(np.linspace(45.0, -45.0, 64), 1024, (0.3, 50.0)),
+        "os1-128": _sensor(np.linspace(22.5, -22.5, 128), 1024, (0.5, 120.0)),
+        "avia": replace(
+            _sensor((np.arange(6) - 2.5) * 0.6, 4000, (1.0, 190.0), 0.02), pattern="rosette"
         ),
     }
 )
@@ -96,10 +69,7 @@ def _spin(name: str, columns: int) -> NDArray[np.float32]:
     elevations = SENSORS[name].elevations
     # A Velodyne turns clockwise seen from above. The seam lies behind, away from what is ahead.
     azimuth = np.pi - 2.0 * np.pi * np.arange(columns) / columns
-    directions = np.empty((columns, len(elevations), 3), np.float32)
-    directions[..., 0] = np.cos(azimuth)[:, None] * np.cos(elevations)
-    directions[..., 1] = np.sin(azimuth)[:, None] * np.cos(elevations)
-    directions[..., 2] = np.sin(elevations)
+    directions = _unit(azimuth, elevations)
     directions.setflags(write=False)
     return directions
 
@@ -109,36 +79,22 @@ def _rosette(sensor: Sensor, times: NDArray[np.float64]) -> NDArray[np.float32]:
     lines = sensor.elevations - sensor.elevations.mean()
     azimuth = _FIELD[0] * (np.cos(first) + np.cos(second)) / 2.0
     elevation = (_FIELD[1] - lines.max()) * (np.sin(first) + np.sin(second)) / 2.0
-    elevation = elevation[:, None] + lines
-    directions = np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth)[:, None],
-            np.cos(elevation) * np.sin(azimuth)[:, None],
-            np.sin(elevation),
-        ],
-        axis=-1,
-    )
-    return directions.astype(np.float32)
+    return _unit(azimuth, elevation[:, None] + lines)
+
+
+def _unit(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit vectors at the azimuths of columns and the elevations of rings."""
+    level = np.cos(elevation)
+    x, y = level * np.cos(azimuth)[:, None], level * np.sin(azimuth)[:, None]
+    z = np.broadcast_to(np.sin(elevation), x.shape)
+    return np.stack([x, y, z], axis=-1).astype(np.float32)
 
 
 def directions(name: str, columns: int, start: float, rate: float) -> NDArray[np.float32]:
-    """Where a sensor looks during one scan.
+    """Where a sensor looks during one scan of some firings (`columns`).
 
-    Parameters
-    ----------
-    name
-        A name from `SENSORS`.
-    columns
-        Firings in the scan.
-    start
-        Seconds since the recording's start at which the scan starts.
-    rate
-        Scans in a second.
-
-    Returns
-    -------
-    ndarray of shape (columns, n_rings, 3)
-        float32 unit vectors in the sensor's frame: x ahead, y to the left, z up.
+    The scan starts `start` seconds after the recording, which has `rate` scans a second. Unit
+    vectors of shape (columns, n_rings, 3) are in the sensor's frame: x ahead, y to the left, z up.
     """
     sensor = SENSORS[name]
     if sensor.pattern == "spin":

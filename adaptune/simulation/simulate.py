@@ -32,38 +32,15 @@ _DETOUR = 1.2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedScan(Scan):
-    """A scan with intensities, rings and its true pose.
+    """A scan with intensities, rings and its true pose."""
 
-    Attributes
-    ----------
-    intensities : ndarray of shape (n,)
-        float32, from 0 to 255.
-    rings : ndarray of shape (n,)
-        uint16 laser of each point.
-    T_world_sensor : ndarray of shape (4, 4)
-        True pose at the scan's stamp.
-    """
-
-    intensities: NDArray[np.float32]
+    intensities: NDArray[np.float32]  # from 0 to 255
     rings: NDArray[np.uint16]
-    T_world_sensor: Poses
+    T_world_sensor: Poses  # at the scan's stamp, of shape (4, 4)
 
 
 class Drive:
-    """A course with its road and the sensor's ride along it.
-
-    Parameters
-    ----------
-    course
-        The course to simulate.
-
-    Attributes
-    ----------
-    course : Course
-    road : Road
-    ride : Ride
-        The sensor's trajectory in continuous time.
-    """
+    """A course with its road and the sensor's ride along it."""
 
     def __init__(self, course: Course) -> None:
         self.course = course
@@ -77,7 +54,7 @@ class Drive:
     def stamps(self) -> NDArray[np.int64]:
         """Borders of the scans in nanoseconds, one more than there are scans."""
         borders = np.arange(len(self) + 1) * (1e9 / self.course.turns)
-        return np.asarray(EPOCH + np.rint(borders).astype(np.int64), np.int64)
+        return np.asarray(EPOCH + np.rint(borders).astype(np.int64))
 
     def seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """Seconds since the start of stamps in nanoseconds."""
@@ -125,9 +102,8 @@ class _Caster:
         self._world = World(drive.road)
         self._here: int | None = None
         self._movers = populate(drive.road) if drive.course.moving_objects else []
-        self._models = {
-            kind: _Target(model(kind), np.zeros(3)) for kind in {m.kind for m in self._movers}
-        }
+        kinds = {mover.kind for mover in self._movers}
+        self._models = {kind: _Target(model(kind), np.zeros(3)) for kind in kinds}
 
     def cast(
         self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
@@ -181,24 +157,10 @@ class _Target:
         """Cast rays of shape (n, 6): metres to the hit, its normal and its reflectivity."""
         answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))
         triangles = np.minimum(answer["primitive_ids"].numpy(), len(self._reflectivity) - 1)
-        return (
-            answer["t_hit"].numpy(),
-            answer["primitive_normals"].numpy(),
-            self._reflectivity[triangles],
-        )
+        hits, normals = answer["t_hit"].numpy(), answer["primitive_normals"].numpy()
+        return hits, normals, self._reflectivity[triangles]
 
 
 def simulate(course: Course) -> Iterator[SimulatedScan]:
-    """Drive a course and scan it, one scan at a time.
-
-    Parameters
-    ----------
-    course
-        The course to simulate.
-
-    Yields
-    ------
-    SimulatedScan
-        In order; the stamp always marks the scan's start.
-    """
+    """Drive a course and scan it, one scan at a time; stamps always mark a scan's start."""
     return Drive(course).scans()

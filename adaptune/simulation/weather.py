@@ -7,21 +7,12 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Weather:
-    """Effect of the air on rays.
+    """Effect of the air on rays."""
 
-    Attributes
-    ----------
-    extinction : float
-        Share of the light lost in a metre, each way (1/m).
-    backscatter : float
-        Chance in a metre that drops send back an echo before the target does (1/m).
-    reach : float
-        Metres within which such an echo is strong enough to be seen.
-    """
-
-    extinction: float
+    extinction: float  # share of the light lost in a metre, each way (1/m)
+    # Chance in a metre that drops send back an echo before the target does (1/m).
     backscatter: float
-    reach: float
+    reach: float  # metres within which such an echo is strong enough to be seen
 
 
 WEATHERS: Mapping[str, Weather] = MappingProxyType(

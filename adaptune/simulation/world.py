@@ -23,22 +23,10 @@ def _offsets() -> NDArray[np.float64]:
 
 
 class World:
-    """All static objects that rays can hit.
+    """All static objects along a road that rays can hit.
 
-    Parameters
-    ----------
-    road
-        The road along which it is built.
-
-    Attributes
-    ----------
-    tiles : dict
-        Meshes of the tiles in reach, by index.
-
-    Notes
-    -----
     Every tile has its own random numbers and is always built the same. Only tiles in reach are
-    kept.
+    kept: `tiles` holds their meshes by index.
     """
 
     def __init__(self, road: Road) -> None:

@@ -17,18 +17,12 @@ TILE = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """Places on the ground, as arrays of one shape.
+    """Places on the ground, as arrays of one shape."""
 
-    Attributes
-    ----------
-    x, y
-        In the world.
-    s, d
-        Station along the road and offset to its left.
-    """
-
+    # In the world.
     x: Floats
     y: Floats
+    # Station along the road and offset to its left.
     s: Floats
     d: Floats
 
@@ -48,32 +42,18 @@ class Line(Protocol):
 
 @dataclass(frozen=True)
 class Tile:
-    """A piece of a scene: up to twenty metres of road and its surroundings.
+    """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    Attributes
-    ----------
-    line
-        The road.
-    index
-        Its number along the road: it begins at station ``index * TILE``.
-    start, stop
-        Stations of its ends, in metres; a leg may begin or end within it.
-    opens, closes
-        Whether it is the leg's first or last tile with another scene next to it.
-    rng
-        Its own random numbers.
-    seed
-        Seed of the whole world, for shapes that continue from tile to tile.
-    """
-
-    line: Line
-    index: int
+    line: Line  # the road
+    index: int  # its number along the road: it begins at station ``index * TILE``
+    # Stations of its ends, in metres; a leg may begin or end within it.
     start: float
     stop: float
+    # Whether it is the leg's first or last tile with another scene next to it.
     opens: bool
     closes: bool
-    rng: np.random.Generator = field(compare=False)
-    seed: int
+    rng: np.random.Generator = field(compare=False)  # its own random numbers
+    seed: int  # seed of the whole world, for shapes that continue from tile to tile
 
     def at(self, s: ArrayLike, d: ArrayLike, lift: ArrayLike = 0.0) -> Floats:
         """Points of shape (..., 3) `lift` metres above the ground at stations and offsets."""
@@ -90,14 +70,8 @@ class Tile:
     ) -> tuple[Floats, Floats]:
         """Stations and offsets of objects strewn on both sides of the road.
 
-        Parameters
-        ----------
-        density
-            How many there are on a square metre, on average.
-        near, far
-            Least and greatest distance from the road's middle in metres.
-        margin
-            Metres kept free at the ends where another scene begins.
+        `density` is their mean number on a square metre, `near` and `far` bound their distance from
+        the road's middle, and `margin` is kept free at the ends where another scene begins.
         """
         start = self.start + margin * self.opens
         stop = self.stop - margin * self.closes
@@ -109,39 +83,20 @@ class Tile:
 
 @dataclass(frozen=True)
 class Scene:
-    """A kind of place.
+    """A kind of place."""
 
-    Attributes
-    ----------
-    summary
-        What it is, in a line.
-    build
-        Makes what stands on the ground of a tile.
-    relief
-        Height of the ground above the road's line at some spots, for a seed.
-    surface
-        Material of the ground at an offset.
-    winding, bend
-        Radians by which the road swings to and fro, and metres from one side to the other.
-    slope
-        Greatest rise of the road, as a ratio.
-    shake
-        How rough the ride is; 1 is a paved road.
-    pace
-        Share of its usual speed at which a vehicle goes.
-    movers
-        What moves about in it: kinds of mover with the offset they keep.
-    """
-
-    summary: str
-    build: Callable[[Tile], list[Mesh]]
+    summary: str  # what it is, in a line
+    build: Callable[[Tile], list[Mesh]]  # makes what stands on the ground of a tile
+    # Height of the ground above the road's line at some spots, for a seed.
     relief: Callable[[Spots, int], Floats]
-    surface: Callable[[Floats], NDArray[np.uint8]]
+    surface: Callable[[Floats], NDArray[np.uint8]]  # material of the ground at an offset
+    # Radians by which the road swings to and fro, and metres from one side to the other.
     winding: float
     bend: float
-    slope: float
-    shake: float
-    pace: float = 1.0
+    slope: float  # greatest rise of the road, as a ratio
+    shake: float  # how rough the ride is; 1 is a paved road
+    pace: float = 1.0  # share of its usual speed at which a vehicle goes
+    # What moves about in it: kinds of mover with the offset they keep.
     movers: tuple[tuple[str, float], ...] = ()
 
 
