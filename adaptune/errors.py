@@ -2,7 +2,7 @@
 
 
 class AdaptuneError(Exception):
-    """A mistake in what was given, told in a sentence that says what to do.
+    """A mistake in the input, with a sentence that says what to do.
 
     The command line prints the sentence and exits with code 2. Modules derive their own class
     from it, and chain the cause.

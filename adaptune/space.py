@@ -160,6 +160,11 @@ class ParameterSpace:
     def __init__(self, parameters: Mapping[str, Float | Integer | Categorical]):
         self.parameters = dict(parameters)
 
+    @classmethod
+    def of(cls, **parameters: Float | Integer | Categorical) -> Self:
+        """Make a space of parameters whose names are Python's."""
+        return cls(parameters)
+
     def __eq__(self, other: object) -> bool:
         mine = list(self.parameters.items())
         return isinstance(other, ParameterSpace) and mine == list(other.parameters.items())

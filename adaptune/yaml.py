@@ -1,4 +1,4 @@
-"""YAML as people mean it: PyYAML's safe loader without YAML 1.1's surprises."""
+"""YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers."""
 
 import re
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from adaptune.errors import AdaptuneError
 
 
 class YamlError(AdaptuneError):
-    """Text that is not YAML, or says a key twice."""
+    """Text that is not YAML, or gives a key twice."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -22,7 +22,7 @@ class _Loader(yaml.SafeLoader):
     }
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Construct a mapping, refusing a key that comes twice."""
+        """Construct a mapping; refuse a key that comes twice."""
         seen: dict[Any, int] = {}
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
@@ -71,7 +71,7 @@ class Document:
             what = ", ".join(part for part in (error.context, error.problem) if part)
             raise YamlError(f"{where}{what}") from error
         except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
-            # What PyYAML's constructors raise on tags that do not suit their values.
+            # PyYAML's constructors raise these on tags that do not fit their values.
             raise YamlError(f"{type(error).__name__}: {error}") from error
 
     def line(self, path: Sequence[str | int]) -> int | None:
@@ -91,12 +91,12 @@ class Document:
 
 
 def scalar(text: str) -> Any:
-    """Value of one line of YAML, as given on a command line."""
+    """Value of one line of YAML from the command line."""
     return Document(text).data
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what either version of YAML would not read back as a string, and repeats lists."""
+    """Quotes what YAML 1.1 or 1.2 does not read back as a string, and repeats lists."""
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
         """Write everything out."""

@@ -4,13 +4,13 @@
     python benchmarks/campaign.py size [TRIALS]
 
 *speed* records a simulated cave and runs TRIALS (64) sets of GICP over its SCANS (600): once in a
-bare loop that reads and prepares the clouds and registers them, once as two such loops side by side
+bare loop that reads, prepares and registers the clouds, once as two such loops at the same time
 with half of the sets each, once as a campaign with one worker, once with two. Limits: 1.10 times
 the bare loop's time with one worker, 1.8 times faster with two, where two bare loops are.
 
-*size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are drawn, not run, and tells
-the driver's memory on the way; then what it takes to resume it: until the next trial is proposed
-(limit 5 s), and until a campaign that lacks nothing is through, model and all.
+*size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are random numbers, and prints
+the driver's memory on the way. Then it measures how long a resumed campaign takes: until it
+proposes the next trial (limit 5 s), and until it ends, with its model, where it lacks nothing.
 """
 
 import multiprocessing as mp
@@ -66,7 +66,7 @@ def bare(study: OfflineStudy, sets: Sequence[dict[str, Any]]) -> None:
 
 
 def in_children(function: Callable[..., Any], *calls: tuple[Any, ...]) -> list[tuple[float, Any]]:
-    """Clock calls, each in a fresh process, all at once; what they take and what they return."""
+    """Time calls, each in a fresh process, all at once; return their seconds and results."""
     context = mp.get_context("spawn")
     queues = [context.SimpleQueue() for _ in calls]
     children = [
@@ -82,7 +82,7 @@ def in_children(function: Callable[..., Any], *calls: tuple[Any, ...]) -> list[t
 
 
 def in_child(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Clock a call in a fresh process."""
+    """Time a call in a fresh process."""
     return in_children(function, arguments)[0]
 
 
@@ -93,8 +93,8 @@ def _answer(queue: Any, function: Callable[..., Any], arguments: tuple[Any, ...]
 
 
 def train(study: OfflineStudy) -> list[dict[str, Any]]:
-    """Run a campaign, and tell its parameter sets."""
-    return training.train(study).model.sets
+    """Run a campaign, and return its parameter sets."""
+    return list(training.train(study).model.sets.parameters)
 
 
 def speed(trials: int, scans: int) -> None:
@@ -127,7 +127,7 @@ def speed(trials: int, scans: int) -> None:
 
 
 class Drawn:
-    """A pool that draws what trials give."""
+    """A pool that draws the results of trials."""
 
     def __init__(self, *_: object):
         self.asked = 0.0
@@ -182,17 +182,17 @@ def _memory() -> float:
 
 
 def fill(study: OfflineStudy) -> None:
-    """Run a drawn campaign, and tell the memory on the way."""
+    """Run a drawn campaign, and print the memory on the way."""
     training.Workers = Drawn  # type: ignore[assignment,misc]
     at = [100, 300, 1000, 3000, 10_000, 30_000]
 
-    def tell(what: str, done: int, *_: object) -> None:
+    def show(what: str, done: int, *_: object) -> None:
         if what == "trials" and at and done >= at[0]:
             at.pop(0)
             print(f"{done:6d} trials: driver {_memory():6.1f} MB", flush=True)
 
-    training.train(study, tell)
-    print(f"with the model of all: at most {_peak():.1f} MB")
+    training.train(study, show)
+    print(f"with the model: at most {_peak():.1f} MB")
 
 
 def _peak() -> float:
@@ -200,7 +200,7 @@ def _peak() -> float:
 
 
 def resume(study: OfflineStudy) -> float:
-    """Run a drawn campaign again, and tell when the first trial was asked for."""
+    """Run a drawn campaign again; return the seconds until the first trial was asked for."""
     pool = Drawn()
     training.Workers = lambda *_: pool  # type: ignore[assignment,misc]
     begin = time.monotonic()

@@ -2,11 +2,11 @@
 
     python benchmarks/kill.py [KILLS] [SEED]
 
-With equal chance a driver or one of its two workers is sent SIGKILL, shortly after a random number
-of trials was finished since the last one; a driver is then started again. Whenever one has ended no
-finished trial may be missing or have been written again, and at the end archive, model and fixed
-set must equal the undisturbed campaign's byte for byte but for times, with every trial once in the
-index and in Optuna's journal. Fifty kills take several campaigns.
+The script sends SIGKILL to a driver or to one of its two workers, with equal chance, shortly after
+a random number of trials has finished since the last kill. Then it starts the driver again.
+Whenever a driver has ended, no finished trial may be missing or written again. At the end archive,
+model and fixed set must equal those of the undisturbed campaign byte for byte, except for times,
+with every trial once in the index and in Optuna's journal. Fifty kills take several campaigns.
 """
 
 import sys

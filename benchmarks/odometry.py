@@ -1,16 +1,16 @@
-"""What adapters add to their odometries, and what changing parameters on the way costs.
+"""The time that adapters add to their odometries, and the error that a switch adds.
 
     python benchmarks/odometry.py adapters RECORDING.bag [METRES]
     python benchmarks/odometry.py switching RECORDING.bag [ODOMETRY ...]
     python benchmarks/odometry.py faults
 
-The recording is a simulated course's, as `adaptune simulate` leaves it, or another one with the
-same topics. *adapters* runs every odometry that can be had with its default parameters and tells
-what a scan takes, how much of that is not spent in the odometry's own code, and how much more a
-process of its own takes. Limit: 5 % of the odometry's time, or 0.3 ms where that is more.
-*switching* hands over to the same parameters every 5 s. RTE over 25 m, or as many as are given; one
-core, medians of its own time, so that other work on the machine counts less. *faults* plants each
-kind of fault at the fourth scan.
+The recording is that of a simulated course, as `adaptune simulate` writes it, or another one with
+the same topics. *adapters* runs every installed odometry with its default parameters. It prints the
+time for a scan, the part of it that is not spent in the odometry's own code, and the time that a
+process of its own adds. Limit: 5 % of the odometry's time, or 0.3 ms where that is more.
+*switching* hands over to the same parameters every 5 s. The RTE is over 25 m, or the given METRES.
+All times are CPU time on one core, medians, so that other work on the machine counts less. *faults*
+plants each kind of fault at the fourth scan.
 """
 
 import sys
@@ -47,13 +47,13 @@ SOME = 30
 
 
 class Clock:
-    """Adds up what the wrapped functions take."""
+    """Adds up the time that the wrapped functions take."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def wrap(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A function that does the same on the clock."""
+        """The same function, timed."""
 
         def timed(*args: Any, **kwargs: Any) -> Any:
             begin = time.process_time()
@@ -66,7 +66,7 @@ class Clock:
 
 
 class Timed:
-    """An object whose methods run on a clock."""
+    """An object whose methods are timed."""
 
     def __init__(self, wrapped: Any, clock: Clock):
         self.__dict__.update(wrapped=wrapped, clock=clock)
@@ -94,22 +94,22 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
     return scans, reference.at(np.array([scan.stamp for scan in scans]))
 
 
-def drive(
+def run(
     odometry: OdometryInstance, scans: list[Scan], before: Callable[[int], None] = lambda _: None
 ) -> tuple[Poses, float]:
-    """Poses, and what a scan took in milliseconds of processors' time, the median."""
+    """Poses, and the median CPU time for a scan in milliseconds."""
     odometry.start(odometry.prepare(scans[0]), np.eye(4))
     poses, at = [np.eye(4)], []
     for i, scan in enumerate(scans[1:], start=1):
         before(i)
         poses.append(odometry.register(odometry.prepare(scan)).T_odom_sensor)
-        # Another process tells what it has computed with each pose, not before the first.
+        # Another process reports its CPU time with each pose, not before the first.
         at.append(computed(odometry))
     return np.array(poses), 1e3 * float(np.median(np.diff(at)))
 
 
 def computed(odometry: OdometryInstance) -> float:
-    """Seconds of processors' time, here and in the other process if there is one."""
+    """Seconds of CPU time, here and in the other process if there is one."""
     return time.process_time() + (odometry.usage.cpu if odometry.usage.memory else 0.0)
 
 
@@ -156,8 +156,8 @@ def adapters(path: Path, length: float) -> None:
         isolated = ""
         if not cls.clean:
             some = scans[:SOME]
-            here = drive(cls(), some)[1]
-            there = drive(Isolated(name, {}, cls.settings_type(), Limits()), some)[1]
+            here = run(cls(), some)[1]
+            there = run(Isolated(name, {}, cls.settings_type(), Limits()), some)[1]
             isolated = f"{there - here:.2f}"
         rte = np.nanmean(sub_trajectory_rte(T_ref, poses, length))
         print(
@@ -173,7 +173,7 @@ def rte_of(
     T_ref: Poses,
     switch: Callable[[int], None] | None = None,
 ) -> float:
-    """RTE in percent of an odometry that is made to switch every so often."""
+    """RTE in percent of an odometry that has to switch every `EVERY` seconds."""
     first = scans[0].stamp
 
     def before(i: int) -> None:
@@ -181,12 +181,12 @@ def rte_of(
         if switch is not None and now > last:
             switch(now)
 
-    poses, _ = drive(odometry, scans, before)
+    poses, _ = run(odometry, scans, before)
     return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
 
 
 def there_and_back(odometry: Any) -> None:
-    """Change all real numbers a little and back, so that an odometry does what a change takes."""
+    """Change all real numbers a little and back, so that an odometry does the work of a switch."""
     real = {name: v for name, v in odometry.parameters.items() if isinstance(v, float)}
     odometry.apply(Selection(0, {name: v * (1.0 + 1e-9) for name, v in real.items()}))
     odometry.apply(Selection(0, real))

@@ -3,10 +3,11 @@
     python benchmarks/pruning.py [--seeds 0 1 2] [--each 3] [--trials 64] [--length 40]
     python benchmarks/pruning.py --scenes cave open street --each 2
 
-For each seed, three caves, open grounds, streets and gardens are simulated, and all sets of a Sobol
-sequence are run on all of them, once. Every rule is then given the results it asks for: the same
-trials, so that what differs is the rule. Printed are the scans that it has registered and the RTE
-of its fixed set, as ratios to those of the study without pruning. The limits are 0.5 and 1.02.
+For each seed, the script simulates three caves, open grounds, streets and gardens, and runs all
+sets of a Sobol sequence on all of them, once. Every rule then receives the results that it asks
+for. The trials are the same, so only the rules differ. The script prints the scans that a rule has
+registered and the RTE of its fixed set, as ratios to those of the study without pruning. The limits
+are 0.5 and 1.02.
 """
 
 import argparse
@@ -21,19 +22,13 @@ from offline.campaign import run_batches
 from offline.objective import choose_fixed
 from offline.offline_study import OfflineStudy, load_study
 from offline.train import train
-from offline.workers import Outcome, Result, Task
+from offline.workers import Outcome, Task, TaskResult
 
 RULES = ("halving", "hyperband", "wilcoxon")
 
 
 class Recorded:
-    """A pool whose one worker has done everything before.
-
-    Parameters
-    ----------
-    archive
-        All trials.
-    """
+    """A pool whose one worker reads the trials from an archive that holds all of them."""
 
     def __init__(self, archive: Archive):
         self._archive = archive
@@ -52,7 +47,7 @@ class Recorded:
         task = self._tasks.pop()
         trials = [self._archive.read(task.sequence, n) for n in task.numbers]
         frames = self._archive.read_frames(task.sequence) if task.frames else None
-        return [(0, Result(trials, frames))]
+        return [(0, TaskResult(trials, frames))]
 
 
 def study_file(folder: Path, seed: int, given: argparse.Namespace) -> Path:

@@ -1,9 +1,9 @@
-"""How fast recordings are read, against the least that reading them takes.
+"""How fast recordings are read, against the least time that reading them takes.
 
     python benchmarks/reading.py [--scans 500] [--large 10] [--folder SCRATCH]
 
-Writes bags of simulated VLP-16 clouds to a scratch folder, and prints a table. All on one thread;
-every figure is the best of several runs.
+The script writes bags of random VLP-16 clouds to a scratch folder, and prints a table. All runs on
+one thread; every figure is the best of several runs.
 """
 
 import argparse
@@ -83,7 +83,7 @@ def read(path: Path, cache: bool = False) -> None:
 
 
 def best(function: Callable[[], object], runs: int = 7) -> float:
-    """Seconds of the processor in the fastest run; what else the machine does is not counted."""
+    """CPU seconds of the fastest run: other work on the machine does not count."""
     times = []
     for _ in range(runs):
         start = time.process_time()
@@ -123,7 +123,7 @@ def decoding() -> None:
 
 
 def reading(path: Path, scans: int, compression: str | None) -> None:
-    """A whole bag, in turns with the least, so that both meet the same machine."""
+    """A whole bag, in turns with the least, so that other work slows both alike."""
     write(path, scans, compression)
     ours, theirs = [], []
     for _ in range(9 if compression != "BZ2" else 2):

@@ -1,41 +1,41 @@
-"""What selection gains where it really drives: courses that no rule has seen.
+"""What selection gains in replays: on courses that no rule has seen.
 
     python benchmarks/replays.py runs/gain --seed 8    # after benchmarks/gain.py --seeds 8
 
 Rules are fitted on the 24 sequences of `benchmarks/gain.py`, and eight mixed courses of other
-worlds are replayed with keyframe GICP (or NDT), each with the health check. Printed are the mean of
-min(RTE, 30 %) over 25 m, in brackets how often the odometry was started anew, and ratios to the
-fixed set's error. The rivals: the defaults; the set that is fixed by the geometric mean of the
-training sequences' errors; a bank whose members always have the same weight.
+worlds are replayed with keyframe GICP (or NDT), each with the health check. The script prints the
+mean of min(RTE, 30 %) over 25 m, in brackets how often the health check restarted the odometry, and
+ratios to the fixed set's error. The rivals: the defaults; the set that is fixed by the geometric
+mean of the training sequences' errors; a bank whose members always have the same weight.
 """
 
 import argparse
 import os
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from adaptune.model.fusion import Steady
-from gain import ODOMETRIES, WINDOW, factory_of, labelled, training_courses, trials
+from gain_data import ODOMETRIES, WINDOW, factory_of, labelled, training_courses, trials
 from numpy.typing import NDArray
-from offline.validation import choose_bank, training_data, tune, tune_bank
 
-from adaptune.descriptor.ndt_histogram import ndt_histogram
-from adaptune.descriptor.pca import ScaledPCA
+from adaptune.descriptor.ndt_histogram import N_FEATURES
 from adaptune.metrics import cap, sub_trajectory_rte
-from adaptune.model import RULES, PairedFusion, Rule, Selection, TrainingData
+from adaptune.model import ErrorModel
+from adaptune.model.bank_weights import weighted_selection
 from adaptune.model.paired import ERROR_FLOOR
-from adaptune.odometry import OdometryInstance, WarmUp
 from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
 from adaptune.odometry.health import HealthCheck
-from adaptune.sequence import Scan
+from adaptune.selection import Selection
+from adaptune.selector import Selector
+from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
-from adaptune.space import ParameterSet
-from online.replay import Policy, replay
+from adaptune.simulation.simulate import SimulatedScan, simulate
+from offline.fit import fit
+from offline.labelled import LabelledData
+from offline.tuning import choose_bank, tune, tune_bank
+from online.replay import Replay, Selects, replay
 
 ORDERS = (
     ("cave", "open", "street"),
@@ -50,67 +50,66 @@ ORDERS = (
 LENGTH, SUB_TRAJECTORY = 60.0, 25.0
 
 
-def asking(rule: Rule, pca: ScaledPCA) -> Policy:
-    """A policy that asks a rule."""
-    current: int | None = None
-    last: deque[NDArray[Any]] = deque(maxlen=WINDOW)
-    steadied = Steady()
-
-    def select(scan: Scan, *_: object) -> Selection:
-        nonlocal current
-        last.append(ndt_histogram(scan.points))
-        selection = rule.select(pca.transform(np.mean(last, axis=0)[None])[0], current)
-        current = selection.set_index
-        if isinstance(rule, PairedFusion):
-            return steadied(selection, rule.candidates_.tolist())
-        return selection
-
-    return select
+Way = tuple[Callable[[], OdometryInstance], Selects | None]
+"""What makes the odometry, and what chooses its parameters."""
 
 
-def geometric(data: TrainingData) -> int:
+class Constant:
+    """Always selects the same."""
+
+    def __init__(self, selection: Selection):
+        self._selection = selection
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See `adaptune.selector.Selector.observe`."""
+
+    def select(self) -> Selection:
+        """See `adaptune.selector.Selector.select`."""
+        return self._selection
+
+
+def geometric(data: LabelledData) -> int:
     """The set with the least geometric mean of the sequences' errors."""
-    of = [cap(data.errors[data.sequence == s]).mean(axis=0) for s in np.unique(data.sequence)]
-    return int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))
+    of = [cap(s.errors).mean(axis=0) for s in data.sequences]
+    return data.sets.trials[int(np.argmin(np.log(np.array(of) + ERROR_FLOOR).mean(axis=0)))]
 
 
-Way = tuple[Callable[[], OdometryInstance], Policy | None, list[int] | None]
-"""What makes the odometry, what chooses its parameters, and the members of a bank."""
+def model_of(odometry: str, data: LabelledData) -> ErrorModel:
+    """The error model, with the settings of the paired rule chosen on the same sequences."""
+    sequences = [replace(s, blocks={"ndt": N_FEATURES}) for s in data.sequences]
+    identity = factory_of(odometry).identity
+    model = fit(data._replace(sequences=sequences), data.fixed(), identity, 25.0, WINDOW, {})
+    return replace(model, paired=tune(data))
 
 
-def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str, Way]]:
-    """The sets that were tried, and all ways to drive, by name."""
-    sequences, units = labelled(paths)
-    data, pca = training_data(sequences, units)
-    settings = tune(sequences, units)
-    print(f"settings of the paired rule: {settings}")
-    factory = factory_of(odometry)
-    sets = factory.space.from_unit(units)
+def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
+    """All ways to replay a course, by name."""
+    model = model_of(odometry, data)
+    print(f"settings of the paired rule: {model.paired}")
+    factory, sets = factory_of(odometry), model.sets
 
-    def alone(number: int | None) -> Way:
-        return lambda: factory(None if number is None else sets[number]), None
+    def alone(trial: int | None) -> Way:
+        return lambda: factory(None if trial is None else sets[trial]), None
 
-    def live(name: str) -> Way:
-        rule = RULES[name](settings, 0.0).fit(data)
-        return lambda: factory(sets[data.fixed]), asking(rule, pca)
+    def live(rule: str) -> Way:
+        return lambda: factory(sets[model.fixed]), Selector(model, rule, ())
 
     def bank(size: int, even: bool = False) -> Way:
-        members = choose_bank(sequences, data.fixed, size)
-        found = tune_bank(sequences, units, members, data.fixed)
-        print(f"bank of {size}: sets {members}, {found}", flush=True)
-        vectors = np.concatenate(
-            [s.vectors[:, members] for s in sequences if s.vectors is not None]
+        members = choose_bank(data, model.fixed, size)
+        settings = tune_bank(data, members, model.fixed)
+        print(f"bank of {size}: trials {members}, {settings}", flush=True)
+        of_bank = replace(
+            model, bank=members, vectors=data.vectors(members), bank_settings=settings
         )
-        rule = PairedFusion(found).fit(replace(data, candidates=members, vectors=vectors))
-        weights = tuple(1.0 / size for _ in members)
-        policy = asking(rule, pca)
+        selector: Selects = Selector(of_bank, "paired", members)
         if even:
-            policy = lambda *_: Selection(data.fixed, 0.0, 0.0, weights=weights)  # noqa: E731
-        return lambda: Bank(factory, [sets[i] for i in members], WarmUp()), policy
+            weights = dict.fromkeys(members, 1.0 / size)
+            selector = Constant(weighted_selection(sets, weights))
+        return lambda: Bank(factory, {t: sets[t] for t in members}, WarmUp()), selector
 
-    return sets, {
+    return {
         "baseline": alone(None),
-        "fixed": alone(data.fixed),
+        "fixed": alone(model.fixed),
         "fixed, geometric": alone(geometric(data)),
         "paper": live("paper"),
         "paired": live("paired"),
@@ -121,49 +120,62 @@ def ways(odometry: str, paths: list[Path]) -> tuple[list[ParameterSet], dict[str
     }
 
 
+def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[Replay]:
+    """Replay a course in all ways."""
+    replays = []
+    for make, selector in compared.values():
+        if isinstance(selector, Selector):
+            selector.reset()
+        replays.append(replay(scans, make(), HealthCheck(), selector))
+    return replays
+
+
+def print_table(names: list[str], means: NDArray[np.float64]) -> None:
+    """Print means over the courses, and ratios to the fixed set's error."""
+    fixed = means[:, [names.index("fixed")]]
+    ratio = means / fixed
+    for what, values in (
+        ("arithmetic mean", means.mean(axis=0)),
+        ("geometric mean", np.exp(np.log(means).mean(axis=0))),
+        ("ratio of arithmetic means", means.mean(axis=0) / fixed.mean()),
+        ("geometric mean ratio", np.exp(np.log(ratio).mean(axis=0))),
+        ("worst ratio", ratio.max(axis=0)),
+    ):
+        print(f"{what:32}" + "".join(f"{value:12.3f}      " for value in values))
+
+
 def main() -> None:
-    """Drive all courses in all ways."""
+    """Replay all courses in all ways."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=8)
     parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
-    parser.add_argument("--modes", nargs="+", help="to drive, besides fixed; all if left out")
+    parser.add_argument("--modes", nargs="+", help="besides fixed; all if left out")
     parser.add_argument("--length", type=float, default=120.0, help="of the training courses")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
-    courses = training_courses(arguments.seed, arguments.length)
-    odometry, modes = arguments.odometry, arguments.modes
-    sets, driven = ways(odometry, trials(arguments.folder, odometry, courses, arguments.seed))
-    if modes:
-        driven = {name: way for name, way in driven.items() if name == "fixed" or name in modes}
-    print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in driven))
+    odometry, seed = arguments.odometry, arguments.seed
+    paths = trials(arguments.folder, odometry, training_courses(seed, arguments.length), seed)
+    compared = ways(odometry, labelled(paths, factory_of(odometry).space))
+    if arguments.modes:
+        compared = {n: way for n, way in compared.items() if n == "fixed" or n in arguments.modes}
+    print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in compared))
     means: list[list[float]] = []
     for i, scenes in enumerate(ORDERS):
-        course = Course(scenes=scenes, length=LENGTH, seed=1000 * arguments.seed + 500 + i)
+        course = Course(scenes=scenes, length=LENGTH, seed=1000 * seed + 500 + i)
         scans = list(simulate(course))
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
         row = f"{' '.join(scenes):32}"
-        for make, policy, members in driven.values():
-            result = replay(scans, make(), HealthCheck(), policy, sets, members=members)
-            errors = sub_trajectory_rte(
-                T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY
-            )
+        for result in replays_of(scans, compared):
+            T_odom_sensor = result.trajectory.T_world_sensor
+            errors = sub_trajectory_rte(T_world_sensor, T_odom_sensor, SUB_TRAJECTORY)
             means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
             row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
         print(row, flush=True)
-    table, fixed = np.array(means), list(driven).index("fixed")
-    ratio = table / table[:, [fixed]]
-    for what, values in (
-        ("arithmetic mean", table.mean(axis=0)),
-        ("geometric mean", np.exp(np.log(table).mean(axis=0))),
-        ("ratio of arithmetic means", table.mean(axis=0) / table[:, fixed].mean()),
-        ("geometric mean ratio", np.exp(np.log(ratio).mean(axis=0))),
-        ("worst ratio", ratio.max(axis=0)),
-    ):
-        print(f"{what:32}" + "".join(f"{value:12.3f}      " for value in values))
+    print_table(list(compared), np.array(means))
 
 
 if __name__ == "__main__":

@@ -6,11 +6,10 @@
 
 *functions*: annealing and TPE against random search at equal budget, 96 trials and 20 seeds, on
 Branin (2 parameters), Ackley (4) and Hartmann (6); the baseline is a random point. *table*: the
-same on trials of GICP, recorded beforehand on a dense grid over a simulated course; a set is worth
-what its nearest neighbour on the grid is worth. Both print the median of the best value, the
-number of seeds that are better than random, and the one-sided p of Wilcoxon's signed-rank test
-over the seeds. The samplers' defaults were chosen on other functions (Rosenbrock, Levy,
-Styblinski-Tang, Griewank).
+same on trials of GICP, recorded beforehand on a dense grid over a simulated course; a set counts as
+its nearest neighbour on the grid. Both print the median of the best value, the number of seeds that
+are better than random, and the one-sided p of Wilcoxon's signed-rank test over the seeds. The
+samplers' defaults were chosen on other functions (Rosenbrock, Levy, Styblinski-Tang, Griewank).
 
 *thesis*: the experiment of Tavares (2026) in small. Grid, random, annealing and TPE tune GICP and
 evalio's KISS-ICP on a simulated garden by RTE, 17 trials (the defaults and a grid of 4 x 4) and

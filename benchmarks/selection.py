@@ -7,10 +7,11 @@ of the descriptor and 2 parameters; 256 sets a sequence (3.6 million pairs), and
 for all (21.7 million). One thread on one core. Limits: `paper` 1 ms in the median and 5 ms for
 99 %, `paired` 5 ms in the median; 300 times faster than 256 iterations of TPE on scikit-learn's
 KNeighborsRegressor over the same 3.6 million rows, and 50 times faster than one call of it on the
-same candidates; file 100 MB, load 1 s, fit 10 s. Where other programs share the core, the time
-spent on it (CPU) tells more than the time by the clock.
+same candidates; file 100 MB, load 1 s, fit 10 s. Where other programs share the core, CPU time
+says more than the time by the clock.
 
-With a PICTURE, the cost of a selection is drawn against 1,000 to 1,000,000 frames of 64 sets.
+With a PICTURE, the script draws the cost of a selection against 1,000 to 1,000,000 frames of 64
+sets.
 """
 
 import sys
@@ -23,21 +24,23 @@ from typing import Any
 import numpy as np
 import optuna
 from numpy.typing import NDArray
-from offline.validation import BANK_FRAMES, BANK_SIZE
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
 from adaptune import cores
 from adaptune.model import (
+    BankRule,
+    BankSettings,
     ErrorModel,
     NearestNeighbours,
     PairedExpectedRatio,
-    PairedFusion,
     Rule,
-    Settings,
     TrainingData,
 )
+from adaptune.parameter_sets import ParameterSets
 from adaptune.space import Float, ParameterSpace
+from offline.leave_one_out import BANK_SIZE
+from offline.tuning import BANK_FRAMES
 
 LENGTHS = (4541, 1101, 4661, 801, 271, 2761)
 """Scans of KITTI's sequences 00 to 05."""
@@ -49,6 +52,11 @@ SPACE = ParameterSpace(
 )
 PER_SEQUENCE = 256
 N_COMPONENTS = 10
+
+
+def numbered(unit: NDArray[np.float64]) -> ParameterSets:
+    """Parameter sets from points of the unit cube; their rows are the trial numbers."""
+    return ParameterSets(SPACE, tuple(range(len(unit))), tuple(SPACE.from_unit(unit)))
 
 
 def kitti_size(seed: int, own_sets: bool) -> ErrorModel:
@@ -70,8 +78,7 @@ def kitti_size(seed: int, own_sets: bool) -> ErrorModel:
     n_bank = 0 if own_sets else BANK_SIZE
     return ErrorModel(
         odometry={"name": "gicp", "settings": {}},
-        space=SPACE,
-        sets=SPACE.from_unit(unit),
+        sets=numbered(unit),
         fixed=0,
         length=100.0,
         sequences=[f"{s:02d}" for s in range(len(LENGTHS))],
@@ -138,22 +145,23 @@ def measure_selection(
 
 
 def against_rows(model: ErrorModel) -> None:
-    """The published way: a regressor over all rows, searched by TPE or at all candidates."""
+    """Compare with the published way: a regressor over all rows, for TPE or all candidates."""
     rule, ours, asked = measure_selection(
         model, "paper", NearestNeighbours(), "limits: median 1, 99 % 5"
     )
     assert isinstance(rule, NearestNeighbours)
     data = rule.data_
-    scale = float(data.sets.std(axis=0).mean())
+    unit = data.sets.unit
+    scale = float(unit.std(axis=0).mean())
     frame, which = np.nonzero(~np.isnan(data.errors))
-    rows = np.hstack([data.features[frame], data.sets[which] / scale])
+    rows = np.hstack([data.features[frame], unit[which] / scale])
     rival = KNeighborsRegressor(5)
     fitting = seconds(lambda: rival.fit(rows, np.minimum(data.errors[frame, which], 30.0)))
     print(f"scikit-learn: {len(rows)} rows, fit {fitting:.2f} s")
     features = model.pca().transform(asked)
     candidates = []
     for feature in features[:5]:
-        at = np.hstack([np.tile(feature, (len(data.sets), 1)), data.sets / scale])
+        at = np.hstack([np.tile(feature, (len(unit), 1)), unit / scale])
         begin = time.perf_counter()
         predicted = rival.predict(at)
         candidates.append(time.perf_counter() - begin)
@@ -202,7 +210,7 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
             np.cumsum(rng.normal(0.0, 0.05, (n, N_COMPONENTS)), axis=0),
             np.arange(n) * n_sequences // n,
             rng.gamma(1.0, 1.0, (n, n_sets)).astype(np.float32),
-            rng.random((n_sets, len(SPACE))),
+            numbered(rng.random((n_sets, len(SPACE)))),
             0,
         )
         asked = data.features[rng.integers(0, n, 100)] + 0.1
@@ -233,7 +241,7 @@ def main(picture: Path | None) -> None:
         model = measure_file(kitti_size(0, own_sets=False), Path(folder))
         measure_selection(model, "paper", NearestNeighbours(), "limits: median 1, 99 % 5")
         measure_selection(model, "paired", PairedExpectedRatio(), "limit: median 5")
-        bank = PairedFusion(Settings(n_frames=BANK_FRAMES))
+        bank = BankRule(BankSettings(n_frames=BANK_FRAMES))
         measure_selection(model, "bank", bank, "limit: median 5", model.bank)
     if picture is not None:
         print("\nCPU time of a selection against training frames")

@@ -3,7 +3,8 @@
     python benchmarks/simulation.py
     python benchmarks/simulation.py --memory       # a course of 2 km as well
 
-Scans a second of whole courses, with their tiles built on the way and a pose for every column.
+The script prints scans per second over whole courses. The simulator builds the tiles on the way,
+and computes a pose for every column.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from adaptune.simulation.simulate import simulate
 
 
 def speed(course: Course) -> tuple[int, float]:
-    """Count the scans of a course, and how many were made in a second, the first left out."""
+    """Count the scans of a course but the first, and compute how many were made in a second."""
     scans = simulate(course)
     # The first scan pays for imports and compiling.
     next(scans)

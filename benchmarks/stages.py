@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import small_gicp
@@ -20,16 +21,19 @@ from adaptune import cores
 from adaptune.descriptor.ndt_histogram import ndt_histogram
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.model import ErrorModel, Selection
+from adaptune.model import ErrorModel
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import crop
-from adaptune.sequence import Scan, SequenceConfig
+from adaptune.selection import Selection
+from adaptune.selector import Selector
+from adaptune.sequence import SequenceConfig
 from adaptune.sequence.opening import open_sequence
+from adaptune.space import ParameterSet
 from adaptune.trajectory import read_kitti
 from offline.offline_study import OfflineStudy, load_study
 from offline.train import train
 from offline.trial import TrialSettings, TrialSetup
-from online.replay import adaptive, replay
+from online.replay import Replay, replay
 
 REPETITIONS = 5
 UNCACHED = [f"sequences.{name}.cache=false" for name in ("hall_begin", "hall_end", "street")]
@@ -84,8 +88,8 @@ def trial(study: OfflineStudy) -> None:
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
     sequence = setup.prepare("hall_begin", 8e9)
     prepared = [(scan.cloud, scan.tree) for scan in sequence]
-    parameters = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
-    iterations = study.odometry.settings.iterations  # type: ignore[attr-defined]
+    parameters: ParameterSet = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+    iterations = study.odometry.settings.iterations
     compare(
         f"trial, {len(prepared)} scans",
         lambda: setup.run(sequence, [parameters], whole=True),
@@ -93,45 +97,51 @@ def trial(study: OfflineStudy) -> None:
     )
 
 
+class KeepsFixed(Selector):
+    """Does all the work of a selection, then keeps the fixed set, as the bare loop does."""
+
+    def __init__(self, model: ErrorModel, rule: str):
+        super().__init__(model, rule, ())
+        self._parameters = model.sets[model.fixed]
+
+    def select(self) -> Selection:
+        """See `Selector.select`."""
+        return super().select()._replace(trial=self.fixed, parameters=self._parameters)
+
+
 def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
     """Replay from the bag, selecting once a second, against read, prepare and align."""
-    fixed = model.sets[model.fixed]
+    fixed: Any = model.sets[model.fixed]
     street = study.sequences.open("street")
-    box = study.odometry()
     settings = study.odometry.settings
 
-    select = adaptive(model, "paired")
-
-    def fixed_after_all(scan: Scan, *_: object) -> Selection:
-        # All the work of a selection, but the same parameters as the bare loop's.
-        return select(scan)._replace(set_index=model.fixed)
-
-    def ours() -> object:
-        return replay(street, study.odometry(fixed), HealthCheck(), fixed_after_all, model.sets)
+    def replayed(selector: Selector) -> Replay:
+        selector.reset()
+        return replay(street, study.odometry(fixed), HealthCheck(), selector)
 
     def bare() -> object:
         prepared = [
             small_gicp.preprocess_points(
-                crop(scan, settings.min_range),  # type: ignore[attr-defined]
-                downsampling_resolution=settings.downsampling,  # type: ignore[attr-defined]
+                crop(scan, settings.min_range), downsampling_resolution=settings.downsampling
             )
             for scan in street
         ]
         return bare_gicp(
             prepared,
-            fixed["max_correspondence_distance"],  # type: ignore[arg-type]
-            fixed["keyframe_interval"],  # type: ignore[arg-type]
-            box.settings.iterations,
+            fixed["max_correspondence_distance"],
+            fixed["keyframe_interval"],
+            settings.iterations,
         )
 
-    result = replay(street, study.odometry(fixed), HealthCheck(), select, model.sets)
+    result = replayed(Selector(model, "paired", ()))
+    keeps_fixed = KeepsFixed(model, "paired")
     stamps = result.trajectory.stamps
     duration = (stamps[-1] - stamps[0]) * 1e-9
     print(
         f"replay: {duration / result.seconds:.2f} times real time; selections take "
         f"{1e3 * np.median([c.seconds for c in result.choices]):.2f} ms"
     )
-    compare("adaptive replay of street.bag", ours, bare)
+    compare("adaptive replay of street.bag", lambda: replayed(keeps_fixed), bare)
 
 
 def main(folder: Path) -> None:

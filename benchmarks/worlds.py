@@ -1,11 +1,14 @@
-"""Whether parameters matter in the simulated worlds, and whether odometries survive in them.
+"""Whether parameters matter in the simulated worlds, and whether odometries keep track in them.
 
     python benchmarks/worlds.py            # everything: an hour on one core
     python benchmarks/worlds.py --seeds 0 --scenes cave street
 
-Drives every scene by itself, runs keyframe GICP and NDT with a 7 x 7 grid of parameter sets over
-the ranges of Koide et al. (2021), and KISS-ICP with its defaults. The cost of a set is the mean
-over all sub-trajectories of 25 m of min(RTE, 30 %). Nothing is started anew: a lost track is lost.
+The script simulates every scene by itself. It runs keyframe GICP and NDT with a 7 x 7 grid of
+parameter sets over the ranges of Koide et al. (2021), and KISS-ICP with its defaults. The cost of a
+set is the mean over all sub-trajectories of 25 m of min(RTE, 30 %). Nothing restarts an odometry
+that has lost track.
+
+The worlds are good if
 
 (a) some set of GICP and of NDT costs less than 1 % in every scene, and KISS-ICP less than 5 % in
     every kind of scene but one at most;
@@ -51,7 +54,7 @@ def parameter_sets(name: str) -> list[dict[str, float]]:
 
 
 def cost(odometry: Odometry, prepared: Sequence[Any], T_world_sensor: NDArray[np.float64]) -> float:
-    """Drive the course with one odometry: mean of min(RTE, cap) in percent."""
+    """Run one odometry on the course: mean of min(RTE, cap) in percent."""
     odometry.start(prepared[0], T_world_sensor[0])
     poses = [T_world_sensor[0], *(odometry.register(p).T_odom_sensor for p in prepared[1:])]
     errors = sub_trajectory_rte(T_world_sensor, np.array(poses), WINDOW)

@@ -52,32 +52,16 @@ def _joined(frames: Frames, trial: Trial) -> Poses:
 
 @dataclass(frozen=True, eq=False)
 class BankSimulation:
-    """What it takes to simulate a bank along a sequence, without any odometry.
+    """What it takes to simulate a bank along a sequence, without any odometry."""
 
-    Attributes
-    ----------
-    stamps : ndarray of shape (n_frames,)
-        Nanoseconds.
-    T_ref_sensor : ndarray of shape (n_frames, 4, 4)
-    descriptors : ndarray of shape (n_frames, n_features)
-        Averaged.
-    period : ndarray of shape (n_frames,)
-        Whole periods since the first scan.
-    length : float
-        Metres of a sub-trajectory.
-    lost_track : float
-        Metres a second.
-    motions : callable
-        The motions of some sets, by trial numbers, over every scan but the first, of shape
-        (n_frames - 1, n_sets, 4, 4), see `recorded_motions`.
-    """
-
-    stamps: NDArray[np.int64]
-    T_ref_sensor: Poses
-    descriptors: NDArray[np.float32]
-    period: NDArray[np.int64]
-    length: float
-    lost_track: float
+    stamps: NDArray[np.int64]  # (n_frames,): nanoseconds
+    T_ref_sensor: Poses  # (n_frames, 4, 4)
+    descriptors: NDArray[np.float32]  # (n_frames, n_features): averaged
+    period: NDArray[np.int64]  # (n_frames,): whole periods since the first scan
+    length: float  # metres of a sub-trajectory
+    lost_track: float  # metres a second
+    # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
+    # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[Sequence[int]], Poses]
 
     def errors(self, members: Sequence[int], weights: NDArray[np.float64]) -> NDArray[np.float64]:

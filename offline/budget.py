@@ -69,11 +69,6 @@ class Clock:
 
     The last batch of a killed process does not count.
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     AdaptuneError

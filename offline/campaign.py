@@ -27,29 +27,24 @@ _log = logging.getLogger(__name__)
 def run_batches(
     study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
 ) -> dict[int, Verdict]:
-    """Run all trials that are not in the archive yet, and judge all of them.
+    """Run all trials that are not in the archive yet, and judge all of them by trial number.
 
     Parameters
     ----------
     study
-        The study, whose folder is there.
+        The study; its folder exists.
     archive
         Its trials.
     workers
-        Who runs them.
+        They run the trials.
     progress
-        Told about every finished trial.
-
-    Returns
-    -------
-    dict
-        Verdicts by the trials' numbers, which rise.
+        Called about every finished trial.
     """
     return _Campaign(study, archive, workers, progress).run()
 
 
 class _Campaign:
-    """Searches on their way."""
+    """Runs the searches of a study, one stage after the other."""
 
     def __init__(
         self, study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
@@ -62,10 +57,12 @@ class _Campaign:
         known = {n: trial.parameters for trials in of_sequences for n, trial in trials.items()}
         self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names
-        self._unframed = [name for name in self._names if not archive.has_frames(name, described)]
+        self._without_frames = [
+            name for name in self._names if not archive.has_frames(name, described)
+        ]
         self._stages = make_stages(self._config, study.odometry.space, self._names, self._finished)
         self._tally = _Tally(progress, self._finished, self._stages)
-        # By the trials' numbers, the sequences that they are of.
+        # For each trial number, the sequences that count.
         self._counted: dict[int, Sequence[str]] = {}
 
     def run(self) -> dict[int, Verdict]:
@@ -74,7 +71,7 @@ class _Campaign:
         for stage in self._stages:
             hours += self._run_stage(stage, hours)
             best |= best_of_each(self._config, stage) if stage.alone else {}
-        self._tell()
+        self._mirror_trials()
         self._tally.catch_up()
         self._run_everywhere(best)
         return {n: self._verdict(n) for n in sorted(self._counted)}
@@ -100,7 +97,7 @@ class _Campaign:
             self._counted[0] = self._names
             self._tally.best = _best(self._config, stage)
             if begun:
-                self._tell()
+                self._mirror_trials()
                 self._tally.catch_up()
                 _log.info("trials %d to %d done; %s", numbers[0], numbers[-1], self._tally.best)
             batch += 1
@@ -118,37 +115,30 @@ class _Campaign:
         self._counted |= dict.fromkeys(best, self._names)
 
     def _tasks(self, missing: Sequence["Missing"]) -> list[Task]:
-        unframed, self._unframed = self._unframed, []
-        return _tasks(missing, unframed, len(self._workers.workers()))
+        without_frames, self._without_frames = self._without_frames, []
+        return _tasks(missing, without_frames, len(self._workers.workers()))
 
     def _verdict(self, n: int) -> Verdict:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
 
-    def _tell(self) -> None:
+    def _mirror_trials(self) -> None:
         self._mirror.report(
             self._counted, lambda n: _mirrored(self._config, self._verdict(n), self._finished, n)
         )
 
 
 class Missing(NamedTuple):
-    """What is still to be run.
+    """What is still to be run."""
 
-    Attributes
-    ----------
-    numbers : dict
-        On every sequence, of the trials.
-    parameters : callable
-        Tells a trial's set.
-    """
-
-    numbers: Mapping[str, Sequence[int]]
-    parameters: Callable[[int], ParameterSet]
+    numbers: Mapping[str, Sequence[int]]  # on every sequence, of the trials
+    parameters: Callable[[int], ParameterSet]  # the set of a trial
 
 
-def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) -> list[Task]:
-    """Share every sequence's trials between the workers; reading it again is a task of its own.
+def _tasks(missing: Sequence[Missing], without_frames: Sequence[str], n_workers: int) -> list[Task]:
+    """Split the trials of every sequence between the workers.
 
-    Those of the last one are shared in ever smaller pieces, so that all workers end together.
+    Those of the last sequence are split into ever smaller pieces, so that all workers end together.
+    A sequence whose frames are missing, but no trial, is a task of its own.
     """
     lacking = [
         (name, numbers, some.parameters)
@@ -156,16 +146,16 @@ def _tasks(missing: Sequence[Missing], unframed: Sequence[str], n_workers: int) 
         for name, numbers in some.numbers.items()
         if numbers
     ]
-    to_read = [name for name in unframed if name not in {n for n, *_ in lacking}]
+    to_read = [name for name in without_frames if name not in {n for n, *_ in lacking}]
     tasks = [Task(name, (), (), frames=True) for name in to_read]
     for last, (name, numbers, parameters) in enumerate(lacking, 1 - len(lacking)):
-        # What all trials on a sequence share is told by the first of its tasks.
-        tells = numbers[0] if name in unframed else None
+        # The first task of a sequence returns what all trials on it share.
+        first = numbers[0] if name in without_frames else None
         left = numbers
         while left:
             size = math.ceil(len(left) / n_workers / (1 if last else 2))
             tasks += [
-                Task(name, tuple(n), tuple(map(parameters, n)), frames=n[0] == tells)
+                Task(name, tuple(n), tuple(map(parameters, n)), frames=n[0] == first)
                 for share in range(n_workers)
                 if (n := left[share * size : (share + 1) * size])
             ]
@@ -187,7 +177,7 @@ def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: in
 
 
 class _Tally:
-    """What the progress tells of trials."""
+    """The progress of trials."""
 
     def __init__(self, progress: Progress, finished: Finished, stages: Sequence[Stage]):
         self.best = ""
@@ -196,7 +186,7 @@ class _Tally:
         self._done = self._failed = 0
 
     def begin(self, at_work: Iterable[Search]) -> None:
-        """Begin a batch, some of whose trials may be finished."""
+        """Begin a batch; some of its trials may be finished already."""
         for search in at_work:
             for name in search.sequences:
                 self._add(name, [n for n in search.numbers if n in self._finished[name]])
@@ -209,7 +199,7 @@ class _Tally:
             self._show(running)
 
     def catch_up(self) -> None:
-        """Count as done what will not be run, too."""
+        """Count trials that will not run as done, too."""
         self._done = sum(len(s.verdicts) * len(s.sequences) for s in self._searches)
         self._show()
 
@@ -227,7 +217,7 @@ class _Tally:
 
 
 def _best(config: OfflineConfig, stage: Stage) -> str:
-    """The best so far; the mean of them where each is of one sequence."""
+    """The best value so far, or its mean where each search has a sequence of its own."""
     best = [search.verdicts[search.best] for search in stage.searches]
     value = float(np.mean([verdict.values[0] for verdict in best]))
     what = f"best {label(config.objective[0])} {value:.3f}"
@@ -241,7 +231,7 @@ def _best(config: OfflineConfig, stage: Stage) -> str:
 def run_tasks(
     archive: Archive, workers: Pool[Any], tasks: list[Task]
 ) -> Iterator[tuple[Task, int]]:
-    """Run tasks; yield each when its results are in the archive, and how many trials run now."""
+    """Run tasks; yield each one once it is in the archive, with the number of running trials."""
     for task, result, running in run(workers, tasks):
         if result.frames is not None:
             archive.write_frames(task.sequence, result.frames)

@@ -59,18 +59,8 @@ class _Place(NamedTuple):
 class Cluster:
     """The workers of a Dask cluster, as a `Pool`.
 
-    Use it as a context: leaving it cancels the tasks that are not done.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    names
-        The training sequences.
-    memory
-        Bytes that prepared scans may take, in all workers together.
-    address
-        Address of the scheduler, as ``tcp://scheduler:8786``.
+    Its workers share `memory` bytes for prepared scans. Use it as a context: leaving it cancels the
+    tasks that are not done.
 
     Raises
     ------
@@ -310,15 +300,9 @@ def fingerprint(config: SequenceConfig) -> str:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AwaySequences(StudySequences):
-    """The sequences of a study on a worker, which may not have the recordings.
+    """The sequences of a study on a worker, which may not have the recordings."""
 
-    Attributes
-    ----------
-    digests : dict
-        `fingerprint` of every sequence at the driver.
-    """
-
-    digests: Mapping[str, str]
+    digests: Mapping[str, str]  # `fingerprint` of every sequence at the driver
 
     def open(self, name: str) -> Any:
         """See `StudySequences.open`.

@@ -49,54 +49,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 class OfflineConfig(StudySection):
-    """How to search for parameter sets.
-
-    Attributes
-    ----------
-    sampler : str
-        One of `offline.samplers.settings.NAMES`, or an Optuna sampler as ``package.module:Class``.
-    sampler_settings : dict
-        Settings of the sampler.
-    sets : str
-        `shared`: one search, which runs each set on every training sequence. `own`: a search for
-        every sequence, which runs its sets on that sequence alone. `both`: first one, then the
-        others.
-    trials : int, optional
-        Number of trials of a search; the first one is the baseline.
-    hours, stagnation, target : optional
-        Other budgets: hours that batches may take; trials in a row without a new best; a value of
-        the first objective that is good enough. The search stops after the batch in which the
-        first budget is used up.
-    initial : int
-        Samplers that learn begin with so many points of a Sobol sequence.
-    batch : int
-        Trials of a batch. The sampler proposes them from the results of the batches before.
-    workers : int, optional
-        Number of processes; by default one for each core.
-    memory : float
-        Gigabytes that prepared scans may take, in all workers together.
-    max_frames : int, optional
-        Frames that the error model keeps, over all sequences; by default all.
-    storage : str, optional
-        URL of a database that mirrors the trials; by default a journal file in the study's folder.
-    objective : tuple of dict
-        What to minimise: a metric, or a weighted sum of metrics. Several objectives give a Pareto
-        front, and the first one chooses the fixed set.
-    limits : dict
-        Limits of metrics.
-    runs : str
-        `restart`: an odometry that loses track restarts at the reference. `whole`: every run goes
-        from end to end. `episodes`: runs are made of overlapping pieces, for odometries that cannot
-        restart where they lose track.
-    repeats : int
-        Runs of every trial, for odometries that differ from run to run.
-    augment : list of ViewConfig
-        Each view adds a changed copy of every training sequence.
-    pruning : str
-        How to stop trials that promise little, see `offline.pruning`.
-    preset : str, optional
-        `paper`: as Koide et al. (IROS 2021), see `PRESETS`.
-    """
+    """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = Field(default_factory=dict)
@@ -154,13 +107,7 @@ class OfflineConfig(StudySection):
         return any((self.trials, self.hours, self.stagnation, self.target))
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
-        """Find mistakes in the sampler and its settings.
-
-        Parameters
-        ----------
-        space
-            The tuned parameters; None where they have mistakes.
-        """
+        """Find mistakes in the sampler and its settings."""
         key = ("sampler_settings",)
         if len(self.objective) > 1 and self.sampler in SINGLE:
             others = ", ".join(sorted(set(NAMES) - set(SINGLE)))

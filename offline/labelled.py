@@ -24,49 +24,31 @@ from offline.search import owner
 
 @dataclass(frozen=True, eq=False)
 class LabelledSequence:
-    """The frames of a sequence that have a sub-trajectory, and the errors of sets there.
-
-    Attributes
-    ----------
-    name : str
-    period : ndarray of shape (n,)
-        Whole periods since the first scan: in each, one selection holds.
-    descriptors : ndarray of shape (n, n_features)
-    errors : ndarray of shape (n, n_sets)
-        Percent, infinite where the track was lost, NaN where a set was not run.
-    blocks : dict, optional
-        By name, in order, the lengths of the descriptors; one descriptor when left out.
-    baseline : ndarray of shape (n,), optional
-        Errors of the baseline, which may exceed limits; those of the first set when left out.
-    values : ndarray of shape (n_sets,), optional
-        The objective that chooses the fixed set; the mean capped error when left out.
-    repeats : ndarray of shape (n_sets, n_repeats), optional
-        Where trials are repeated, the objective of every run.
-    own : ndarray of shape (n_sets,), optional
-        Sets that were searched for on this very place, or a view of it, and on no other: they are
-        unknown to whoever has not been there.
-    block : int
-        Frames of a sub-trajectory.
-    elevation : float
-        Degrees, see `adaptune.descriptor.base.lowest_elevation`.
-    vectors : ndarray of shape (n, n_sets, 3), optional
-        The errors as vectors, NaN where nobody asks; see `adaptune.model.TrainingData`.
-    simulation : BankSimulation, optional
-        With all frames; without it and `vectors` there is no bank.
-    """
+    """The frames of a sequence that have a sub-trajectory, and the errors of sets there."""
 
     name: str
+    # (n,): whole periods since the first scan: in each, one selection holds.
     period: NDArray[np.int64]
-    descriptors: NDArray[np.float32]
+    descriptors: NDArray[np.float32]  # (n, n_features)
+    # (n, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
+    # By name, in order, the lengths of the descriptors; one descriptor when left out.
     blocks: Mapping[str, int] | None = None
+    # (n,): errors of the baseline, which may exceed limits; those of the first set when left out.
     baseline: NDArray[np.float64] | None = None
+    # (n_sets,): the objective that chooses the fixed set; the mean capped error when left out.
     values: NDArray[np.float64] | None = None
+    # (n_sets, n_repeats): where trials are repeated, the objective of every run.
     repeats: NDArray[np.float64] | None = None
+    # (n_sets,): sets that were searched for on this very place, or a view of it, and on no other:
+    # they are unknown to whoever has not been there.
     own: NDArray[np.bool_] | None = None
-    block: int = 1
-    elevation: float = np.nan
+    block: int = 1  # frames of a sub-trajectory
+    elevation: float = np.nan  # degrees, see `adaptune.descriptor.base.lowest_elevation`
+    # (n, n_sets, 3): the errors as vectors, NaN where nobody asks; see
+    # `adaptune.model.TrainingData`.
     vectors: NDArray[np.float32] | None = None
+    # With all frames; without it and `vectors` there is no bank.
     simulation: BankSimulation | None = None
 
     def subset(self, columns: NDArray[np.intp]) -> "LabelledSequence":
@@ -82,17 +64,10 @@ class LabelledSequence:
 
 
 class LabelledData(NamedTuple):
-    """Labelled sequences, all with errors of the same sets.
-
-    Attributes
-    ----------
-    sequences : sequence of LabelledSequence
-    sets : ParameterSets
-        The columns of their errors.
-    """
+    """Labelled sequences, all with errors of the same sets."""
 
     sequences: Sequence[LabelledSequence]
-    sets: ParameterSets
+    sets: ParameterSets  # the columns of their errors
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
         """The same with some of the sets."""

@@ -52,30 +52,19 @@ class ValidationError(AdaptuneError):
 
 
 class LeftOut(NamedTuple):
-    """What happened on one sequence that was left out.
-
-    Attributes
-    ----------
-    name : str
-    errors : dict
-        For every mode the capped error in percent at each frame, of shape (n,).
-    adapted : dict
-        For every rule the share of periods in which it did not choose the fixed set; of a bank,
-        the share of the weight that the other members had.
-    familiarity : ndarray of shape (n,)
-        See `Selection`; NaN where no rule computes it.
-    portfolio : ndarray of shape (MOST_SETS,)
-        Mean error in percent if the best of 1, 2, ... complementary sets were always known.
-    block : int
-        Frames of a sub-trajectory.
-    """
+    """What happened on one sequence that was left out."""
 
     name: str
+    # For every mode the capped error in percent at each frame, of shape (n,).
     errors: dict[str, NDArray[np.float64]]
+    # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
+    # share of the weight that the other members had.
     adapted: dict[str, float]
-    familiarity: NDArray[np.float64]
+    familiarity: NDArray[np.float64]  # (n,): see `Selection`; NaN where no rule computes it
+    # (MOST_SETS,): mean error in percent if the best of 1, 2, ... complementary sets were always
+    # known.
     portfolio: NDArray[np.float64]
-    block: int = 1
+    block: int = 1  # frames of a sub-trajectory
 
     def interval(self, mode: str) -> Interval:
         """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
@@ -88,16 +77,10 @@ class LeftOut(NamedTuple):
 
 @dataclass
 class Validation:
-    """All sequences left out, and the conclusion.
-
-    Attributes
-    ----------
-    left_out : list of LeftOut
-    ratios : dict
-        For every mode its mean error over the fixed set's, a number for each sequence.
-    """
+    """All sequences left out, and the conclusion."""
 
     left_out: list[LeftOut]
+    # For every mode its mean error over the fixed set's, a number for each sequence.
     ratios: dict[str, NDArray[np.float64]] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -115,7 +98,7 @@ class Validation:
     @property
     def default(self) -> str:
         """The first of them."""
-        return self.modes[0] if self.modes else next(iter(RULES))
+        return (*self.modes, RULES[0])[0]
 
     def summary(self, mode: str) -> dict[str, float]:
         """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
@@ -153,14 +136,11 @@ class Validation:
         s = self.summary(rule)
         worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
+        weight = f"{share:.0f} % of the weight on other members than the fixed set"
         ratio = (
             f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
             f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
-            + (
-                f"others than the fixed set having {share:.0f} % of the weight"
-                if rule == BANK
-                else f"adapting {share:.0f} % of the time"
-            )
+            + (f"with {weight}" if rule == BANK else f"adapting {share:.0f} % of the time")
         )
         if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
             return f"`{rule}` kept the fixed set: what it was fitted on did not show that it pays."

@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from adaptune.archive import Frames, Summary
 from adaptune.errors import AdaptuneError
@@ -40,30 +39,18 @@ Value = float | tuple[float, ...]
 
 
 class Verdict(NamedTuple):
-    """How a parameter set did on the sequences on which it was run.
-
-    Attributes
-    ----------
-    parameters : dict
-    values : tuple of float
-        Mean of every objective over the sequences.
-    constraints : tuple of float
-        Excess over every limit, as a share of the limit; negative if the limit is kept.
-    margin : float
-        Distance from the first value to the upper end of its one-sided 95 % confidence interval;
-        0 unless trials are repeated.
-    complete : bool
-        Whether the set was run on all sequences; if not, its values are estimates.
-    sequences : tuple of str
-        The sequences on which it was run.
-    """
+    """How a parameter set did on the sequences on which it was run."""
 
     parameters: ParameterSet
-    values: tuple[float, ...]
+    values: tuple[float, ...]  # mean of every objective over the sequences
+    # Excess over every limit, as a share of the limit; negative if the limit is kept.
     constraints: tuple[float, ...] = ()
+    # Distance from the first value to the upper end of its one-sided 95 % confidence interval; 0
+    # unless trials are repeated.
     margin: float = 0.0
+    # Whether the set was run on all sequences; if not, its values are estimates.
     complete: bool = True
-    sequences: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = ()  # the sequences on which it was run
 
     @property
     def excess(self) -> float:
@@ -77,20 +64,11 @@ class Verdict(NamedTuple):
 
 
 class SamplerResult(NamedTuple):
-    """The result of a trial as samplers receive it.
-
-    Attributes
-    ----------
-    parameters : dict
-    value : float or tuple of float
-        Samplers minimise it.
-    constraints : tuple of float
-        See `Verdict`.
-    """
+    """The result of a trial as samplers receive it."""
 
     parameters: ParameterSet
-    value: Value
-    constraints: tuple[float, ...] = ()
+    value: Value  # samplers minimise it
+    constraints: tuple[float, ...] = ()  # see `Verdict`
 
 
 def exceeded(constraints: Sequence[float]) -> float:
@@ -101,17 +79,7 @@ def exceeded(constraints: Sequence[float]) -> float:
 def trajectory_metrics(
     frames: Frames, T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]
 ) -> dict[str, float]:
-    """The metrics of a whole trajectory; KITTI's error if it is long enough.
-
-    Parameters
-    ----------
-    frames
-        The sequence's frames.
-    T_odom_sensor
-        The odometry's poses, of shape (n, 4, 4).
-    lost_steps
-        See `joined`.
-    """
+    """The metrics of a whole trajectory; KITTI's error if it is long enough."""
     T_ref_sensor, T = frames.T_ref_sensor, joined(T_odom_sensor, lost_steps)
     with np.errstate(over="ignore", invalid="ignore"):
         kitti = kitti_error(T_ref_sensor, T)
@@ -146,15 +114,7 @@ def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
 
 
 def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
-    """Judge a parameter set by its trials on some sequences.
-
-    Parameters
-    ----------
-    config
-        Objectives and limits. A limit holds on every sequence.
-    runs
-        The set's trials, one for each sequence.
-    """
+    """Judge a parameter set by its trials on some sequences."""
     metrics = [run.metrics for run in runs]
     values = tuple(
         float(np.mean([weighted(weights, of_run) for of_run in metrics]))
@@ -191,6 +151,9 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
     repeats
         Values of every run, of shape (n_sequences, ..., n_repeats).
     """
+    # Workers import this module too; scipy.stats takes half a second.
+    from scipy import stats
+
     n_sequences, n_repeats = len(repeats), repeats.shape[-1]
     variance = repeats.var(axis=-1, ddof=1).sum(axis=0)
     error = np.sqrt(variance / n_repeats) / n_sequences
@@ -210,11 +173,6 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
 
     A set that breaks limits is worse by `SEVERITY` times the baseline's value, and more with a
     larger excess: the sampler keeps away from it.
-
-    Parameters
-    ----------
-    history
-        Results of all trials; the first one is the baseline's.
     """
     if not any(result.constraints for result in history):
         return list(history)

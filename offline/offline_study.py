@@ -12,7 +12,10 @@ OfflineStudy = Study[OfflineStudyConfig]
 
 
 def load_study(
-    path: Path, overrides: Sequence[str] = (), folder: Path | None = None, runs: Path = Path("runs")
+    path: Path | str,
+    overrides: Sequence[str] = (),
+    folder: Path | None = None,
+    runs: Path = Path("runs"),
 ) -> OfflineStudy:
     """Read and check the whole YAML of a study, see `adaptune.study.loading.read_study`."""
-    return read_study(path, OfflineStudyConfig, overrides, folder, runs)
+    return read_study(Path(path), OfflineStudyConfig, overrides, folder, runs)

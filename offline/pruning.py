@@ -37,17 +37,7 @@ Values = Sequence[float]
 
 
 def rungs(pruning: Pruning, batch: int, n: int) -> list[int]:
-    """Numbers of sequences after which trials of a batch stop; the last one is all of them.
-
-    Parameters
-    ----------
-    pruning
-        The rule.
-    batch
-        Number of the batch.
-    n
-        Number of sequences.
-    """
+    """Numbers of sequences after which trials of a batch may stop; the last one is `n`, all."""
     if pruning == "none" or batch == 0:
         return [n]
     if pruning == "wilcoxon":
@@ -100,14 +90,6 @@ def _worse(values: Values, best: Values) -> bool:
 
 
 def estimate(values: Values, baseline: Values) -> float:
-    """Estimate the mean of a stopped trial from its ratio to the baseline so far.
-
-    Parameters
-    ----------
-    values
-        The trial's values, on the first sequences.
-    baseline
-        The baseline's values, on all of them.
-    """
+    """Estimate the mean of a stopped trial from its ratio so far to the whole baseline."""
     seen = float(np.mean(baseline[: len(values)]))
     return float(np.mean(values)) * (float(np.mean(baseline)) / seen if seen > 0.0 else 1.0)

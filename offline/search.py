@@ -25,17 +25,6 @@ class Search:
     baseline, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers
     do not depend on a budget.
 
-    Parameters
-    ----------
-    sampler
-        Proposes the sets.
-    sequences
-        The sequences on which the sets are run.
-    finished
-        All trials of the study.
-    place
-        j and n, see above.
-
     Attributes
     ----------
     sequences : list of str
@@ -79,13 +68,7 @@ class Search:
         return {self.number(i): verdict for i, verdict in enumerate(self.verdicts)}
 
     def begin(self, hours: float) -> bool:
-        """Begin the next batch; False if the search has ended.
-
-        Parameters
-        ----------
-        hours
-            Hours that all batches before took.
-        """
+        """Begin the next batch after so many hours; False if the search has ended."""
         if self.end is None:
             best = self.number(self.best)
             self.end = spent(self._config, self.verdicts, self.best, hours, best)
@@ -178,21 +161,7 @@ def assess(
     sequences: Sequence[str],
     finished: Finished,
 ) -> Verdict:
-    """Judge a trial; estimate its values if it was not run on all sequences.
-
-    Parameters
-    ----------
-    number
-        The trial number.
-    counted
-        The sequences that count, if the trial was run on them.
-    config
-        Objectives and limits.
-    sequences
-        All of them.
-    finished
-        The trials of the study.
-    """
+    """Judge a trial; estimate its values if it was not run on all sequences."""
     seen = tuple(name for name in sequences if name in counted and number in finished[name])
     found = judge(config, [finished[name][number] for name in seen])
     if len(seen) == len(sequences):
@@ -213,35 +182,16 @@ def _rank(verdict: Verdict) -> tuple[bool, float, float]:
 
 
 class Stage(NamedTuple):
-    """Searches that run side by side.
-
-    Attributes
-    ----------
-    searches : list of Search
-    alone : bool
-        Whether each search uses one sequence alone.
-    """
+    """Searches that run side by side."""
 
     searches: list[Search]
-    alone: bool
+    alone: bool  # whether each search uses one sequence alone
 
 
 def make_stages(
     config: OfflineConfig, space: ParameterSpace, names: list[str], finished: Finished
 ) -> list[Stage]:
-    """Make the searches of a study, in their order.
-
-    Parameters
-    ----------
-    config
-        Sampler, seed, budgets and kinds of searches.
-    space
-        The tuned parameters.
-    names
-        The training sequences.
-    finished
-        The finished trials on them.
-    """
+    """Make the searches of a study, in their order."""
     shared = [names] if config.sets != "own" else []
     own = [[name] for name in names] if config.sets != "shared" else []
     searches = []
@@ -256,15 +206,7 @@ def make_stages(
 
 
 def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
-    """The best set of each search that keeps the limits, by trial number.
-
-    Parameters
-    ----------
-    config
-        Objectives and limits.
-    stage
-        Searches that have ended.
-    """
+    """The best set of each search that keeps the limits, by trial number."""
     best = {}
     for search in stage.searches:
         if any(verdict.feasible for verdict in search.verdicts):
@@ -274,17 +216,7 @@ def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
 
 
 def owner(config: OfflineConfig, sequences: Sequence[str], number: int) -> str | None:
-    """The sequence whose own search proposed a trial's set; None for a shared search.
-
-    Parameters
-    ----------
-    config
-        Kinds of searches.
-    sequences
-        All training sequences.
-    number
-        The trial number.
-    """
+    """The sequence whose own search proposed a trial's set; None for a shared search."""
     n_shared = 0 if config.sets == "own" else 1
     if config.sets == "shared" or number == 0:
         return None

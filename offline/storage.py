@@ -37,23 +37,12 @@ class StorageError(AdaptuneError):
 
 
 class MirrorRow(NamedTuple):
-    """A trial as the mirror receives it.
-
-    Attributes
-    ----------
-    parameters : dict
-    values : tuple of float
-        The value of each objective.
-    attributes : dict
-        Further figures, as plain data.
-    constraints : dict
-        Excess over every limit; negative if the limit is kept.
-    """
+    """A trial as the mirror receives it."""
 
     parameters: ParameterSet
-    values: tuple[float, ...]
-    attributes: Mapping[str, Any] = {}
-    constraints: Mapping[str, float] = {}
+    values: tuple[float, ...]  # the value of each objective
+    attributes: Mapping[str, Any] = {}  # further figures, as plain data
+    constraints: Mapping[str, float] = {}  # excess over every limit; negative if the limit is kept
 
 
 def open_mirror(
@@ -64,16 +53,7 @@ def open_mirror(
 ) -> "Mirror":
     """Open the storage that a study names, by default a journal in its folder.
 
-    Parameters
-    ----------
-    folder
-        The study's folder, in which no other process works. Its name is the name of the study.
-    config
-        Storage and objectives.
-    space
-        The tuned parameters.
-    finished
-        Parameters of the finished trials, by trial number.
+    The folder's name is the name of the study; no other process may work in it.
 
     Raises
     ------
@@ -87,17 +67,7 @@ def open_mirror(
 
 
 class Mirror(ABC):
-    """An Optuna study that receives every trial once.
-
-    Parameters
-    ----------
-    name
-        Name of the study.
-    n_objectives
-        Number of objectives.
-    space
-        The tuned parameters.
-    """
+    """An Optuna study that receives every trial once."""
 
     def __init__(self, name: str, n_objectives: int, space: ParameterSpace):
         self._name = name
@@ -146,15 +116,7 @@ _FAIL = optuna.trial.TrialState.FAIL
 
 
 class JournalMirror(Mirror):
-    """A journal file in the study's folder; a damaged one is written again.
-
-    Parameters
-    ----------
-    path
-        The file; its folder's name is the name of the study.
-    n_objectives, space
-        See `Mirror`.
-    """
+    """A journal file in the study's folder; a damaged one is written again."""
 
     def __init__(self, path: Path, n_objectives: int, space: ParameterSpace):
         super().__init__(path.parent.name, n_objectives, space)
@@ -198,17 +160,7 @@ def _reported(path: Path) -> set[int]:
 
 
 class DatabaseMirror(Mirror):
-    """A database that SQLAlchemy and Optuna support, such as PostgreSQL.
-
-    Parameters
-    ----------
-    url
-        Address of the database.
-    name, n_objectives, space
-        See `Mirror`.
-    finished
-        See `open_mirror`.
-    """
+    """A database that SQLAlchemy and Optuna support, such as PostgreSQL."""
 
     def __init__(
         self,

@@ -30,23 +30,14 @@ _log = logging.getLogger(__name__)
 
 
 class Training(NamedTuple):
-    """Result of the offline stage.
-
-    Attributes
-    ----------
-    model : ErrorModel
-    means : dict
-        For every training sequence the mean capped error in percent of each trial, by rising
-        number, of shape (n_trials,); NaN where it was not run.
-    fixed : int
-        Number of the trial of the fixed set.
-    rows : list of dict
-        For every training sequence what the baseline, the fixed set and its own best set do there.
-    """
+    """Result of the offline stage."""
 
     model: ErrorModel
+    # For every training sequence the mean capped error in percent of each trial, by rising number,
+    # of shape (n_trials,); NaN where it was not run.
     means: dict[str, list[float]]
-    fixed: int
+    fixed: int  # number of the trial of the fixed set
+    # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
 
 
@@ -58,15 +49,13 @@ def train(
     Parameters
     ----------
     study
-        The study; its folder holds the archive and receives the error model, the
-        fixed set (``fixed.yaml``), a table of all trials (``trials.csv``, ``trials.json``), one of
-        the training sequences (``training.csv``, ``training.json``), and where there are several
-        objectives their Pareto front (``pareto.csv``, ``pareto.json``, ``pareto.png``).
+        The study. Its folder holds the archive and receives the error model, the fixed set
+        (``fixed.yaml``), tables of the trials (``trials``) and of the training sequences
+        (``training``), and with several objectives their Pareto front (``pareto``).
     progress
         Called about every finished trial.
     cluster
-        Address of a Dask scheduler, whose workers run the trials; processes of this machine when
-        left out.
+        Address of a Dask scheduler whose workers run the trials; None for processes here.
 
     Raises
     ------
@@ -82,16 +71,7 @@ def train(
         )
     archive = Archive(study.folder / "trials")
     archive.tidy()
-    n_workers = config.workers or available()
-    where = cluster or f"{n_workers} worker{'s' if n_workers > 1 else ''}"
-    _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    memory = config.memory * 1e9
-    with (
-        Cluster(setup, study.training, memory, cluster)
-        if cluster
-        else Workers(setup, n_workers, memory)
-    ) as workers:
+    with _workers(study, cluster) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
         sets = {n: verdicts[n].parameters for n in sorted({0, fixed})}
@@ -114,6 +94,17 @@ def train(
     rows = _training_rows(config, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
     return Training(model, means, fixed, rows)
+
+
+def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
+    """Processes of this machine, or of a cluster."""
+    config = study.config.offline
+    n = config.workers or available()
+    where = cluster or f"{n} worker{'s' if n > 1 else ''}"
+    _log.info("trials run on %s; each sequence is prepared before its first one", where)
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    memory = config.memory * 1e9
+    return Cluster(setup, study.training, memory, cluster) if cluster else Workers(setup, n, memory)
 
 
 def _fit(

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,21 +31,7 @@ EPISODE = 4.0
 
 @dataclass(frozen=True)
 class TrialSettings:
-    """What a trial depends on beside odometry, sequence and parameter set.
-
-    Attributes
-    ----------
-    sub_trajectory : float
-        Metres over which errors are measured.
-    lost_track : float
-        Metres a second by which a step of an odometry that loses track departs from the reference.
-    health : HealthCheck
-    descriptors : tuple of str
-    runs, repeats
-        See `OfflineConfig`.
-    metrics : frozenset of str
-        The metrics by which trials are judged.
-    """
+    """What a trial depends on besides odometry, sequence and parameter set."""
 
     sub_trajectory: float = 25.0
     lost_track: float = 3.0
@@ -58,15 +44,9 @@ class TrialSettings:
     @classmethod
     def of(cls, config: OfflineStudyConfig) -> Self:
         """The settings of a study."""
-        return cls(
-            config.sub_trajectory,
-            config.lost_track,
-            config.health,
-            config.descriptor.names,
-            config.offline.runs,
-            config.offline.repeats,
-            frozenset(config.offline.metrics),
-        )
+        shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor.names)
+        own = (config.offline.runs, config.offline.repeats, frozenset(config.offline.metrics))
+        return cls(*shared, *own)
 
     @property
     def isolated(self) -> bool:
@@ -77,18 +57,7 @@ class TrialSettings:
 class PreparedSequence:
     """A sequence that is read, prepared and described once, for all trials of a worker.
 
-    Parameters
-    ----------
-    name
-        Name of the sequence.
-    scans
-        The sequence.
-    odometry
-        Makes the odometry, which prepares the scans.
-    settings
-        Settings of the trials.
-    memory
-        Bytes that prepared scans may take. Scans beyond are read again on every pass.
+    Prepared scans that exceed `memory` bytes are read again on every pass.
 
     Attributes
     ----------
@@ -135,7 +104,7 @@ class PreparedSequence:
                 f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points"
             )
         at = np.array(stamps, np.int64)
-        T_ref_sensor = _reference(name, scans, at, settings)
+        T_ref_sensor = reference_poses(name, scans, at, settings)
         described = np.array(descriptors)
         # When a scan is described online, the pose of the scan before is known.
         motion = speed_and_turn_rate(at, T_ref_sensor)
@@ -158,9 +127,16 @@ def _described(describe: Describer, scan: sequence.Scan, name: str) -> NDArray[n
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
-def _reference(
+def reference_poses(
     name: str, scans: sequence.Sequence, stamps: NDArray[np.int64], settings: TrialSettings
 ) -> Poses:
+    """Reference poses at the scans' stamps, of shape (n, 4, 4), NaN where they are not known.
+
+    Raises
+    ------
+    AdaptuneError
+        If no error can be measured on the sequence.
+    """
     reference = scans.reference()
     if reference is None:
         raise AdaptuneError(
@@ -168,26 +144,6 @@ def _reference(
             f"(reference: ...)"
         )
     T_ref_sensor = reference.at(stamps)
-    check_reference(name, T_ref_sensor, settings)
-    return T_ref_sensor
-
-
-def check_reference(name: str, T_ref_sensor: Poses, settings: TrialSettings) -> None:
-    """Refuse a sequence on which no error can be measured.
-
-    Parameters
-    ----------
-    name
-        Name of the sequence.
-    T_ref_sensor
-        Reference poses at the scans' stamps, NaN where they are not known.
-    settings
-        Settings of the trials.
-
-    Raises
-    ------
-    AdaptuneError
-    """
     if np.isnan(T_ref_sensor).all():
         raise AdaptuneError(
             f"sequences.{name}: the reference does not overlap the scans in time; check that both "
@@ -207,6 +163,7 @@ def check_reference(name: str, T_ref_sensor: Poses, settings: TrialSettings) -> 
             f"sequences.{name}: its path holds no sub-trajectory of {shortest:g} m, the shortest "
             f"of KITTI's error; judge by another metric (offline.objective, offline.limits)"
         )
+    return T_ref_sensor
 
 
 class _Run:
@@ -292,21 +249,10 @@ def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
     return list(zip(begins, ends, strict=True))
 
 
-class Scans(Protocol):
-    """Prepared scans with their frames."""
-
-    name: str
-    frames: Frames
-
-    def __iter__(self) -> Iterator[Any]:
-        """Read the prepared scans."""
-        ...
-
-
 def run_trials(
     settings: TrialSettings,
     odometry: OdometryFactory,
-    scans: Scans,
+    scans: PreparedSequence,
     sets: Sequence[ParameterSet],
     whole: bool = False,
 ) -> list[Trial]:
@@ -314,20 +260,7 @@ def run_trials(
 
     With ``runs: restart``, an odometry that loses track restarts at the reference with that scan.
     The sub-trajectories across that frame count as failures; later ones are judged on their own.
-    `OfflineConfig` describes the other kinds of runs.
-
-    Parameters
-    ----------
-    settings
-        Settings of the trials.
-    odometry
-        Makes instances of the odometry.
-    scans
-        The sequence.
-    sets
-        The parameter sets.
-    whole
-        Run from end to end once, whatever the settings say.
+    `OfflineConfig` describes other kinds; with `whole`, there is one run from end to end.
     """
     frames = scans.frames
     kind, repeats = ("whole", 1) if whole else (settings.runs, settings.repeats)
@@ -429,14 +362,7 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """Everything that a process needs to run trials.
-
-    Attributes
-    ----------
-    settings : TrialSettings
-    odometry : OdometryFactory
-    sequences : StudySequences
-    """
+    """Everything that a process needs to run trials."""
 
     settings: TrialSettings
     odometry: OdometryFactory
@@ -447,6 +373,8 @@ class TrialSetup:
         scans = self.sequences.open(name)
         return PreparedSequence(name, scans, self.odometry, self.settings, memory)
 
-    def run(self, scans: Scans, sets: Sequence[ParameterSet], whole: bool = False) -> list[Trial]:
+    def run(
+        self, scans: PreparedSequence, sets: Sequence[ParameterSet], whole: bool = False
+    ) -> list[Trial]:
         """Run trials, see `run_trials`."""
         return run_trials(self.settings, self.odometry, scans, sets, whole)

@@ -12,27 +12,19 @@ from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.paired import ERROR_FLOOR
 from offline.curves import bank_curve, learning_curve
-from offline.labelled import labelled_data
+from offline.labelled import LabelledData, labelled_data
 from offline.leave_one_out import Interval, Validation, leave_one_out
 from offline.offline_study import OfflineStudy
 
 
 class Validated(NamedTuple):
-    """Result of `validate`.
-
-    Attributes
-    ----------
-    validation : Validation
-    rows : list of dict
-        Ratio to the fixed set's error of every mode on every sequence left out.
-    learning, banks : list of dict
-        See `learning_curve` and `bank_curve`; empty where they were not asked for.
-    """
+    """Result of `validate`."""
 
     validation: Validation
+    # Ratio to the fixed set's error of every mode on every sequence left out.
     rows: list[dict[str, Any]]
-    learning: list[dict[str, Any]]
-    banks: list[dict[str, Any]]
+    learning: list[dict[str, Any]]  # see `learning_curve`; empty where nobody asked
+    banks: list[dict[str, Any]]  # see `bank_curve`; empty where nobody asked
 
 
 def validate(
@@ -46,14 +38,14 @@ def validate(
     Parameters
     ----------
     study
-        A study that the offline stage has finished; its folder receives ``validation.csv``,
-        ``validation.json`` and ``validation.png``, and its model the summary.
+        A study that the offline stage has finished. Its folder receives ``validation`` (CSV, JSON
+        and PNG), and its model the summary.
     curve
-        Compute, too, what fewer training sequences would gain: ``learning.csv``, ``learning.json``.
+        Compute, too, what fewer training sequences would gain (``learning``).
     sizes
-        Compute, too, what banks of other sizes would gain: ``banks.csv``, ``banks.json``.
+        Compute, too, what banks of other sizes would gain (``banks``).
     progress
-        Called with what is done, and about every sequence.
+        Called about every sequence.
 
     Raises
     ------
@@ -63,13 +55,9 @@ def validate(
         If there is only one training sequence.
     """
     model = _checked_model(study)
-    complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
-    sets = model.sets.subset([model.sets.trials[column] for column in complete])
-    run = {name: list(sets) for name in model.sequences}
-    archive = Archive(study.folder / "trials")
-    data = labelled_data(archive, run, sets, study.config, study.window)
+    data = _labelled(study, model)
     switching = study.config.online.switching
-    named = switching.sets is not None and set(model.bank) <= set(sets)
+    named = switching.sets is not None and set(model.bank) <= set(data.sets)
     bank = model.bank if named else switching.size
 
     def stage(what: str) -> Callable[[int, int], None]:
@@ -100,6 +88,15 @@ def validate(
     found = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=found).save(study.model_path)
     return Validated(validation, rows, learning, banks)
+
+
+def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
+    """The labelled data set of the sets that were run on all training sequences."""
+    complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
+    sets = model.sets.subset([model.sets.trials[column] for column in complete])
+    run = {name: list(sets) for name in model.sequences}
+    archive = Archive(study.folder / "trials")
+    return labelled_data(archive, run, sets, study.config, study.window)
 
 
 def _checked_model(study: OfflineStudy) -> ErrorModel:

@@ -25,40 +25,20 @@ class WorkerError(AdaptuneError):
 
 
 class Task(NamedTuple):
-    """Trials to run on one pass over a sequence.
-
-    Attributes
-    ----------
-    sequence : str
-    numbers : tuple of int
-        Trial numbers.
-    sets : tuple of dict
-        The parameter sets of the trials.
-    whole : bool
-        Run them from end to end, without restarts at the reference.
-    frames : bool
-        Return the frames, which all trials on the sequence share, too.
-    """
+    """Trials to run on one pass over a sequence."""
 
     sequence: str
-    numbers: tuple[int, ...]
-    sets: tuple[ParameterSet, ...]
-    whole: bool = False
-    frames: bool = False
+    numbers: tuple[int, ...]  # trial numbers
+    sets: tuple[ParameterSet, ...]  # the parameter sets of the trials
+    whole: bool = False  # run them from end to end, without restarts at the reference
+    frames: bool = False  # return the frames, which all trials on the sequence share, too
 
     def __str__(self) -> str:
         return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"
 
 
 class TaskResult(NamedTuple):
-    """The result of a task.
-
-    Attributes
-    ----------
-    trials : list of Trial
-    frames : Frames, optional
-        If the task asks for them.
-    """
+    """The result of a task; the frames are there if the task asks for them."""
 
     trials: list[Trial]
     frames: Frames | None
@@ -176,15 +156,7 @@ def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
 
 
 class Sequences:
-    """The sequences that a worker has prepared, as many as its memory holds.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    memory
-        Bytes that prepared scans may take.
-    """
+    """The sequences that a worker has prepared, as many as its memory holds."""
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
@@ -225,18 +197,9 @@ class _Worker(NamedTuple):
 
 
 class Workers:
-    """Processes on this machine.
+    """Processes on this machine, which share `memory` bytes for prepared scans.
 
     Use it as a context: leaving it ends the processes.
-
-    Parameters
-    ----------
-    setup
-        What trials need.
-    n
-        Number of processes.
-    memory
-        Bytes that prepared scans may take, in all processes together.
     """
 
     def __init__(self, setup: TrialSetup, n: int, memory: float):
@@ -246,7 +209,7 @@ class Workers:
         # A process forked from one with threads may deadlock. A small server that has imported
         # what workers need forks them in milliseconds.
         self._context = mp.get_context("forkserver")
-        self._context.set_forkserver_preload(["offline.trial"])
+        self._context.set_forkserver_preload(["offline.preload"])
         self._workers: dict[int, _Worker] = {}
         self._busy: set[int] = set()
 

@@ -30,30 +30,15 @@ class Mode(NamedTuple):
 
 @dataclass(frozen=True)
 class ReplaySetup:
-    """What a replay depends on, besides the recording and the model.
-
-    Attributes
-    ----------
-    odometry : OdometryFactory
-    rules : tuple of str
-        Selection rules to compare.
-    switching : SwitchingConfig
-    mechanism : str
-        How the odometry changes its parameters.
-    warm_up : WarmUp
-    lost_track : float
-        Metres a second by which the members of a bank may differ and agree.
-    switch_cost : float
-        What a switch must promise, as a share of the fixed set's error.
-    """
+    """What a replay depends on, besides the recording and the model."""
 
     odometry: OdometryFactory
-    rules: tuple[str, ...]
+    rules: tuple[str, ...]  # selection rules to compare
     switching: SwitchingConfig
-    mechanism: Mechanism
+    mechanism: Mechanism  # how the odometry changes its parameters
     warm_up: WarmUp
-    lost_track: float
-    switch_cost: float
+    lost_track: float  # metres a second by which the members of a bank may differ and agree
+    switch_cost: float  # what a switch must promise, as a share of the fixed set's error
 
     @classmethod
     def of(cls, study: Study) -> Self:

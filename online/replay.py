@@ -29,50 +29,26 @@ class Selects(Protocol):
 
 
 class Choice(NamedTuple):
-    """A selection that was made.
+    """A selection that was made."""
 
-    Attributes
-    ----------
-    stamp : int
-        Nanoseconds, of the scan that it was made from and first applied to.
-    selection : Selection
-    seconds : float
-        Time to describe the scan and choose.
-    """
-
-    stamp: int
+    stamp: int  # nanoseconds, of the scan that it was made from and first applied to
     selection: Selection
-    seconds: float
+    seconds: float  # time to describe the scan and choose
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """One way through a recording.
+    """One way through a recording."""
 
-    Attributes
-    ----------
-    trajectory : Trajectory
-        The odometry's.
-    restarted : ndarray of shape (n,)
-        Frames at which the health check restarted the odometry.
-    registered : ndarray of shape (n,)
-        False where the scan was too poor to register and the last motion went on.
-    prepare_seconds, register_seconds : ndarray of shape (n,)
-    choices : list of Choice
-    seconds : float
-        The whole replay, reading included.
-    unhealthy : dict
-        How often the health check found what.
-    """
-
-    trajectory: Trajectory
-    restarted: NDArray[np.bool_]
+    trajectory: Trajectory  # the odometry's
+    restarted: NDArray[np.bool_]  # (n,): frames at which the health check restarted the odometry
+    # (n,): false where the scan was too poor to register and the last motion went on.
     registered: NDArray[np.bool_]
-    prepare_seconds: NDArray[np.float64]
-    register_seconds: NDArray[np.float64]
+    prepare_seconds: NDArray[np.float64]  # (n,)
+    register_seconds: NDArray[np.float64]  # (n,)
     choices: list[Choice]
-    seconds: float
-    unhealthy: dict[str, int]
+    seconds: float  # the whole replay, reading included
+    unhealthy: dict[str, int]  # how often the health check found what
 
 
 class Schedule:
@@ -119,16 +95,9 @@ class Step(NamedTuple):
 
 @dataclass
 class Tracker:
-    """Registers scan after scan, and restarts the odometry where its motion is not healthy.
+    """Registers scan after scan, and restarts the odometry where its motion is not healthy."""
 
-    Attributes
-    ----------
-    odometry : OdometryInstance
-        A new instance.
-    health : HealthCheck
-    """
-
-    odometry: OdometryInstance
+    odometry: OdometryInstance  # a new instance
     health: HealthCheck
     _last: Step | None = field(default=None, init=False)
 

@@ -1,7 +1,8 @@
 """The online stage: replay the test sequences in every mode."""
 
+import itertools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,12 @@ from adaptune.descriptor.base import DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.selection import Selection
+from adaptune.sequence.sequence import Sequence
+from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, write_tum
-from online.modes import ReplaySetup
-from online.replay import replay
+from online.modes import Mode, ReplaySetup
+from online.replay import Replay, replay
 from online.stored_replays import ReplayIdentity, is_current, write_replay
 
 Progress = Callable[[str, int, int], None]
@@ -58,8 +61,8 @@ def run_replays(
     model = ErrorModel.load(model_path)
     model.check_study(study.odometry.identity, study.odometry.space, model_path)
     setup = ReplaySetup.of(study)
-    # The set that adaptive modes begin with.
-    fixed = next(iter(setup.members(model))) if setup.mechanism == "bank" else model.fixed
+    if setup.mechanism == "bank":
+        setup.members(model)  # refuses another bank before anything runs
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     study.open()
@@ -73,37 +76,40 @@ def run_replays(
             continue
         sequence = study.sequences.open(name)
         for mode in due:
-            what, n = f"{name}, {mode}", sequence.n_messages
-            odometry, selector = setup.start(mode, model, name)
-            step = _counter(progress, what, n)
-            health, period = study.config.health, study.config.online.period
-            try:
-                result = replay(sequence, odometry, health, selector, period, step)
-            except DescriptorError as error:
-                raise ReplayError(f"sequences.{name}: {error}") from error
-            finally:
-                odometry.close()
-            progress(what, n, n)
+            started = setup.start(mode, model, name)
+            result = _replay(study.config, sequence, f"{name}, {mode}", started, progress)
             if mode == due[0]:
                 _write_reference(folder, sequence.reference(), result.trajectory)
             write_replay(folder / mode, result, about[mode])
-            warn_of_scant_evidence(what, [choice.selection for choice in result.choices], fixed)
+            if started.selector is not None:
+                selections = [choice.selection for choice in result.choices]
+                warn_of_scant_evidence(f"{name}, {mode}", selections, started.selector.fixed)
         made += len(due)
     return made
 
 
-def _counter(progress: Progress, what: str, n: int) -> Callable[[], None]:
-    done = 0
+def _replay(
+    config: StudyConfig, sequence: Sequence, what: str, mode: Mode, progress: Progress
+) -> Replay:
+    done, n = itertools.count(1), sequence.n_messages
+    try:
+        result = replay(
+            sequence,
+            mode.odometry,
+            config.health,
+            mode.selector,
+            config.online.period,
+            lambda: progress(what, next(done), n),
+        )
+    except DescriptorError as error:
+        raise ReplayError(f"sequences.{what.partition(',')[0]}: {error}") from error
+    finally:
+        mode.odometry.close()
+    progress(what, n, n)
+    return result
 
-    def step() -> None:
-        nonlocal done
-        done += 1
-        progress(what, done, n)
 
-    return step
-
-
-def warn_of_scant_evidence(what: str, selections: Sequence[Selection], fixed: int) -> None:
+def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:
     """Warn of selections that rest on hardly more than one training sequence."""
     left = [s for s in selections if s.trial != fixed]
     few = sum(s.n_sequences < SCANT for s in left)

@@ -14,22 +14,14 @@ from adaptune.trajectory import Trajectory, read_tum
 from online.stored_replays import StoredReplay
 
 Interval = tuple[float, float] | None
-"""Ends of a 95 % interval, where it can be told."""
+"""Ends of a 95 % interval, where it is known."""
 
 
 class Reference(NamedTuple):
-    """Errors are measured against this.
+    """Errors are measured against this."""
 
-    Attributes
-    ----------
-    trajectory : Trajectory or None
-        None where nothing is known.
-    length : float
-        Metres of a sub-trajectory.
-    """
-
-    trajectory: Trajectory | None
-    length: float
+    trajectory: Trajectory | None  # None where nothing is known
+    length: float  # metres of a sub-trajectory
 
     @classmethod
     def read(cls, folder: Path, length: float) -> "Reference":
@@ -59,41 +51,21 @@ class Reference(NamedTuple):
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """A mode on a sequence, or over all sequences.
-
-    Attributes
-    ----------
-    sequence, mode : str
-    rte : float or None
-        Mean sub-trajectory RTE in percent; None where the reference is unknown.
-    vs_fixed : float or None
-        Its ratio to that of the fixed set.
-    rte_interval, ratio_interval : tuple of float or None
-        95 % intervals of both.
-    median : float or None
-        Median sub-trajectory RTE in percent.
-    kitti : KittiError or None
-    restarts, switches, poor_scans : int
-        Restarts by the health check; changes of the parameters; scans that were too poor.
-    blocks : int or None
-        Independent pieces of the recording.
-    x_real_time : float or None
-        Speed of the replay.
-    """
+    """A mode on a sequence, or over all sequences."""
 
     sequence: str
     mode: str
-    rte: float | None
-    vs_fixed: float | None
-    restarts: int
-    switches: int
-    poor_scans: int
+    rte: float | None  # mean sub-trajectory RTE in percent; None where the reference is unknown
+    vs_fixed: float | None  # its ratio to that of the fixed set
+    restarts: int  # by the health check
+    switches: int  # changes of the parameters
+    poor_scans: int  # too poor to register
     rte_interval: Interval = None
     ratio_interval: Interval = None
-    median: float | None = None
+    median: float | None = None  # of the sub-trajectory RTE, percent
     kitti: KittiError | None = None
-    blocks: int | None = None
-    x_real_time: float | None = None
+    blocks: int | None = None  # independent pieces of the recording
+    x_real_time: float | None = None  # speed of the replay
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""

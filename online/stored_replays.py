@@ -21,35 +21,20 @@ class StoredReplayError(AdaptuneError):
 
 
 class ReplayIdentity(BaseModel):
-    """All that a replay depends on.
-
-    Attributes
-    ----------
-    mode : str
-    parameters : dict or None
-        Of a mode that keeps them.
-    model : str or None
-        Digest of the model, of an adaptive mode.
-    switching : dict or None
-        See `online.modes.ReplaySetup.identity`.
-    period : float
-        Seconds.
-    odometry, health, sequence, course, recording
-        Their configuration, and the sizes of the recording's files.
-    """
+    """All that a replay depends on."""
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
 
     mode: str
-    parameters: dict[str, Any] | None
-    model: str | None
-    switching: dict[str, Any] | None
-    period: float
+    parameters: dict[str, Any] | None  # of baseline and fixed, which keep them
+    model: str | None  # its digest, of an adaptive mode
+    switching: dict[str, Any] | None  # see `online.modes.ReplaySetup.identity`
+    period: float  # seconds
     odometry: dict[str, Any]
     health: dict[str, Any]
     sequence: dict[str, Any]
     course: dict[str, Any] | None
-    recording: list[int] | None
+    recording: list[int] | None  # sizes of the recording's files
 
     def differences(self, other: Self) -> list[str]:
         """What differs in the settings that all modes of a sequence share."""
@@ -59,28 +44,14 @@ class ReplayIdentity(BaseModel):
 
 
 class ReplaySummary(BaseModel):
-    """The content of ``replay.json``.
-
-    Attributes
-    ----------
-    scans, selections : int
-    duration_s, replay_s : float
-        Of the recording, and of its replay.
-    restarts : int
-        How often the health check restarted the odometry.
-    unhealthy : dict
-        How often the health check found what.
-    poor_scans : int
-        Scans that were too poor to register.
-    about : ReplayIdentity
-    """
+    """The content of ``replay.json``."""
 
     scans: int
-    duration_s: float
-    replay_s: float
-    restarts: int
-    unhealthy: dict[str, int]
-    poor_scans: int
+    duration_s: float  # of the recording
+    replay_s: float  # of its replay
+    restarts: int  # how often the health check restarted the odometry
+    unhealthy: dict[str, int]  # how often the health check found what
+    poor_scans: int  # scans that were too poor to register
     selections: int
     about: ReplayIdentity
 
@@ -113,26 +84,15 @@ def is_current(folder: Path, about: ReplayIdentity) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class StoredReplay:
-    """A replay as it was stored.
-
-    Attributes
-    ----------
-    summary : ReplaySummary
-    trajectory : Trajectory
-    restarted : ndarray of shape (n,)
-        Frames at which the health check restarted the odometry.
-    choice_stamps : ndarray of shape (m,)
-        Nanoseconds, of the scans that selections were made from; the first one of a mode that
-        keeps its parameters.
-    choices : dict
-        For every parameter its values, of shape (m,).
-    """
+    """A replay as it was stored."""
 
     summary: ReplaySummary
     trajectory: Trajectory
-    restarted: NDArray[np.bool_]
+    restarted: NDArray[np.bool_]  # (n,): frames at which the health check restarted the odometry
+    # (m,): nanoseconds, of the scans that selections were made from; the first one of a mode that
+    # keeps its parameters.
     choice_stamps: NDArray[np.int64]
-    choices: dict[str, Sequence[Any]]
+    choices: dict[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -193,14 +153,8 @@ def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
 
 
 _SELECTION = (
-    "stamp_ns",
-    "trial",
-    "predicted_error_percent",
-    "predicted_fixed_percent",
-    "familiarity",
-    "sequences",
-    "weights",
-    "ms",
+    *("stamp_ns", "trial", "predicted_error_percent", "predicted_fixed_percent"),
+    *("familiarity", "sequences", "weights", "ms"),
 )
 """Columns of ``selections.csv`` before the parameters."""
 

@@ -33,18 +33,10 @@ PERIOD = 5.0
 
 
 class Mechanism(NamedTuple):
-    """A way to change parameters.
+    """A way to change parameters."""
 
-    Attributes
-    ----------
-    make : callable
-        Makes a new odometry.
-    sets : tuple of dict
-        The sets to switch between; empty for no switches.
-    """
-
-    make: Callable[[], OdometryInstance]
-    sets: tuple[ParameterSet, ...]
+    make: Callable[[], OdometryInstance]  # makes a new odometry
+    sets: tuple[ParameterSet, ...]  # the sets to switch between; empty for no switches
 
 
 class Recording(NamedTuple):

@@ -1,17 +1,28 @@
 """What tests need that is not in the repository, and what many of them share."""
 
+import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import drives
 import pytest
 from needs import lacking
 
+from offline.offline_study import load_study
+from offline.train import train
+
+Factory = pytest.TempPathFactory
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run slow tests first, so that all processes end at about the same time."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
 
 @pytest.fixture(scope="session", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Decoded scans go to a folder of the tests', and not to the user's cache."""
+def _cache(tmp_path_factory: Factory) -> Iterator[None]:
+    """Keep decoded scans in a folder of the tests, not in the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ADAPTUNE_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -27,7 +38,30 @@ def recorded() -> Path:
     return Path(folder)
 
 
+def shared(factory: Factory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first process that needs it makes, and that all processes use."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        made = folder.with_suffix(".made")
+        if not made.exists():
+            make(folder)
+            made.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
-def study_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def study_file(tmp_path_factory: Factory) -> Path:
     """A study of three short drives, with its bags; not to be changed."""
-    return drives.write_study(tmp_path_factory.mktemp("study"))
+    return shared(tmp_path_factory, "study", drives.write_study) / drives.STUDY_FILE
+
+
+@pytest.fixture(scope="session")
+def trained_folder(study_file: Path, tmp_path_factory: Factory) -> Path:
+    """The run folder of the trained study; not to be changed."""
+
+    def make(folder: Path) -> None:
+        train(load_study(study_file, [], folder))
+
+    return shared(tmp_path_factory, "trained", make)

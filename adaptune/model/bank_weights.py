@@ -24,48 +24,30 @@ POOL = 64
 
 
 class BankSettings(BaseModel):
-    """Settings of a bank's weights.
-
-    Attributes
-    ----------
-    adapt : bool
-        If not, the bank was not shown to pay, and is not used.
-    sharpness : float
-        How fast a sequence's weight falls with the distance of its nearest frames.
-    n_frames : int
-        Nearest frames of each sequence.
-    min_fixed_share : float
-        Minimum share of the weight that the fixed set keeps.
-    clip : float
-        Errors are clipped at this many times the fixed set's root mean square in the sequence: a
-        member that has lost track is left out of the mean, and does not cost what it would alone.
-    """
+    """Settings of a bank's weights."""
 
     # A file of a later version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    adapt: bool = True
+    adapt: bool = True  # if not, the fixed set keeps all the weight
+    # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
-    n_frames: PositiveInt = 300
+    n_frames: PositiveInt = 300  # nearest frames of each sequence
+    # Minimum share of the weight that the fixed set keeps.
     min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
+    # member that has lost track is left out of the mean, and does not cost what it would alone.
     clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
 
 
 class NearProducts(NamedTuple):
-    """Products of errors on the training frames nearest to some scans.
-
-    Attributes
-    ----------
-    evidence : Evidence
-    products : ndarray of shape (n_scans, n_sequences, n_members, n_members)
-        Mean products of the members' errors, percent squared.
-    fixed : ndarray of shape (n_scans, n_sequences)
-        Mean squared error of the fixed set.
-    """
+    """Products of errors on the training frames nearest to some scans."""
 
     evidence: Evidence
+    # (n_scans, n_sequences, n_members, n_members): mean products of the members' errors, percent
+    # squared.
     products: NDArray[np.float64]
-    fixed: NDArray[np.float64]
+    fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean squared error of the fixed set
 
 
 class BankRule(Rule):
@@ -182,7 +164,8 @@ def bank_weights(
     of_sequences = near.evidence.weights(settings.sharpness)
     squares = np.einsum("qs,qsjk->qjk", of_sequences, relative)
     weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
-    trust = near.evidence.trust * (1.0 - settings.min_fixed_share)
+    kept = settings.min_fixed_share if settings.adapt else 1.0
+    trust = near.evidence.trust * (1.0 - kept)
     weights *= trust[:, None]
     weights[:, 0] += 1.0 - trust
     mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)

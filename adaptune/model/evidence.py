@@ -14,21 +14,14 @@ _QUANTILES = 10
 
 
 class Evidence(NamedTuple):
-    """The training frames nearest to some scans.
+    """The training frames nearest to some scans."""
 
-    Attributes
-    ----------
-    frames : tuple of ndarray of shape (n_scans, n_near)
-        For each training sequence, numbers of its frames that are nearest to each scan.
-    squared : ndarray of shape (n_scans, n_sequences)
-        Mean squared distance of these frames.
-    familiarity : ndarray of shape (n_scans,)
-        Share of the training frames that are farther from the other sequences than each scan is
-        from all of them.
-    """
-
+    # (n_scans, n_near): for each training sequence, numbers of its frames that are nearest to each
+    # scan.
     frames: tuple[NDArray[np.intp], ...]
-    squared: NDArray[np.float64]
+    squared: NDArray[np.float64]  # (n_scans, n_sequences): mean squared distance of these frames
+    # (n_scans,): share of the training frames that are farther from the other sequences than each
+    # scan is from all of them.
     familiarity: NDArray[np.float64]
 
     @property

@@ -16,69 +16,42 @@ ERROR_FLOOR = 0.02
 
 
 class PairedSettings(BaseModel):
-    """Settings of the paired rule.
-
-    Attributes
-    ----------
-    adapt : bool
-        If not, the rule always keeps the fixed set.
-    n_sets : int, optional
-        Number of complementary sets to choose among, the fixed one included; all sets if None.
-        Candidates that the training data name come first.
-    sharpness : float
-        How fast a sequence's weight falls with the distance of its nearest frames.
-    width : float
-        Standard deviation of the Gaussian over parameter sets, in the unit cube.
-    n_frames : int
-        Nearest frames of each sequence.
-    threshold : float
-        Logarithm of the ratio below which a set is preferred to the fixed one.
-    caution : float
-        Standard errors, estimated from how much the sequences differ, that are added to a ratio.
-    """
+    """Settings of the paired rule."""
 
     # A file of a later version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    adapt: bool = True
+    adapt: bool = True  # if not, the rule always keeps the fixed set
+    # Number of complementary sets to choose among, the fixed one included; all sets if None.
+    # Candidates that the training data name come first.
     n_sets: PositiveInt | None = 3
+    # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
+    # Standard deviation of the Gaussian over parameter sets, in the unit cube.
     width: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 0.12
-    n_frames: PositiveInt = 300
+    n_frames: PositiveInt = 300  # nearest frames of each sequence
+    # Logarithm of the ratio below which a set is preferred to the fixed one.
     threshold: Annotated[float, Field(le=0.0, allow_inf_nan=False)] = -0.1
+    # Standard errors, estimated from how much the sequences differ, that are added to a ratio.
     caution: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.5
 
 
 class Near(NamedTuple):
-    """Errors on the training frames nearest to some scans.
-
-    Attributes
-    ----------
-    evidence : Evidence
-    errors : ndarray of shape (n_scans, n_sequences, n_candidates)
-        Mean error of every candidate in percent, mixed with that of its neighbours.
-    fixed : ndarray of shape (n_scans, n_sequences)
-        Mean error of the fixed set.
-    """
+    """Errors on the training frames nearest to some scans."""
 
     evidence: Evidence
+    # (n_scans, n_sequences, n_candidates): mean error of every candidate in percent, mixed with
+    # that of its neighbours.
     errors: NDArray[np.float64]
-    fixed: NDArray[np.float64]
+    fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean error of the fixed set
 
 
 class Ratios(NamedTuple):
-    """Ratios of errors to the fixed set's.
+    """Ratios of errors to the fixed set's."""
 
-    Attributes
-    ----------
-    expected, cautious : ndarray of shape (n_scans, n_candidates)
-        The expected ratio, without and with `caution` standard errors.
-    weights : ndarray of shape (n_scans, n_sequences)
-        Of the training sequences, adding up to 1.
-    """
-
-    expected: NDArray[np.float64]
-    cautious: NDArray[np.float64]
+    expected: NDArray[np.float64]  # (n_scans, n_candidates)
+    cautious: NDArray[np.float64]  # the same with `caution` standard errors added
+    # (n_scans, n_sequences): of the training sequences, adding up to 1.
     weights: NDArray[np.float64]
 
 

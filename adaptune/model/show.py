@@ -14,7 +14,7 @@ from adaptune.model.error_model import ErrorModel
 from adaptune.space import Value, describe
 
 N_BEST = 5
-"""Sets to be shown beside the fixed one."""
+"""Sets to show, besides the fixed one."""
 
 
 def render(model: ErrorModel, path: Path) -> RenderableType:

@@ -42,11 +42,7 @@ class Bank(Recorded):
     """
 
     def __init__(
-        self,
-        make: Make,
-        sets: Mapping[int, ParameterSet],
-        warm_up: WarmUp,
-        lost_track: float = 3.0,
+        self, make: Make, sets: Mapping[int, ParameterSet], warm_up: WarmUp, lost_track: float = 3.0
     ):
         self.trials = tuple(sets)
         self.restarts = 0
@@ -64,47 +60,39 @@ class Bank(Recorded):
     @property
     def usage(self) -> Usage:
         """CPU time and memory of all members together."""
-        usages = [member.usage for member in self._members]
-        memory = [usage.memory for usage in usages if usage.memory is not None]
-        return Usage(sum(usage.cpu for usage in usages), sum(memory) if memory else None)
+        return Usage.total((member.usage for member in self._members), sum)
 
     @property
     def motions(self) -> Motions:
-        """See `OdometryInstance.motions`; of a member before it was restarted."""
+        # Of a member before it was restarted.
         members = dict(zip(self.trials, self._T_previous_current, strict=True))
         return super().motions._replace(members=members)
 
     def prepare(self, scan: Scan) -> PreparedScan:
-        """See `Odometry.prepare`."""
         return PreparedScan.by(self._members[0], scan)
 
     def apply(self, selection: Selection) -> None:
-        """See `OdometryInstance.apply`; members without a weight get 0."""
+        # Members without a weight get 0.
         weights = {selection.trial: 1.0} if selection.weights is None else selection.weights
         if unknown := sorted(set(weights) - set(self.trials)):
-            raise OdometryError(
-                f"the bank holds trials {', '.join(map(str, self.trials))}, not "
-                f"{', '.join(map(str, unknown))}"
-            )
+            held, others = (", ".join(map(str, trials)) for trials in (self.trials, unknown))
+            raise OdometryError(f"the bank holds trials {held}, not {others}")
         self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
 
     def start(
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`."""
         for member in self._members:
             member.start(prepared.prepared, T_odom_sensor, T_previous_current)
         self._T_previous_current = self._member_motions()
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: PreparedScan) -> None:
-        """See `OdometryInstance.submit`."""
         self._submitted = prepared
         for member in self._members:
             member.submit(prepared.prepared)
 
     def collect(self) -> Registration:
-        """See `OdometryInstance.collect`."""
         prepared = self._submitted
         registrations = [member.collect() for member in self._members]
         self._T_previous_current = T_previous_current = self._member_motions()
@@ -121,13 +109,10 @@ class Bank(Recorded):
             if agreeing.sum() > 1 or not np.isfinite(T_previous_current[i]).all():
                 self._recent.replay_to(self._members[i]).catch_up()
                 self.restarts += 1
-        registered = any(
-            r.registered for r, agrees in zip(registrations, agreeing, strict=True) if agrees
-        )
-        return Registration(T_odom_sensor, registered)
+        registered = np.array([registration.registered for registration in registrations])
+        return Registration(T_odom_sensor, bool(registered[agreeing].any()))
 
     def close(self) -> None:
-        """See `OdometryInstance.close`."""
         for member in self._members:
             member.close()
 
@@ -136,9 +121,7 @@ class Bank(Recorded):
 
 
 def agreement(
-    T_previous_current: Poses,
-    weights: NDArray[np.float64],
-    bound: float | NDArray[np.float64],
+    T_previous_current: Poses, weights: NDArray[np.float64], bound: float | NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Which members agree: those near the motion that has the most votes near it.
 
@@ -165,9 +148,8 @@ def agreement(
     votes = weights + 1e-9
     votes[..., 0] += TRUST
     heard = (near * votes[..., None, :]).sum(axis=-1)
-    return np.asarray(
-        np.take_along_axis(near, heard.argmax(axis=-1)[..., None, None], -2)[..., 0, :]
-    )
+    most = heard.argmax(axis=-1)[..., None, None]
+    return np.asarray(np.take_along_axis(near, most, -2)[..., 0, :])
 
 
 def share(weights: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> NDArray[np.float64]:

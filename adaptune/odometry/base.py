@@ -2,18 +2,22 @@
 
 import functools
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
+
+MIN_POINTS = 20
+"""An adapter does not register scans with fewer points in range."""
 
 
 class OdometryError(AdaptuneError):
@@ -24,6 +28,22 @@ class BaseSettings(BaseModel):
     """What a study sets once and does not tune."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RangeSettings(BaseSettings):
+    """Settings of odometries that crop scans and can deskew them.
+
+    Attributes
+    ----------
+    min_range, max_range : float
+        Metres.
+    deskew : bool
+        Take the motion out of scans whose points have times.
+    """
+
+    min_range: float = Field(1.0, ge=0)
+    max_range: float = Field(100.0, gt=0)
+    deskew: bool = True
 
 
 class WarmUp(NamedTuple):
@@ -73,6 +93,13 @@ class Usage(NamedTuple):
     cpu: float
     memory: float | None
 
+    @classmethod
+    def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
+        """CPU time of all together, and the sum or the maximum of their memory."""
+        cpu, peaks = zip(*usages, strict=True)
+        known = [peak for peak in peaks if peak is not None]
+        return cls(sum(cpu), memory(known) if known else None)
+
 
 class Motions(NamedTuple):
     """How the sensor moved over the last scan, before any health check.
@@ -80,8 +107,7 @@ class Motions(NamedTuple):
     Attributes
     ----------
     T_previous_current : ndarray of shape (4, 4)
-        Motion of the odometry or of the whole bank. NaN if there was no pose. After a start it is
-        the motion that `start` received, or the identity.
+        NaN if there was no pose. After a start, what `start` received, or the identity.
     members : dict of ndarray
         The same for each member of a bank, by trial number; empty for single odometries.
     """
@@ -91,18 +117,12 @@ class Motions(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What a study must know of an odometry before it runs it.
+    """What a study must know of an odometry before it runs it; see also `Odometry`.
 
     Attributes
     ----------
     space : ParameterSpace or None
         The parameters that can be tuned; None if the study defines them.
-    live : bool
-        See `Odometry`.
-    needs_imu : bool
-        See `Odometry`.
-    warm_up : WarmUp
-        See `Odometry`.
     whole : bool
         Whether it runs whole recordings only, with one parameter set from end to end.
     """
@@ -133,13 +153,29 @@ class OdometryInstance(Protocol):
     def motions(self) -> Motions:
         """Motions over the last scan."""
 
+    @abstractmethod
     def prepare(self, scan: Scan) -> Any:
-        """See `Odometry.prepare`."""
+        """Do to a scan all that does not depend on parameters, pose or earlier scans.
 
+        All instances with the same settings share the result, and none may change it.
+        """
+
+    @abstractmethod
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`."""
+        """Forget all scans and begin with this one.
+
+        Parameters
+        ----------
+        prepared
+            A prepared scan.
+        T_odom_sensor
+            Pose of the sensor, of shape (4, 4).
+        T_previous_current
+            The last motion, of shape (4, 4), for odometries that predict by it; None if the sensor
+            stood still.
+        """
 
     def submit(self, prepared: Any) -> None:
         """Begin to register the next scan."""
@@ -149,6 +185,8 @@ class OdometryInstance(Protocol):
 
     def register(self, prepared: Any) -> Registration:
         """Find the pose of the next scan: submit it, then collect."""
+        self.submit(prepared)
+        return self.collect()
 
     def apply(self, selection: Selection) -> None:
         """Change to what was selected, before the next scan.
@@ -170,29 +208,24 @@ class _Record:
     """The last two poses of an instance, and the CPU time of its registrations."""
 
     def __init__(self) -> None:
-        self.active = False
-        self.cpu = 0.0
+        self.busy, self.cpu = False, 0.0
         self._started_with: Poses | None = np.eye(4)
         self._T_before = self._T_now = np.eye(4)
 
-    def call(self, method: Callable[..., Any], *arguments: Any) -> tuple[Any, bool]:
-        """Call a method. False if it is part of another call, which is recorded instead."""
-        if self.active:
-            return method(*arguments), False
-        self.active = True
-        try:
-            return method(*arguments), True
-        finally:
-            self.active = False
-
-    def start(self, T_odom_sensor: Poses, T_previous_current: Poses | None) -> None:
+    def start(
+        self,
+        prepared: Any,  # noqa: ARG002
+        T_odom_sensor: Poses,
+        T_previous_current: Poses | None = None,
+    ) -> None:
         self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
         self._T_now = np.array(T_odom_sensor)
 
-    def register(self, T_odom_sensor: Poses) -> None:
+    def register(self, T_odom_sensor: Poses, cpu: float) -> None:
         # A copy, in case the odometry changes its pose in place.
         self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor)
         self._started_with = None
+        self.cpu += cpu
 
     @property
     def motion(self) -> Poses:
@@ -201,36 +234,29 @@ class _Record:
         return invert(self._T_before) @ self._T_now
 
 
-def _recorded_start(start: Callable[..., None]) -> Callable[..., None]:
-    @functools.wraps(start)
-    def recorded(
-        self: "Recorded",
-        prepared: Any,
-        T_odom_sensor: Poses,
-        T_previous_current: Poses | None = None,
-    ) -> None:
-        record = self._odometry_record
-        if record.call(start, self, prepared, T_odom_sensor, T_previous_current)[1]:
-            record.start(T_odom_sensor, T_previous_current)
+def _recorded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method that records its calls, except those that are part of another one."""
 
-    return recorded
-
-
-def _recorded_registration(register: Callable[..., Registration]) -> Callable[..., Registration]:
-    @functools.wraps(register)
-    def recorded(self: "Recorded", *prepared: Any) -> Registration:
+    @functools.wraps(method)
+    def recorded(self: "Recorded", *arguments: Any, **named: Any) -> Any:
         record, begin = self._odometry_record, time.process_time()
-        registration: Registration
-        registration, outermost = record.call(register, self, *prepared)
-        if outermost:
-            record.cpu += time.process_time() - begin
-            record.register(registration.T_odom_sensor)
+        if record.busy:
+            return method(self, *arguments, **named)
+        record.busy = True
+        try:
+            registration = method(self, *arguments, **named)
+        finally:
+            record.busy = False
+        if name == "start":
+            record.start(*arguments, **named)
+        else:
+            record.register(registration.T_odom_sensor, time.process_time() - begin)
         return registration
 
     return recorded
 
 
-class Recorded(ABC):
+class Recorded(OdometryInstance):
     """Records motion and CPU time, whatever a subclass does to find poses.
 
     For that it wraps `start`, `register` and `collect` of each subclass.
@@ -238,10 +264,8 @@ class Recorded(ABC):
 
     def __init_subclass__(cls, **keywords: Any):
         super().__init_subclass__(**keywords)
-        for name in ("start", "register", "collect"):
-            if method := vars(cls).get(name):
-                wrap: Any = _recorded_start if name == "start" else _recorded_registration
-                setattr(cls, name, wrap(method))
+        for name in {"start", "register", "collect"} & vars(cls).keys():
+            setattr(cls, name, _recorded(name, vars(cls)[name]))
 
     @functools.cached_property
     def _odometry_record(self) -> _Record:
@@ -254,24 +278,7 @@ class Recorded(ABC):
 
     @property
     def motions(self) -> Motions:
-        """See `OdometryInstance.motions`."""
         return Motions(self._odometry_record.motion, {})
-
-    @abstractmethod
-    def submit(self, prepared: Any) -> None:
-        """See `OdometryInstance.submit`."""
-
-    @abstractmethod
-    def collect(self) -> Registration:
-        """See `OdometryInstance.collect`."""
-
-    def register(self, prepared: Any) -> Registration:
-        """See `OdometryInstance.register`."""
-        self.submit(prepared)
-        return self.collect()
-
-    def close(self) -> None:  # noqa: B027 - most have nothing to close
-        """See `OdometryInstance.close`."""
 
 
 class Odometry(Recorded):
@@ -333,43 +340,16 @@ class Odometry(Recorded):
         return Description(cls.space, cls.live, cls.needs_imu, cls.warm_up)
 
     @abstractmethod
-    def prepare(self, scan: Scan) -> Any:
-        """Do to a scan all that does not depend on parameters, pose or earlier scans.
-
-        All instances with the same settings share the result, and none may change it.
-        """
-
-    @abstractmethod
-    def start(
-        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None:
-        """Forget all scans and begin with this one.
-
-        Parameters
-        ----------
-        prepared
-            A prepared scan.
-        T_odom_sensor
-            Pose of the sensor, of shape (4, 4).
-        T_previous_current
-            The last motion, of shape (4, 4), for odometries that predict by it; None if the sensor
-            stood still.
-        """
-
-    @abstractmethod
     def register(self, prepared: Any) -> Registration:
         """Find the pose of the next scan."""
 
     def submit(self, prepared: Any) -> None:
-        """See `OdometryInstance.submit`; `collect` does the work."""
         self.__submitted = prepared
 
     def collect(self) -> Registration:
-        """See `OdometryInstance.collect`."""
         return self.register(self.__submitted)
 
     def apply(self, selection: Selection) -> None:
-        """See `OdometryInstance.apply`."""
         self.configure(selection.parameters)
 
     def configure(self, parameters: ParameterSet) -> None:
@@ -385,23 +365,29 @@ class Odometry(Recorded):
         self.parameters |= self._known(parameters)
 
     def _known(self, parameters: ParameterSet) -> ParameterSet:
-        for name in parameters:
-            if name not in self.space.names:
-                raise OdometryError(
-                    f"{type(self).__name__} has no parameter {name!r}: "
-                    f"{nearest(name, self.space.names)}"
-                )
+        if unknown := [name for name in parameters if name not in self.space.names]:
+            help_ = nearest(unknown[0], self.space.names)
+            raise OdometryError(f"{type(self).__name__} has no parameter {unknown[0]!r}: {help_}")
         return parameters
+
+
+@functools.cache
+def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
+    """Import modules of a package that one of adaptune's extras installs; an error without it."""
+    try:
+        return tuple(map(import_module, modules))
+    except ImportError as error:
+        install = f"pip install 'adaptune[{extra}]'"
+        raise OdometryError(f"{extra} cannot be imported ({error}); run `{install}`") from error
 
 
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
     if isinstance(prepared, Scan):
-        columns = (prepared.times, prepared.rings, prepared.intensities)
-        prepared = (prepared.points, *columns, prepared.imu)
+        prepared = tuple(vars(prepared).values())
+    size = getattr(prepared, "nbytes", None)
+    if size is not None:
+        return int(size)
     if isinstance(prepared, tuple):
         return sum(map(prepared_bytes, prepared))
-    if prepared is None:
-        return 0
-    size = getattr(prepared, "nbytes", None)
-    return int(size) if size is not None else 1_000_000
+    return 0 if prepared is None or isinstance(prepared, int) else 1_000_000

@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from logging import getLogger
 from pathlib import Path
@@ -17,17 +17,10 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator
 
 from adaptune.geometry import Poses, invert
+from adaptune.odometry import isolation
 from adaptune.odometry.base import BaseSettings, Description, OdometryError, Recorded, Registration
 from adaptune.odometry.frame_check import check_frame
-from adaptune.odometry.isolation import (
-    ONE_THREAD,
-    Arguments,
-    Limits,
-    bounded,
-    last_lines,
-    pose_fault,
-    verdict,
-)
+from adaptune.odometry.isolation import Arguments, Limits
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.selection import Selection
@@ -91,14 +84,10 @@ class Command(Recorded):
     read
         Gives the recording at the first start; None if scans are only prepared.
     strict
-        Whether a run that fails is an error, not a fault.
-
-    Attributes
-    ----------
-    faults : list of str
-        What went wrong, with the last lines that the program wrote. Unknown poses are NaN.
+        Whether a run that fails is an error, not a fault, which quotes the program's last lines.
     """
 
+    faults: Sequence[str] = ()
     settings_type = Settings
 
     def __init__(
@@ -109,9 +98,7 @@ class Command(Recorded):
         read: Callable[[], ProgramInput] | None = None,
         strict: bool = False,
     ):
-        self.parameters = dict(parameters)
-        self.settings = settings
-        self.faults: list[str] = []
+        self.parameters, self.settings = dict(parameters), settings
         self._limits, self._read_input, self._strict = limits, read, strict
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_odom_own = np.eye(4)
@@ -123,12 +110,7 @@ class Command(Recorded):
 
     @staticmethod
     def check(settings: Settings, parameters: ParameterSet) -> None:
-        """Make sure that the program exists, and that every parameter reaches it.
-
-        Raises
-        ------
-        OdometryError
-        """
+        """Raise an `OdometryError` if there is no such program, or no way for a parameter to it."""
         program, *arguments = settings.command
         if shutil.which(program) is None:
             raise OdometryError(f"command: there is no program {program!r}")
@@ -141,22 +123,14 @@ class Command(Recorded):
         check_names(parameters, template, arguments)
 
     def prepare(self, scan: Scan) -> NDArray[np.int64]:
-        """See `Odometry.prepare`; only the scan's stamp is needed."""
-        return np.array(scan.stamp, np.int64)
+        return np.array(scan.stamp, np.int64)  # nothing else is needed
 
     def start(
         self,
-        prepared: NDArray[np.int64],
+        prepared: Any,
         T_odom_sensor: Poses,
         T_previous_current: Poses | None = None,  # noqa: ARG002
     ) -> None:
-        """See `Odometry.start`; the first call runs the program.
-
-        Raises
-        ------
-        OdometryError
-            If the program cannot run, or its poses belong to another frame.
-        """
         if self._T_own_sensor is None:
             if self._read_input is None:
                 raise OdometryError("a program runs on a recording, not on single scans")
@@ -166,21 +140,13 @@ class Command(Recorded):
         self._T_odom_own = T_odom_sensor @ invert(self._own(prepared))
 
     def submit(self, prepared: NDArray[np.int64]) -> None:
-        """See `OdometryInstance.submit`."""
         self._submitted = prepared
 
     def collect(self) -> Registration:
-        """See `OdometryInstance.collect`."""
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
 
     def apply(self, selection: Selection) -> None:  # noqa: ARG002
-        """Refuse.
-
-        Raises
-        ------
-        OdometryError
-        """
         raise OdometryError("a program that runs whole recordings cannot change its parameters")
 
     def _own(self, stamp: NDArray[np.int64]) -> Poses:
@@ -204,12 +170,13 @@ class Command(Recorded):
                 except (TrajectoryError, OdometryError) as error:
                     failure = str(error).replace(f"{folder}{os.sep}", "")
             with log.open("rb") as written:
-                words = last_lines(written)
+                words = isolation.last_lines(written)
         known = np.isfinite(T_own_sensor[:, 0, 0])
         if failure is None and known.mean() < _COVERAGE:
+            seconds = 1e-9 * (given.stamps - given.stamps[0])
             failure = (
                 f"{self.settings.output} has poses for {known.sum()} of {len(known)} scans, the "
-                f"last at {_seconds(given.stamps, known)}"
+                f"last at {seconds[known][-1]:.1f} s of {seconds[-1]:.1f} s"
             )
         if failure is not None:
             self._fault(failure, words)
@@ -220,12 +187,8 @@ class Command(Recorded):
         return T_own_sensor
 
     def _command(self, given: ProgramInput, output: Path, folder: Path) -> list[str]:
-        values: dict[str, Any] = {
-            "input": given.path.resolve(),
-            "output": output,
-            "points": given.points,
-            "imu": given.imu,
-        }
+        values: dict[str, Any] = {"input": given.path.resolve(), "output": output}
+        values |= {"points": given.points, "imu": given.imu}
         if self.settings.template is not None:
             template = Template(Path(self.settings.template))
             values["parameters"] = folder / template.path.name
@@ -236,27 +199,26 @@ class Command(Recorded):
     def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:
         """Run the program; how it ended if not well."""
         seconds = self._limits.seconds * n
+        late = f"it took longer than isolation.seconds = {self._limits.seconds:g} for each scan"
         with log.open("wb") as file:
             process = subprocess.Popen(
                 # The limit on its CPU time holds even if this process is killed.
-                bounded(command, self._limits.memory, f"-t {round(seconds) + 1}"),
+                isolation.bounded(command, self._limits.memory, f"-t {round(seconds) + 1}"),
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
-                env=os.environ | ONE_THREAD,
+                env=os.environ | isolation.ONE_THREAD,
                 start_new_session=True,
             )
             with _ending(process):
                 try:
                     code = process.wait(seconds)
                 except subprocess.TimeoutExpired:
-                    return f"it took longer than isolation.seconds = {seconds / n:g} for each scan"
-        if code == 0:
-            return None
+                    return late
         if code == -signal.SIGXCPU:
-            return f"it took longer than isolation.seconds = {seconds / n:g} for each scan"
-        return verdict(code)
+            return late
+        return isolation.verdict(code) if code else None
 
     def _read(self, path: Path, stamps: NDArray[np.int64]) -> Poses:
         if not path.exists():
@@ -264,16 +226,14 @@ class Command(Recorded):
         if self.settings.format == "kitti":
             poses = read_kitti(path)
             if len(poses) > len(stamps):
-                raise OdometryError(
-                    f"{self.settings.output} has {len(poses)} poses without stamps for "
-                    f"{len(stamps)} scans"
-                )
+                counted = f"{len(poses)} poses without stamps for {len(stamps)} scans"
+                raise OdometryError(f"{self.settings.output} has {counted}")
             stamps_own = stamps[: len(poses)]
         else:
             trajectory = read_tum(path)
             poses, stamps_own = trajectory.T_world_sensor, trajectory.stamps
         for number, T in enumerate(poses):
-            if what := pose_fault(T):
+            if what := isolation.pose_fault(T):
                 raise OdometryError(f"{self.settings.output}, pose {number + 1}: {what}")
         if self.settings.extrinsic is not None:
             poses = poses @ to_pose(self.settings.extrinsic)
@@ -288,7 +248,7 @@ class Command(Recorded):
         if self._strict:
             raise OdometryError(self._message(what, words))
         what = f"{what}: {words}" if words else what
-        self.faults.append(what)
+        self.faults = [*self.faults, what]
         _log.warning("%s with %s: %s", self.settings.command[0], self.parameters, what)
 
 
@@ -317,22 +277,12 @@ def _at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
     return T
 
 
-def _seconds(stamps: NDArray[np.int64], known: NDArray[np.bool_]) -> str:
-    last = stamps[np.flatnonzero(known)[-1]]
-    return f"{1e-9 * (last - stamps[0]):.1f} s of {1e-9 * (stamps[-1] - stamps[0]):.1f} s"
-
-
 @contextmanager
 def _ending(process: subprocess.Popen[bytes]) -> Iterator[None]:
     """End a program and its children after the block, or when this process receives SIGTERM."""
 
-    def end() -> None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
     def terminate(number: int, _: object) -> None:
-        end()
+        isolation.end_group(process)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
@@ -342,6 +292,6 @@ def _ending(process: subprocess.Popen[bytes]) -> Iterator[None]:
     try:
         yield
     finally:
-        end()
+        isolation.end_group(process)
         if before is not None:
             signal.signal(signal.SIGTERM, before)

@@ -50,17 +50,14 @@ def _watch(connection: socket.socket, limits: Limits) -> None:
             _run(connection, output.fileno(), limits)
         _, status = os.waitpid(child, 0)
         if status:
-            what = _verdict(os.waitstatus_to_exitcode(status), limits)
+            code = os.waitstatus_to_exitcode(status)
+            what = verdict(code)
+            if code == -signal.SIGALRM:
+                what = f"a scan took longer than isolation.seconds = {limits.seconds:g}"
             if last := last_lines(output):
                 what = f"{what}: {last}"
             with contextlib.suppress(OSError), connection.makefile("wb") as writer:
                 wire.send(writer, {"type": "fault", "message": what})
-
-
-def _verdict(code: int, limits: Limits) -> str:
-    if code == -signal.SIGALRM:
-        return f"a scan took longer than isolation.seconds = {limits.seconds:g}"
-    return verdict(code)
 
 
 def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:

@@ -12,10 +12,6 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
 
     The rotation that aligns displacements over a metre with those of the reference (Kabsch, Acta
     Cryst. 1976) must not remove most of their difference.
-
-    Raises
-    ------
-    OdometryError
     """
     if T_ref_sensor is None:
         return

@@ -53,20 +53,19 @@ class HandOver(Recorded):
     @property
     def usage(self) -> Usage:
         """CPU time of all instances together, and the most memory that one of them took."""
-        return _sum([self._ended_usage, *(one.usage for one in self._instances)])
+        return Usage.total([self._ended_usage, *(one.usage for one in self._instances)], max)
 
     @property
     def _instances(self) -> list[OdometryInstance]:
         return [self._current, *([self._successor.odometry] if self._successor else [])]
 
     def prepare(self, scan: Scan) -> PreparedScan:
-        """See `Odometry.prepare`."""
         return PreparedScan.by(self._first, scan)
 
     def start(
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`; a successor that is being warmed up takes over."""
+        # A successor that is being warmed up takes over.
         if self._successor is not None:
             self._replace(self._successor.odometry)
         self._current.start(prepared.prepared, T_odom_sensor, T_previous_current)
@@ -74,12 +73,10 @@ class HandOver(Recorded):
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: PreparedScan) -> None:
-        """See `OdometryInstance.submit`."""
         self._submitted = prepared
         self._current.submit(prepared.prepared)
 
     def collect(self) -> Registration:
-        """See `OdometryInstance.collect`."""
         successor = self._successor
         # An instance in another process registers the new scan meanwhile.
         if successor is not None:
@@ -96,7 +93,7 @@ class HandOver(Recorded):
         return Registration(T_odom_sensor, registered)
 
     def apply(self, selection: Selection) -> None:
-        """Begin to replace the instance, unless it has or will have these parameters."""
+        # Nothing changes if the instance has or will have these parameters.
         wanted = self.parameters | selection.parameters
         if wanted == self.parameters:
             return
@@ -110,15 +107,12 @@ class HandOver(Recorded):
         if not self._recent:
             self._replace(instance)
             return
-        successor = self._recent.replay_to(instance)
-        if self._catch_up_scans:
-            self._successor = successor
-        else:
-            successor.catch_up()
-            self._take_over(successor)
+        self._successor = self._recent.replay_to(instance)
+        if not self._catch_up_scans:
+            self._successor.catch_up()
+            self._take_over(self._successor)
 
     def close(self) -> None:
-        """See `OdometryInstance.close`."""
         for instance in self._instances:
             instance.close()
 
@@ -138,9 +132,4 @@ class HandOver(Recorded):
     def _end(self, instance: OdometryInstance) -> None:
         instance.close()
         self._ended_faults += instance.faults
-        self._ended_usage = _sum([self._ended_usage, instance.usage])
-
-
-def _sum(usages: list[Usage]) -> Usage:
-    memory = [usage.memory for usage in usages if usage.memory is not None]
-    return Usage(sum(usage.cpu for usage in usages), max(memory, default=None))
+        self._ended_usage = Usage.total([self._ended_usage, instance.usage], max)

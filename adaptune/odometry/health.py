@@ -46,11 +46,7 @@ class HealthCheck(BaseModel):
     max_unregistered: int = Field(10, ge=1)
 
     def exceeded(
-        self,
-        velocity: Poses,
-        last_velocity: Poses | None,
-        elapsed: float,
-        turn_rate: float = 0.0,
+        self, velocity: Poses, last_velocity: Poses | None, elapsed: float, turn_rate: float = 0.0
     ) -> str | None:
         """The bound that this motion exceeds, if any.
 
@@ -81,35 +77,19 @@ class HealthCheck(BaseModel):
         return bool(max(moved, rotation_angle(T_previous_current)) < _STILL)
 
     def frozen(self, seconds: float, speed: float) -> bool:
-        """Whether a pose has frozen, and the robot not stopped.
-
-        Parameters
-        ----------
-        seconds
-            How long it has been still.
-        speed
-            Metres a second, of the last step before.
-        """
+        """Whether a pose that stands still for `seconds`, after a step at `speed`, has frozen."""
         return speed > _WALK and seconds > self.max_freeze
 
 
 class Guard:
-    """Checks motion after motion, and remembers the last healthy one.
-
-    Parameters
-    ----------
-    check
-        The bounds.
-    """
+    """Checks motion after motion, and remembers the last healthy one."""
 
     def __init__(self, check: HealthCheck):
         self._health = check
-        self._T_previous_current = np.eye(4)
-        self._seconds = 1.0
-        self._velocity: NDArray[np.float64] | None = None
-        self._since = 0.0
+        # The last healthy motion, and the last one that was not still, each with its seconds.
+        self._healthy: tuple[Poses, float] | None = None
         self._moving: tuple[Poses, float] | None = None
-        self._still = 0.0
+        self._since = self._still = 0.0
         self._unregistered = 0
 
     def check(
@@ -130,16 +110,15 @@ class Guard:
         self._unregistered = 0 if registered else self._unregistered + 1
         if not np.isfinite(T_previous_current).all():
             return "no_pose"
-        velocity = T_previous_current[:3, 3] / elapsed
+        motion = T_previous_current, elapsed
+        last = None if self._healthy is None else _velocity(*self._healthy)
         turn_rate = float(rotation_angle(T_previous_current)) / elapsed
-        what = self._health.exceeded(velocity, self._velocity, self._since, turn_rate)
+        what = self._health.exceeded(_velocity(*motion), last, self._since, turn_rate)
         if what is not None:
             return what
-        if self._frozen(T_previous_current, elapsed):
+        if self._frozen(*motion):
             return "max_freeze"
-        self._T_previous_current, self._seconds = T_previous_current, elapsed
-        self._velocity = velocity
-        self._since = 0.0
+        self._healthy, self._since = motion, 0.0
         if self._unregistered >= self._health.max_unregistered:
             self._unregistered = 0
             return "max_unregistered"
@@ -155,13 +134,17 @@ class Guard:
         T, seconds = self._moving
         if not self._health.frozen(self._still, float(np.linalg.norm(T[:3, 3])) / seconds):
             return False
-        self._T_previous_current, self._seconds = T, seconds
-        self._velocity, self._still = T[:3, 3] / seconds, 0.0
+        self._healthy, self._still = self._moving, 0.0
         return True
 
     def go_on(self, elapsed: float) -> Poses:
         """The last healthy motion, for so many seconds."""
-        return scale(self._T_previous_current, elapsed / self._seconds)
+        T_previous_current, seconds = self._healthy or (np.eye(4), 1.0)
+        return scale(T_previous_current, elapsed / seconds)
+
+
+def _velocity(T_previous_current: Poses, seconds: float) -> Poses:
+    return T_previous_current[:3, 3] / seconds
 
 
 def unhealthy(
@@ -170,7 +153,7 @@ def unhealthy(
     stamps: NDArray[np.int64],
     registered: NDArray[np.bool_],
 ) -> dict[str, int]:
-    """How often the check finds each fault in a trajectory.
+    """How often a `Guard` finds each fault in a trajectory of n poses.
 
     Parameters
     ----------
@@ -178,15 +161,8 @@ def unhealthy(
         The bounds.
     T_previous_current
         Motions of shape (n - 1, 4, 4).
-    stamps
-        Nanoseconds, of shape (n,).
-    registered
-        Of shape (n,).
-
-    Returns
-    -------
-    dict
-        See `Guard.check`.
+    stamps, registered
+        Of shape (n,); stamps in nanoseconds.
     """
     guard = Guard(check)
     elapsed = (np.diff(stamps) * 1e-9).tolist()

@@ -70,7 +70,8 @@ class Isolated(Recorded):
     """An odometry that lives in another process, a new one with every start.
 
     If that process ends, or returns a pose that is none, this is a *fault*: the pose of that scan
-    is NaN, and so are all that follow until a new start.
+    is NaN, and so are all that follow until a new start. A fault quotes the last lines that the
+    odometry wrote.
 
     Parameters
     ----------
@@ -80,20 +81,15 @@ class Isolated(Recorded):
         See `Odometry`.
     limits
         What each process may use.
-
-    Attributes
-    ----------
-    faults : list of str
-        What went wrong, each with the last lines that the odometry wrote.
     """
 
+    faults: Sequence[str] = ()
     _fresh = True
     """Whether each start needs a new process."""
 
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
-        self.name: str | None = name
+        self.name = name
         self.parameters = dict(parameters)
-        self.faults: list[str] = []
         self._cpu = self._cpu_before = self._memory = 0.0
         self._settings = settings.model_dump(mode="json")
         self._limits = limits
@@ -104,32 +100,19 @@ class Isolated(Recorded):
         """CPU time and peak memory that the other processes report."""
         return Usage(self._cpu, self._memory)
 
-    @property
-    def _label(self) -> str:
-        """Name in messages."""
-        return str(self.name)
-
     def prepare(self, scan: Scan) -> Scan:
-        """See `Odometry.prepare`; the other process prepares."""
-        return scan
+        return scan  # the other process prepares
 
     def start(
         self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`.
-
-        Raises
-        ------
-        OdometryError
-            If the odometry refuses its parameters or the scan.
-        """
         if self._fresh:
             self.close()
         if self._stream is None:
             if len(self.faults) >= MOST_FAULTS:
                 return
             self._stream = self._connect()
-            self._ask(wire.hello(self.name, self.parameters, self._settings))
+            self._ask(self._hello())
         self._ask(
             {"type": "start", "stamp": prepared.stamp},
             **wire.scan_arrays(prepared),
@@ -138,15 +121,13 @@ class Isolated(Recorded):
         )
 
     def submit(self, prepared: Scan) -> None:
-        """See `OdometryInstance.submit`."""
         self._submitted = prepared.stamp
         self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
 
     def collect(self) -> Registration:
-        """See `OdometryInstance.collect`."""
-        answer = self._receive()
+        answer, lost = self._receive(), Registration(np.full((4, 4), np.nan), registered=False)
         if answer is None:
-            return Registration(np.full((4, 4), np.nan), registered=False)
+            return lost
         try:
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
@@ -155,24 +136,22 @@ class Isolated(Recorded):
             lacking = isinstance(error, KeyError)
             what = f"without {error}" if lacking else f"of other types ({error})"
             self._fault(f"it gave an answer {what}")
-            return Registration(np.full((4, 4), np.nan), registered=False)
+            return lost
         wrong = pose_fault(T_odom_sensor)
         if late:
             wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
         if wrong is not None:
             self._fault(f"it gave a pose {wrong}")
-            return Registration(np.full((4, 4), np.nan), registered=False)
+            return lost
         self._cpu = self._cpu_before + cpu
         self._memory = max(self._memory, memory)
         return Registration(T_odom_sensor.copy(), bool(registered))
 
     def apply(self, selection: Selection) -> None:
-        """See `OdometryInstance.apply`."""
         self.parameters |= selection.parameters
         self._ask({"type": "configure", "parameters": selection.parameters})
 
     def close(self) -> None:
-        """End the other process."""
         if self._stream is not None:
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -181,6 +160,9 @@ class Isolated(Recorded):
 
     def __del__(self) -> None:
         self.close()
+
+    def _hello(self) -> dict[str, Any]:
+        return wire.hello(self.name, self.parameters, self._settings)
 
     def _ask(self, header: dict[str, Any], **arrays: Any) -> None:
         self._send(header, **arrays)
@@ -208,17 +190,23 @@ class Isolated(Recorded):
         if answer is None:
             self._fault(self._verdict(what))
             return None
-        if answer.header.get("type") == "fault":
-            self._fault(str(answer.header.get("message")))
+        kind, message = map(answer.header.get, ("type", "message"))
+        if kind == "refused":
+            raise OdometryError(f"{self.name}: {message}")
+        if kind == "fault":
+            self._fault(str(message))
             return None
-        if answer.header.get("type") == "refused":
-            raise OdometryError(f"{self._label}: {answer.header.get('message')}")
         return answer
 
     def _connect(self) -> BinaryIO:
         """A stream to a new process, which first receives a hello."""
-        assert self.name is not None
-        return _fork(self.name, self._limits)
+        if fork_server(self.name).process.poll() is not None:
+            fork_server.cache_clear()
+        here, there = socket.socketpair()
+        with here, there:
+            request = self._limits.model_dump_json().encode()
+            socket.send_fds(fork_server(self.name).control, [request], [there.fileno()])
+            return cast("BinaryIO", here.makefile("rwb"))
 
     def _verdict(self, what: str) -> str:
         """Add to `what` how the process ended; here the process itself reports that."""
@@ -226,10 +214,10 @@ class Isolated(Recorded):
 
     def _fault(self, what: str) -> None:
         self.close()
-        self.faults.append(what)
-        _log.warning("%s with %s: %s", self._label, self.parameters, what)
+        self.faults = [*self.faults, what]
+        _log.warning("%s with %s: %s", self.name, self.parameters, what)
         if len(self.faults) == MOST_FAULTS:
-            _log.warning("%s: fault number %d, it does not start again", self._label, MOST_FAULTS)
+            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
 
 
 def pose_fault(T_odom_sensor: Poses) -> str | None:
@@ -255,6 +243,13 @@ def bounded(command: Sequence[str], memory: float, *limits: str) -> list[str]:
     """A command with a limit on its address space in gigabytes, and further limits of ulimit."""
     bounds = "; ".join(f"ulimit {limit}" for limit in (f"-v {round(memory * 1e6)}", *limits))
     return ["/bin/sh", "-c", f'{bounds}; exec "$@"', "sh", *command]
+
+
+def end_group(process: subprocess.Popen[bytes]) -> None:
+    """End a process that leads a session, and its children."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def last_lines(output: BinaryIO) -> str:
@@ -287,14 +282,3 @@ def fork_server(name: str) -> ForkServer:
             start_new_session=True,
         )
     return ForkServer(process, here)
-
-
-def _fork(name: str, limits: Limits) -> BinaryIO:
-    """A stream to a fresh process."""
-    if fork_server(name).process.poll() is not None:
-        fork_server.cache_clear()
-    here, there = socket.socketpair()
-    with here, there:
-        request = limits.model_dump_json().encode()
-        socket.send_fds(fork_server(name).control, [request], [there.fileno()])
-        return cast("BinaryIO", here.makefile("rwb"))

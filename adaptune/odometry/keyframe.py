@@ -4,14 +4,33 @@ from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
-from adaptune.odometry.base import Odometry, Registration
+from adaptune.odometry.base import BaseSettings, Odometry, Registration
 from adaptune.sequence.scan import Scan
 
 JITTER = 0.1
 """Two times between scans count as the same if they differ by no more than this share: a LiDAR
 turns more steadily than its stamps say, and a missing scan doubles the time."""
+
+
+class Settings(BaseSettings):
+    """Settings of keyframe odometries, in metres."""
+
+    downsampling: float = Field(0.5, gt=0)
+    min_range: float = Field(1.0, ge=0)
+    iterations: int = Field(20, ge=1)
+
+
+class Prepared(NamedTuple):
+    """A downsampled cloud, whether it has enough points, its bytes, and its tree if it has one."""
+
+    stamp: int
+    cloud: Any
+    usable: bool
+    nbytes: int
+    tree: Any = None
 
 
 class Alignment(NamedTuple):
@@ -25,8 +44,8 @@ class KeyframeOdometry(Odometry):
     """Scan-to-keyframe odometry with a constant-velocity prediction.
 
     A scan becomes the new keyframe when it lies `keyframe_interval` metres or more from the old
-    one. Where scans are missing, the prediction lasts until the next one; for that, what `prepare`
-    returns has a `stamp` in nanoseconds. After Koide et al., IROS 2021.
+    one. Where scans are missing, the prediction lasts until the next one. What `prepare` returns
+    has a `stamp` in nanoseconds, and is `usable` or not. After Koide et al., IROS 2021.
     """
 
     live = True
@@ -35,7 +54,6 @@ class KeyframeOdometry(Odometry):
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`."""
         self._begin_keyframe(prepared, T_odom_sensor)
         self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
         # The given motion goes on for one scan, whatever time it took.
@@ -47,14 +65,13 @@ class KeyframeOdometry(Odometry):
         self._T_keyframe_sensor = np.eye(4)
 
     def register(self, prepared: Any) -> Registration:
-        """See `Odometry.register`."""
         elapsed, self._stamp = prepared.stamp - self._stamp, prepared.stamp
         T_keyframe_guess = self._T_keyframe_sensor @ self._predict(elapsed)
-        if not self.usable(prepared):
+        if not prepared.usable:
             self._T_keyframe_sensor = T_keyframe_guess
             return Registration(self._T_odom_keyframe @ T_keyframe_guess, registered=False)
         T_target_source, ok = T_keyframe_guess, False
-        if self.usable(self._keyframe):
+        if self._keyframe.usable:
             T_target_source, ok = self.align(self._keyframe, prepared, T_keyframe_guess)
         if ok and np.isfinite(T_target_source).all():
             T_keyframe_sensor = rectify(T_target_source)
@@ -76,10 +93,6 @@ class KeyframeOdometry(Odometry):
             return self._T_previous_current
         share = elapsed / self._duration
         return scale(self._T_previous_current, 1.0 if abs(share - 1.0) <= JITTER else share)
-
-    @abstractmethod
-    def usable(self, prepared: Any) -> bool:
-        """Whether there is enough in a scan to register it."""
 
     @abstractmethod
     def align(self, target: Any, source: Any, T_target_guess: Poses) -> Alignment:

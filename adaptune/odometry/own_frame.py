@@ -8,17 +8,15 @@ import numpy as np
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import Odometry, Registration
 
+NO_IMU = "{} needs an IMU, and the scans do not bring along what one measured"
+
 
 class OwnFrameOdometry(Odometry):
     """An odometry that can begin only at rest, in its own frame, and with a usable scan.
 
     The first pose that it returns places its frame. Where it returns none, the last motion goes
-    on.
+    on. What `prepare` returns is `usable` or not.
     """
-
-    @abstractmethod
-    def _usable(self, prepared: Any) -> bool:
-        """Whether it can begin with a scan."""
 
     @abstractmethod
     def _begin(self, prepared: Any) -> None:
@@ -31,7 +29,6 @@ class OwnFrameOdometry(Odometry):
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """See `Odometry.start`."""
         self._T_odom_sensor = T_odom_sensor
         self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
         self._T_odom_own: Poses | None = None
@@ -39,7 +36,6 @@ class OwnFrameOdometry(Odometry):
         self._correct(prepared)
 
     def register(self, prepared: Any) -> Registration:
-        """See `Odometry.register`."""
         T_odom_previous = self._T_odom_sensor
         self._T_odom_sensor = T_odom_previous @ self._T_previous_current
         registered = self._correct(prepared)
@@ -50,7 +46,7 @@ class OwnFrameOdometry(Odometry):
     def _correct(self, prepared: Any) -> bool:
         """Correct the predicted pose; False if the odometry returned none."""
         if not self._begun:
-            if not self._usable(prepared):
+            if not prepared.usable:
                 return False
             self._begin(prepared)
             self._begun = True

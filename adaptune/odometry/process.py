@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import signal
 import socket
 import subprocess
 import tempfile
@@ -11,17 +10,9 @@ from typing import Any, BinaryIO, Self, cast
 
 from pydantic import Field, model_validator
 
-from adaptune.odometry import wire
+from adaptune.odometry import isolation, wire
 from adaptune.odometry.base import BaseSettings, Description, OdometryError
-from adaptune.odometry.isolation import (
-    ONE_THREAD,
-    Arguments,
-    Isolated,
-    Limits,
-    bounded,
-    last_lines,
-    verdict,
-)
+from adaptune.odometry.isolation import Arguments, Isolated, Limits
 from adaptune.space import ParameterSet
 
 _FIRST_ANSWER = 60.0
@@ -29,13 +20,7 @@ _FIRST_ANSWER = 60.0
 
 
 def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
-    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``.
-
-    Raises
-    ------
-    OdometryError
-        If it is neither.
-    """
+    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``; else an error."""
     kind, colon, rest = address.partition(":")
     if kind == "unix" and colon and rest:
         return socket.AF_UNIX, rest
@@ -87,59 +72,29 @@ class Process(Isolated):
     _fresh = False
 
     def __init__(self, parameters: ParameterSet, settings: Settings, limits: Limits):
-        self.name = None
-        self.parameters = dict(parameters)
-        self.faults: list[str] = []
-        self._cpu = self._cpu_before = self._memory = 0.0
-        self._settings = settings.settings
-        self._limits = limits
+        name = settings.command[0] if settings.command else str(settings.address)
+        super().__init__(name, parameters, settings, limits)
         self._reach = settings
-        self._stream: BinaryIO | None = None
         self._socket: socket.socket | None = None
         self._program: subprocess.Popen[bytes] | None = None
         self._written: Any = None
 
-    @property
-    def _label(self) -> str:
-        return self._reach.command[0] if self._reach.command else str(self._reach.address)
-
     @staticmethod
     def describe(settings: Settings) -> Description:
-        """What the program reports about itself.
-
-        Raises
-        ------
-        OdometryError
-            If the program cannot be reached, or does not describe itself.
-        """
+        """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json())
 
-    def ask(self) -> Description:
-        """Let the program describe itself."""
-        self._stream = self._connect()
-        try:
-            self._send(wire.hello(None, self.parameters, self._settings))
-            answer = self._receive()
-            if answer is None:
-                raise OdometryError(self.faults[-1])
-            try:
-                return wire.announced(answer)
-            except wire.WireError as error:
-                raise OdometryError(str(error)) from error
-        finally:
-            self.close()
-
     def close(self) -> None:
-        """End the conversation, and the program if this instance started it."""
         super().close()
         if self._socket is not None:
             self._socket.close()
             self._socket = None
         if self._program is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._program.pid, signal.SIGKILL)
-            self._program.wait()
+            isolation.end_group(self._program)
             self._program = None
+
+    def _hello(self) -> dict[str, Any]:
+        return wire.hello(None, self.parameters, self._reach.settings)
 
     def _connect(self) -> BinaryIO:
         if self._reach.command is not None:
@@ -161,11 +116,11 @@ class Process(Isolated):
         self._written = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
         with there:
             self._program = subprocess.Popen(
-                bounded(command, self._limits.memory),
+                isolation.bounded(command, self._limits.memory),
                 stdin=there.fileno(),
                 stdout=there.fileno(),
                 stderr=self._written,
-                env=os.environ | ONE_THREAD,
+                env=os.environ | isolation.ONE_THREAD,
                 start_new_session=True,
             )
         return here
@@ -181,12 +136,20 @@ class Process(Isolated):
         if self._program is None:
             return what.replace("its process ended", "it ended the conversation")
         with contextlib.suppress(subprocess.TimeoutExpired):
-            what = verdict(self._program.wait(0.5))
-        words = last_lines(self._written)
+            what = isolation.verdict(self._program.wait(0.5))
+        words = isolation.last_lines(self._written)
         return f"{what}: {words}" if words else what
 
 
 @cache
 def _describe(settings: str) -> Description:
-    reach = Settings.model_validate_json(settings)
-    return Process({}, reach, Limits()).ask()
+    program = Process({}, Settings.model_validate_json(settings), Limits())
+    program._stream = program._connect()
+    try:
+        program._send(program._hello())
+        answer = program._receive()
+        if answer is None:
+            raise OdometryError(program.faults[-1])
+        return wire.announced(answer)
+    finally:
+        program.close()

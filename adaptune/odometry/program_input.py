@@ -18,46 +18,28 @@ from adaptune.sequence.sequence import Sequence
 
 
 class ProgramInput(NamedTuple):
-    """A sequence as a program reads it.
-
-    Attributes
-    ----------
-    path : Path
-        The recording.
-    points : str
-        Topic of its clouds.
-    imu : str
-        Topic of its IMU; empty if there is none.
-    stamps : ndarray of shape (n,)
-        Stamps of the scans in nanoseconds.
-    T_ref_sensor : ndarray of shape (n, 4, 4), optional
-        Reference poses, NaN where there is none.
-    """
+    """A recording as a program reads it, the topics in it, and what is known of its n scans."""
 
     path: Path
     points: str
-    imu: str
-    stamps: NDArray[np.int64]
-    T_ref_sensor: Poses | None
+    imu: str  # empty if there is none
+    stamps: NDArray[np.int64]  # nanoseconds, of shape (n,)
+    T_ref_sensor: Poses | None  # of shape (n, 4, 4), NaN where there is no reference
 
 
 def program_input(
     sequence: Sequence, config: SequenceConfig, about: Any, folder: Path, layout: Layout
 ) -> ProgramInput:
-    """Find or write the recording of a sequence for a program.
+    """Find or write the recording of a sequence for a program that reads `layout`.
 
     Parameters
     ----------
-    sequence
-        What `config` describes.
-    config
-        The sequence's description.
+    sequence, config
+        The sequence and its description.
     about
         All that the sequence depends on, as plain data. A recording with another is replaced.
     folder
         Where to keep what is written. Processes wait for each other.
-    layout
-        What the program reads.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     own = _own_bag(config, layout)

@@ -6,63 +6,43 @@ called: hence the pinned version.
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import BaseSettings, OdometryError
-from adaptune.odometry.own_frame import OwnFrameOdometry
+from adaptune.odometry.base import (
+    MIN_POINTS,
+    BaseSettings,
+    OdometryError,
+    RangeSettings,
+    import_extra,
+)
+from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
-
-MIN_POINTS = 20
 
 _LATER = 10**9
 """Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
 
 
-class Settings(BaseSettings):
+class Settings(RangeSettings):
     """Settings of RKO-LIO.
 
     Attributes
     ----------
-    min_range, max_range : float
-        Metres.
-    deskew : bool
-        Take the motion out of scans whose points have times.
     double_downsample : bool
         Register fewer points than the map receives; sparse LiDARs may do better without.
     """
 
-    min_range: float = Field(1.0, ge=0)
-    max_range: float = Field(100.0, gt=0)
-    deskew: bool = True
     double_downsample: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A scan in its types.
-
-    Attributes
-    ----------
-    points : ndarray of shape (n, 3)
-        float64 metres.
-    stamps : list of int
-        Nanoseconds, of every point.
-    begin, end : int
-        Nanoseconds, of the first and the last one.
-    usable : bool
-        Whether enough points are in range.
-    imu : Imu
-    """
+class Prepared(NamedTuple):
+    """A scan in its types: float64 points, and the nanoseconds of all, the first and the last."""
 
     points: NDArray[np.float64]
     stamps: list[int]
@@ -77,15 +57,8 @@ class Prepared:
         return 256 + self.points.nbytes + 40 * len(self.stamps) + self.imu.nbytes
 
 
-@cache
 def _bindings() -> Any:
-    try:
-        from rko_lio import rko_lio_pybind
-    except ImportError as error:
-        raise OdometryError(
-            f"RKO-LIO cannot be imported ({error}); run `pip install 'adaptune[rko_lio]'`"
-        ) from error
-    return rko_lio_pybind
+    return import_extra("rko_lio", "rko_lio.rko_lio_pybind")[0]
 
 
 with contextlib.suppress(OdometryError):
@@ -101,15 +74,13 @@ class RkoLio(OwnFrameOdometry):
     pose belongs to a scan's end.
     """
 
-    space = ParameterSpace(
-        {
-            "voxel_size": Float(low=0.1, high=3.0, baseline=1.0, log=True),
-            "max_correspondence_distance": Float(low=0.1, high=3.0, baseline=0.5, log=True),
-            "max_expected_jerk": Float(low=0.3, high=30.0, baseline=3.0, log=True),
-            "min_beta": Float(low=10.0, high=5000.0, baseline=200.0, log=True),
-        }
+    space = ParameterSpace.of(
+        voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True),
+        max_correspondence_distance=Float(low=0.1, high=3.0, baseline=0.5, log=True),
+        max_expected_jerk=Float(low=0.3, high=30.0, baseline=3.0, log=True),
+        min_beta=Float(low=10.0, high=5000.0, baseline=200.0, log=True),
     )
-    settings_type: ClassVar[type[BaseSettings]] = Settings
+    settings_type = Settings
     live = False
     needs_imu = True
 
@@ -120,11 +91,8 @@ class RkoLio(OwnFrameOdometry):
         _bindings()
 
     def prepare(self, scan: Scan) -> Prepared:
-        """See `Odometry.prepare`."""
         if scan.imu is None:
-            raise OdometryError(
-                "rko_lio needs an IMU, and the scans do not bring along what one measured"
-            )
+            raise OdometryError(NO_IMU.format("rko_lio"))
         points = scan.points.astype(np.float64)
         n_in_range = count_within(points, self.settings.min_range, self.settings.max_range)
         stamps = np.full(len(scan), scan.stamp + _LATER, np.int64)
@@ -133,11 +101,7 @@ class RkoLio(OwnFrameOdometry):
         begin = end = scan.stamp + _LATER
         if len(scan):
             begin, end = int(stamps.min()), int(stamps.max())
-        usable = n_in_range >= MIN_POINTS
-        return Prepared(points, stamps.tolist(), begin, end, usable, scan.imu)
-
-    def _usable(self, prepared: Prepared) -> bool:
-        return prepared.usable
+        return Prepared(points, stamps.tolist(), begin, end, n_in_range >= MIN_POINTS, scan.imu)
 
     def _begin(self, prepared: Prepared) -> None:
         bindings = _bindings()
@@ -159,12 +123,9 @@ class RkoLio(OwnFrameOdometry):
 
     def _process(self, prepared: Prepared) -> Poses | None:
         imu = prepared.imu
-        measured = [
-            *self._early,
-            *zip(
-                (imu.stamps + _LATER).tolist(), imu.acceleration, imu.angular_velocity, strict=True
-            ),
-        ]
+        stamps = (imu.stamps + _LATER).tolist()
+        new = zip(stamps, imu.acceleration, imu.angular_velocity, strict=True)
+        measured = [*self._early, *new]
         # A measurement after the scan's end belongs to the motion to the next one.
         self._early = [one for one in measured if one[0] >= prepared.end]
         for stamp, acceleration, gyro in measured[: len(measured) - len(self._early)]:
@@ -172,23 +133,17 @@ class RkoLio(OwnFrameOdometry):
         if not prepared.usable:
             return None
         bindings = _bindings()
+        points, times = bindings._Vector3sVector(prepared.points), prepared.stamps
+        scan = points, bindings._VectorInt64(times), prepared.begin, prepared.end
         try:
-            self._lio.register_scan(
-                self._T_base_sensor,
-                bindings._Vector3sVector(prepared.points),
-                bindings._VectorInt64(prepared.stamps),
-                prepared.begin,
-                prepared.end,
-            )
+            self._lio.register_scan(self._T_base_sensor, *scan)
         except (bindings.InputError, bindings.RegistrationError):
             return None
-        T_own_base: Poses = self._lio.pose()
-        return T_own_base @ self._T_base_sensor
+        return np.asarray(self._lio.pose() @ self._T_base_sensor)
 
 
 def _levelling(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The smallest rotation that takes a direction of shape (3,) to +z."""
     if not np.linalg.norm(up) > 0:
         return np.eye(3)
-    R: NDArray[np.float64] = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-    return R
+    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix())

@@ -41,11 +41,6 @@ def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
         The odometry.
     ready
         Called with the address when connections are accepted.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such odometry, or the address is not available.
     """
     odometry_class(name)
     family, where = parse_address(address)

@@ -3,7 +3,7 @@
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,14 @@ from adaptune import yaml
 from adaptune.odometry.base import OdometryError
 from adaptune.space import ParameterSet, nearest
 
-SUFFIXES = (".yaml", ".yml", ".json", ".toml")
+_YAML = (lambda text: yaml.Document(text).data, yaml.dump)
+_FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    ".yaml": _YAML,
+    ".yml": _YAML,
+    ".json": (json.loads, lambda data: json.dumps(data, indent=2) + "\n"),
+    ".toml": (tomllib.loads, tomli_w.dumps),
+}
+"""Functions that read and write a format, by a file's suffix."""
 
 _ROS2 = "ros__parameters"
 
@@ -31,40 +38,25 @@ class Template:
     Parameters
     ----------
     path
-        Its suffix gives the format.
-
-    Raises
-    ------
-    OdometryError
-        If it cannot be read.
+        Its suffix gives the format. There is an `OdometryError` if it cannot be read.
     """
 
     def __init__(self, path: Path):
         self.path = path
-        if path.suffix not in SUFFIXES:
-            raise OdometryError(f"{path}: a template is a file of {', '.join(SUFFIXES)}")
+        if path.suffix not in _FORMATS:
+            raise OdometryError(f"{path}: a template is a file of {', '.join(_FORMATS)}")
+        read, self._write = _FORMATS[path.suffix]
         try:
-            text = path.read_text(encoding="utf-8")
-            if path.suffix == ".toml":
-                self._data: Any = tomllib.loads(text)
-            elif path.suffix == ".json":
-                self._data = json.loads(text)
-            else:
-                self._data = yaml.Document(text).data
+            self._data = read(path.read_text(encoding="utf-8"))
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
         except (OSError, ValueError, yaml.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
-        self._places = list(_places(self._data))
+        held = isinstance(self._data, dict | list)
+        self._places = list(_places(self._data)) if held else []
 
     def holds(self, name: str) -> bool:
-        """Whether there is such a value.
-
-        Raises
-        ------
-        OdometryError
-            If there are several.
-        """
+        """Whether there is such a value; an error if there are several."""
         return self._find(name) is not None
 
     @property
@@ -76,13 +68,8 @@ class Template:
         """The file's text with new values; parameters that are not in it are ignored."""
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
-                _, holder, key = place
-                holder[key] = value
-        if self.path.suffix == ".toml":
-            return tomli_w.dumps(self._data)
-        if self.path.suffix == ".json":
-            return json.dumps(self._data, indent=2) + "\n"
-        return yaml.dump(self._data)
+                place[1][place[2]] = value
+        return self._write(self._data)
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
@@ -101,12 +88,7 @@ def _parts(name: Any) -> tuple[str, ...]:
 
 def _places(data: Any, path: tuple[str, ...] = ()) -> Iterator[_Place]:
     """Every value that is neither a mapping nor a list of them."""
-    if isinstance(data, dict):
-        items: Any = data.items()
-    elif isinstance(data, list):
-        items = enumerate(data)
-    else:
-        return
+    items = data.items() if isinstance(data, dict) else enumerate(data)
     for key, value in items:
         below = path if key == _ROS2 else path + _parts(key)
         if isinstance(value, dict | list) and value:
@@ -125,30 +107,21 @@ def placeholders(argument: str) -> list[str]:
 
 def replace(argument: str, values: Mapping[str, Any]) -> str:
     """Replace names in braces by their values; names without a value stay."""
-    return _PLACEHOLDER.sub(
-        lambda match: _text(values[match[1]]) if match[1] in values else match[0], argument
-    )
 
+    def text(match: re.Match[str]) -> str:
+        value = values.get(match[1], match[0])
+        return str(value).lower() if isinstance(value, bool) else str(value)
 
-def _text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return _PLACEHOLDER.sub(text, argument)
 
 
 def check_names(parameters: ParameterSet, template: Template | None, command: list[str]) -> None:
-    """Make sure that every parameter reaches the program.
-
-    Raises
-    ------
-    OdometryError
-        If one is neither in the template nor in the arguments.
-    """
+    """Raise an `OdometryError` if a parameter is neither in the template nor in the arguments."""
     inside = {name for argument in command for name in placeholders(argument)}
     for name in parameters:
         if name in inside or (template is not None and template.holds(name)):
             continue
-        if template is None:
-            raise OdometryError(f"{name}: no argument holds {{{name}}}, and there is no template")
-        raise OdometryError(
-            f"{name}: no argument holds {{{name}}}, and {template.path.name} has no such value; "
-            f"{nearest(name, template.names)}"
-        )
+        lacking = "there is no template"
+        if template is not None:
+            lacking = f"{template.path.name} has no such value; {nearest(name, template.names)}"
+        raise OdometryError(f"{name}: no argument holds {{{name}}}, and {lacking}")

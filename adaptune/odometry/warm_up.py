@@ -108,15 +108,9 @@ class RecentScans:
 
 
 class Successor:
-    """A new instance on its way through scans of the past.
+    """A new instance on its way through scans of the past, of which some are still waiting.
 
-    Attributes
-    ----------
-    odometry : OdometryInstance
-    waiting : deque of PastScan
-        The scans that it has not seen yet.
-    T_own_sensor : ndarray of shape (4, 4)
-        Its own newest pose.
+    `T_own_sensor`, of shape (4, 4), is its own newest pose.
     """
 
     def __init__(self, odometry: OdometryInstance, past: Iterable[PastScan]):

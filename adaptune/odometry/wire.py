@@ -43,13 +43,7 @@ from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.odometry.base import (
-    BaseSettings,
-    Description,
-    Odometry,
-    OdometryError,
-    OdometryInstance,
-)
+from adaptune.odometry import BaseSettings, Description, Odometry, OdometryError, OdometryInstance
 from adaptune.odometry.registry import odometry_class
 from adaptune.selection import Selection
 from adaptune.sequence.imu import Imu, ImuNoise
@@ -63,6 +57,8 @@ _HOLDS = {
     "register": ("stamp", "points"),
     "configure": ("parameters",),
 }
+_COLUMNS = ("points", "times", "rings", "intensities")
+_IMU = ("imu", "imu_stamps", "imu_pose", "imu_noise")
 _LENGTH = struct.Struct("<I")
 _LONGEST_HEADER = 1 << 24
 
@@ -79,14 +75,7 @@ class WireError(AdaptuneError):
 
 
 class Message(NamedTuple):
-    """A message.
-
-    Attributes
-    ----------
-    header : dict
-        With its ``type``.
-    arrays : dict of ndarray
-    """
+    """A message: its header, ``type`` included, and its arrays by name."""
 
     header: dict[str, Any]
     arrays: dict[str, NDArray[Any]]
@@ -103,13 +92,7 @@ def send(stream: BinaryIO, header: Mapping[str, Any], **arrays: NDArray[Any] | N
 
 
 def receive(stream: Readable) -> Message | None:
-    """Read a message, or None where the stream has ended.
-
-    Raises
-    ------
-    WireError
-        If the stream holds something else, or ends in the middle.
-    """
+    """Read a message, or None where the stream has ended; else there is a `WireError`."""
     first = stream.read(_LENGTH.size)
     if not first:
         return None
@@ -118,12 +101,10 @@ def receive(stream: Readable) -> Message | None:
         if length > _LONGEST_HEADER:
             raise WireError("the stream holds no message of adaptune's: write nothing else to it")
         header = json.loads(_exactly(stream, length))
-        arrays = {
-            name: np.frombuffer(
-                _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize), kind
-            ).reshape(shape)
-            for name, kind, shape in header.pop("arrays")
-        }
+        arrays = {}
+        for name, kind, shape in header.pop("arrays"):
+            data = _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize)
+            arrays[name] = np.frombuffer(data, kind).reshape(shape)
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise WireError(f"the stream holds no message of adaptune's ({error})") from error
     return Message(header, arrays)
@@ -138,30 +119,23 @@ def _exactly(stream: Readable, size: int) -> bytes:
 
 def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
     """A scan as the arrays of a message."""
-    arrays: dict[str, NDArray[Any] | None] = {
-        "points": scan.points,
-        "times": scan.times,
-        "rings": scan.rings,
-        "intensities": scan.intensities,
-    }
-    if scan.imu is not None:
-        arrays["imu_stamps"] = scan.imu.stamps
-        arrays["imu"] = np.hstack([scan.imu.angular_velocity, scan.imu.acceleration])
-        arrays["imu_pose"] = scan.imu.T_sensor_imu
-        arrays["imu_noise"] = np.array(scan.imu.noise)
+    arrays: dict[str, NDArray[Any] | None] = {name: getattr(scan, name) for name in _COLUMNS}
+    if (imu := scan.imu) is not None:
+        measured = np.hstack([imu.angular_velocity, imu.acceleration])
+        noise = np.array(imu.noise)
+        arrays |= zip(_IMU, (measured, imu.stamps, imu.T_sensor_imu, noise), strict=True)
     return arrays
 
 
 def to_scan(message: Message) -> Scan:
     """The scan that a message holds."""
-    arrays = message.arrays
-    imu = None
+    arrays, imu = message.arrays, None
     if "imu" in arrays:
-        gyro, acceleration = np.hsplit(arrays["imu"], 2)
-        noise = ImuNoise(*arrays["imu_noise"].tolist())
-        imu = Imu(arrays["imu_stamps"], gyro, acceleration, arrays["imu_pose"], noise)
-    times, rings, intensities = map(arrays.get, ("times", "rings", "intensities"))
-    return Scan(message.header["stamp"], arrays["points"], times, rings, imu, intensities)
+        measured, stamps, T_sensor_imu, noise = (arrays[name] for name in _IMU)
+        gyro, acceleration = np.hsplit(measured, 2)
+        imu = Imu(stamps, gyro, acceleration, T_sensor_imu, ImuNoise(*noise.tolist()))
+    columns: Any = {name: arrays.get(name) for name in _COLUMNS}
+    return Scan(message.header["stamp"], imu=imu, **columns)
 
 
 Make = Callable[[str, ParameterSet, BaseSettings], OdometryInstance]
@@ -169,13 +143,7 @@ Make = Callable[[str, ParameterSet, BaseSettings], OdometryInstance]
 
 
 def python_class(name: str) -> type[Odometry]:
-    """Class of an odometry that this process can run.
-
-    Raises
-    ------
-    OdometryError
-        If there is none, or it is a program of the user.
-    """
+    """Class of an odometry that this process can run; an error for programs of the user."""
     cls = odometry_class(name)
     if not issubclass(cls, Odometry):
         raise OdometryError(f"{name}: is a program of the user, not a class that can be served")
@@ -191,39 +159,26 @@ def hello(
     odometry: str | None, parameters: ParameterSet, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
     """First message of a conversation; no name if the other side serves one odometry only."""
-    return {
-        "type": "hello",
-        "version": VERSION,
-        "odometry": odometry,
-        "parameters": parameters,
-        "settings": settings,
-    }
+    name: dict[str, Any] = {"type": "hello", "version": VERSION, "odometry": odometry}
+    return name | {"parameters": parameters, "settings": settings}
 
 
 def announced(answer: Message) -> Description:
-    """Description of an odometry in its answer to a hello.
-
-    Raises
-    ------
-    WireError
-        If the answer is not one of this version.
-    """
+    """Description of an odometry in its answer to a hello; an error if of another version."""
     header = answer.header
-    if header.get("version") != VERSION:
-        raise WireError(
-            f"it speaks version {header.get('version')} of the protocol, this adaptune {VERSION}"
-        )
+    if (version := header.get("version")) != VERSION:
+        raise OdometryError(f"it speaks version {version} of the protocol, this adaptune {VERSION}")
     try:
         space = ParameterSpace.load(header["space"])
         return Description(space, bool(header["live"]), bool(header.get("needs_imu")))
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
-        raise WireError(f"its answer to hello does not describe it: {error}") from error
+        raise OdometryError(f"its answer to hello does not describe it: {error}") from error
 
 
 def serve(
     reader: Readable, writer: BinaryIO, name: str | None = None, make: Make = make_here
 ) -> None:
-    """Answer messages with an odometry until the stream ends.
+    """Answer messages with an odometry until the stream ends; anything else is a `WireError`.
 
     Parameters
     ----------
@@ -233,29 +188,14 @@ def serve(
         The only odometry to serve; otherwise each hello names one.
     make
         Makes it.
-
-    Raises
-    ------
-    WireError
-        If the stream holds something else than messages.
     """
     odometry: OdometryInstance | None = None
     while (message := receive(reader)) is not None:
         try:
             _check(message)
             if message.header["type"] == "hello":
-                served, cls, odometry = _make(message.header, name, make)
-                send(
-                    writer,
-                    {
-                        "type": "done",
-                        "version": VERSION,
-                        "odometry": served,
-                        "live": cls.live,
-                        "needs_imu": cls.needs_imu,
-                        "space": cls.space.dump(),
-                    },
-                )
+                odometry, about = _make(message.header, name, make)
+                send(writer, {"type": "done", "version": VERSION, **about})
             elif odometry is None:
                 raise OdometryError("the first message must be a hello")
             else:
@@ -271,17 +211,18 @@ def _check(message: Message) -> None:
     there = message.header.keys() | message.arrays.keys()
     holds = _HOLDS[kind]
     if "imu" in there:
-        holds += ("imu_stamps", "imu_pose", "imu_noise")
+        holds += _IMU
     if lacking := [name for name in holds if name not in there]:
         raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
 
 
 def _make(
     hello: Mapping[str, Any], only: str | None, make: Make
-) -> tuple[str, type[Odometry], OdometryInstance]:
-    if hello["version"] != VERSION:
+) -> tuple[OdometryInstance, dict[str, Any]]:
+    """The odometry that a hello asks for, and what the answer reports about it."""
+    if (version := hello["version"]) != VERSION:
         raise OdometryError(
-            f"this adaptune speaks version {VERSION} of the protocol, not {hello['version']}"
+            f"this adaptune speaks version {VERSION} of the protocol, not {version}"
         )
     name = hello.get("odometry") or only
     if name is None:
@@ -293,13 +234,8 @@ def _make(
         settings = cls.settings_type.model_validate(hello["settings"])
     except ValidationError as error:
         raise OdometryError(f"settings: {error}") from error
-    return name, cls, make(name, hello["parameters"], settings)
-
-
-def _usage() -> dict[str, float]:
-    """CPU seconds and peak resident megabytes of this process."""
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
+    about = {"live": cls.live, "needs_imu": cls.needs_imu, "space": cls.space.dump()}
+    return make(name, hello["parameters"], settings), {"odometry": name, **about}
 
 
 def _answer(odometry: OdometryInstance, message: Message, writer: BinaryIO) -> None:
@@ -311,7 +247,9 @@ def _answer(odometry: OdometryInstance, message: Message, writer: BinaryIO) -> N
             send(writer, {"type": "fault", "message": odometry.faults[-1]})
             return
         answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
-        send(writer, answer | _usage(), pose=pose)
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        usage = {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
+        send(writer, answer | usage, pose=pose)
         return
     if header["type"] == "start":
         # Arrays from the stream are read-only; an odometry may change its poses.

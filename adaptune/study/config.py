@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 """Becomes the name of a file."""
 
-RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
-"""Keys of earlier versions and what they are called now."""
-
 
 class StudySection(BaseModel):
     """A section of a study's YAML."""
@@ -52,13 +49,7 @@ def _known_descriptor(name: str) -> str:
 class DescriptorConfig(StudySection):
     """How scans are described.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of descriptors, see `adaptune.descriptor`.
-    window : float
-        Seconds over which the descriptors of selections are averaged; with 0, only the newest scan
-        counts.
+    Descriptors are averaged over `window` seconds; with 0, only the newest scan counts.
     """
 
     names: Annotated[
@@ -90,31 +81,10 @@ def _catches_up(scans: int) -> int:
 class SwitchingConfig(StudySection):
     """How the odometry changes its parameters during a replay.
 
-    Attributes
-    ----------
-    mechanism : str
-        `live`: the odometry changes them between scans. `hand_over`: a new instance takes over.
-        `bank`: several instances run side by side, and their motions are averaged. `auto`: the
-        first of bank (given more than one core, and enough memory), live and hand_over that is
-        possible.
-    warm_up : float, optional
-        Seconds of scans that a new instance sees before it takes over. The odometry has its own
-        defaults for this and the next two.
-    full_rate : float, optional
-        The new instance sees every scan of the most recent seconds.
-    stride : int, optional
-        Of the scans before, it sees every n-th.
-    catch_up_scans : int
-        Scans of the past that a new instance sees with every new scan, while the old instance
-        still gives the poses. With 0, it sees all of them at once.
-    size : int
-        Number of members of the bank.
-    sets : list of int or dict, optional
-        Parameter sets of the bank, or their trial numbers; the first one is the fixed one. By
-        default the fixed set, and the sets whose errors cancel each other best.
-    cores, memory : int, float, optional
-        What `auto` may spend on a bank: cores (default: all), and gigabytes, of which each member
-        may take `isolation.memory`.
+    `live`: it changes them between scans. `hand_over`: a new instance takes over. `bank`: several
+    instances run side by side, and their motions are averaged. `auto`: the first of bank (given
+    more than one core, and enough memory), live and hand_over that is possible.
+    ``docs/adapting-live.md`` describes every key.
     """
 
     mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"
@@ -132,16 +102,7 @@ class SwitchingConfig(StudySection):
 
 
 class OnlineConfig(StudySection):
-    """How to replay.
-
-    Attributes
-    ----------
-    period : float
-        Seconds between selections.
-    rules : list of str
-        Selection rules: `paired`, `paper`.
-    switching : SwitchingConfig
-    """
+    """How to replay: seconds between selections, selection rules, and switching."""
 
     period: float = Field(1.0, gt=0, allow_inf_nan=False)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
@@ -151,24 +112,7 @@ class OnlineConfig(StudySection):
 class StudyConfig(StudySection):
     """The YAML of a study without the settings that only one stage uses.
 
-    Attributes
-    ----------
-    sequences : dict
-        Recordings by name.
-    courses : dict
-        Simulated sequences by name; `adaptune simulate` records them.
-    training, test : list of str
-        Names of sequences and courses.
-    sub_trajectory : float
-        Length in metres over which errors are measured.
-    lost_track : float
-        Metres a second. A trial counts a step that departs from the reference by more as a
-        failure, and restarts the odometry at the reference.
-    health : HealthCheck
-        Bounds on the platform's motion. A replay restarts an odometry that exceeds them, from its
-        last healthy motion.
-    isolation : Limits
-        Limits of an odometry that runs in a process of its own.
+    ``docs/reference-study.md`` describes every key.
     """
 
     odometry: OdometryConfig

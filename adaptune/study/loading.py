@@ -1,16 +1,30 @@
 """Reading a study: its YAML, the overrides, and all mistakes with their lines."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pydantic import ValidationError
+
 from adaptune import yaml
-from adaptune.study.checking import check
+from adaptune.errors import AdaptuneError
+from adaptune.odometry.base import Description, Odometry, OdometryError
+from adaptune.odometry.command import Command
+from adaptune.odometry.registry import odometry_class
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import check_sequence
+from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
-from adaptune.study.mistakes import ConfigurationError, Key, Mistake
-from adaptune.study.study import Study
+from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated
+from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 
 C = TypeVar("C", bound=StudyConfig)
+
+_KINDS: dict[str, type[Float | Integer | Categorical]] = {
+    "float": Float,
+    "integer": Integer,
+    "categorical": Categorical,
+}
 
 
 def read_study(
@@ -43,7 +57,7 @@ def read_study(
     document = _read(path)
     data: Any = document.data
     overridden = [_override(data, text) for text in overrides]
-    config, mistakes = check(config_type, data, path.parent.resolve())
+    config, mistakes = _check(config_type, data, path.parent.resolve())
     if mistakes or config is None:
         mistakes.sort(key=lambda mistake: document.line(mistake.key) or 0)
         lines = [_say(mistake, path, document, overridden) for mistake in mistakes]
@@ -92,3 +106,153 @@ def _say(mistake: Mistake, path: Path, document: yaml.Document, overridden: Sequ
         where = f"{path}, line {line}" if line else str(path)
     dotted = ".".join(map(str, key))
     return f"{where}: {dotted + ': ' if dotted else ''}{mistake.message}"
+
+
+def _check(
+    config_type: type[C], data: dict[str, Any], folder: Path
+) -> tuple[C | None, list[Mistake]]:
+    """Validate a study's data, and find the mistakes that the models cannot find.
+
+    Returns
+    -------
+    config : StudyConfig, optional
+        None if the data are not valid.
+    mistakes : list of Mistake
+    """
+    mistakes: list[Mistake] = []
+    if isinstance(odometry := data.get("odometry"), dict):
+        _check_odometry(odometry, mistakes, folder)
+    sound = not mistakes
+    config = validated(config_type, data, (), mistakes, {"folder": folder})
+    if config is not None:
+        try:
+            described = describe_odometry(config.odometry)
+        except (OdometryError, ValidationError):
+            described = None
+        if described is not None:
+            mistakes += _check_imu(config, described)
+            mistakes += _check_switching(config, described)
+        space = tuned_space(config.odometry, described) if sound and described else None
+        mistakes += config.mistakes(space)
+    sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
+    if not isinstance(sequences, dict) or not isinstance(courses, dict):
+        return None, mistakes
+    mistakes += [
+        Mistake(("courses", name), "there is a sequence of the same name")
+        for name in sequences
+        if name in courses
+    ]
+    for name, entry in sequences.items():
+        mistakes += _check_recording(name, entry, folder)
+    for role in ("training", "test"):
+        mistakes += _check_role(role, data, {*sequences, *courses})
+    return config, mistakes
+
+
+def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
+    """Open a recording; mistakes in the entry itself were found with the whole."""
+    config = validated(SequenceConfig, entry, (), [], {"folder": folder})
+    if config is not None:
+        try:
+            check_sequence(config)
+        except AdaptuneError as error:
+            yield Mistake(("sequences", name), str(error))
+
+
+def _check_role(role: str, data: Mapping[str, Any], known: Collection[Any]) -> Iterable[Mistake]:
+    names, training = data.get(role), data.get("training")
+    if not isinstance(names, list):
+        return
+    for i, name in enumerate(names):
+        if not isinstance(name, str):
+            continue  # the models find it
+        if name not in known:
+            message = f"there is no sequence {name!r}: {nearest(name, map(str, known))}"
+            yield Mistake((role, i), message)
+        elif name in names[:i]:
+            yield Mistake((role, i), f"{name!r} is named twice")
+        elif role == "test" and isinstance(training, list) and name in training:
+            yield Mistake((role, i), f"{name!r} is a training sequence, and proves nothing here")
+
+
+def _check_odometry(data: dict[str, Any], mistakes: list[Mistake], folder: Path) -> None:
+    """Check all that depends on the odometry; make paths in its settings absolute."""
+    name = data.get("name")
+    if not isinstance(name, str):
+        return
+    try:
+        odometry = odometry_class(name)
+    except OdometryError as error:
+        mistakes.append(Mistake(("odometry", "name"), str(error)))
+        return
+    key = ("odometry", "settings")
+    settings = data.get("settings") or {}
+    if not isinstance(settings, dict):
+        return
+    found: Any = validated(odometry.settings_type, settings, key, mistakes, {"folder": folder})
+    if found is not None:
+        data["settings"] = found.model_dump(mode="json", exclude_unset=True)
+    elif not issubclass(odometry, Odometry):
+        return
+    try:
+        space = odometry.describe(found).space
+        _check_parameters(name, space, data.get("parameters"), mistakes)
+        if issubclass(odometry, Command) and isinstance(tuned := data.get("parameters"), dict):
+            odometry.check(found, dict.fromkeys(tuned, 0))
+    except OdometryError as error:
+        mistakes.append(Mistake(key, str(error)))
+
+
+def _check_parameters(
+    name: str, space: ParameterSpace | None, tuned: Any, mistakes: list[Mistake]
+) -> None:
+    if space is None and not tuned:
+        message = f"define the parameters: a {name} does not know its own"
+        mistakes.append(Mistake(("odometry", "parameters"), message))
+    for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
+        key = ("odometry", "parameters", parameter)
+        if space is not None and parameter not in space.names:
+            help_ = nearest(str(parameter), space.names)
+            mistakes.append(Mistake(key, f"{name} has no parameter {parameter!r}: {help_}"))
+        elif isinstance(given, dict):
+            whole = whole_definition(space, parameter, given)
+            if whole.get("type") not in _KINDS:
+                mistakes.append(Mistake(key, f"give its type, one of {', '.join(_KINDS)}"))
+            else:
+                validated(_KINDS[whole["type"]], whole, key, mistakes)
+
+
+def _check_imu(config: StudyConfig, described: Description) -> Iterable[Mistake]:
+    if not described.needs_imu:
+        return
+    needs = f"{config.odometry.name} needs an IMU"
+    for name, sequence in config.sequences.items():
+        if sequence.imu is None:
+            help_ = "name its topic and its place, imu: {topic: ..., extrinsic: ...}"
+            yield Mistake(("sequences", name), f"{needs}; {help_}")
+    for name, course in config.courses.items():
+        if course.imu is None:
+            yield Mistake(("courses", name), f"{needs}; simulate one, imu: 200")
+
+
+def _check_switching(config: StudyConfig, described: Description) -> Iterable[Mistake]:
+    online, key = config.online, ("online", "switching")
+    tuned = config.odometry.parameters or {}
+    names = tuned if described.space is None else described.space.names
+    for i, given in enumerate(online.switching.sets or ()):
+        for name in given if isinstance(given, dict) else ():
+            if name not in names:
+                message = f"there is no such parameter; {nearest(name, names)}"
+                yield Mistake((*key, "sets", i, name), message)
+    if described.whole and "rules" in online.model_fields_set and online.rules:
+        message = "a command runs whole recordings and cannot adapt; leave this out"
+        yield Mistake(("online", "rules"), message)
+    if described.whole and online.switching.mechanism != "auto":
+        message = "a command runs whole recordings and cannot change parameters; leave this out"
+        yield Mistake((*key, "mechanism"), message)
+    elif online.switching.mechanism == "live" and not described.live:
+        message = (
+            f"{config.odometry.name} cannot change its parameters between scans; choose auto, "
+            f"hand_over or bank"
+        )
+        yield Mistake((*key, "mechanism"), message)

@@ -10,10 +10,12 @@ from pydantic import BaseModel, ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.space import nearest
-from adaptune.study.config import RENAMED
 
 Key = tuple[str | int, ...]
 """Keys and indices that lead to a value."""
+
+RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
+"""Keys of earlier versions, and their present names."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -23,15 +25,7 @@ class ConfigurationError(AdaptuneError):
 
 
 class Mistake(NamedTuple):
-    """One mistake.
-
-    Attributes
-    ----------
-    key : tuple
-        Leads to it; empty for the study as a whole.
-    message : str
-        What is wrong, and what to do.
-    """
+    """What is wrong with a value, and what to do; the key of the whole study is empty."""
 
     key: Key
     message: str
@@ -48,21 +42,7 @@ def validated(
     mistakes: list[Mistake],
     context: dict[str, Any] | None = None,
 ) -> M | None:
-    """Validate a section; None if it has mistakes, which are added to `mistakes`.
-
-    Parameters
-    ----------
-    model
-        What the section must be.
-    data
-        The section.
-    key
-        Leads to the section.
-    mistakes
-        Receives what is found.
-    context
-        See `pydantic.BaseModel.model_validate`.
-    """
+    """Validate a section; None if it has mistakes, which are added to `mistakes`."""
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:

@@ -23,15 +23,6 @@ def check_folder(
 ) -> None:
     """Refuse a folder that was begun with another study.
 
-    Parameters
-    ----------
-    folder
-        The study's folder.
-    resolved
-        The study's configuration.
-    lasting
-        Returns the part of a configuration that may not change.
-
     Raises
     ------
     ConfigurationError

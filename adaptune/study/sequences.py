@@ -23,28 +23,14 @@ _inputs: dict[tuple[str, str], ProgramInput] = {}
 
 @dataclass(frozen=True)
 class StudySequences:
-    """Opens the sequences of a study by name, in any process.
-
-    Attributes
-    ----------
-    recordings : dict of SequenceConfig
-    courses : dict of Course
-    views : dict of ViewConfig
-        Views that may be had of every sequence.
-    folder : Path
-        The study's folder, which keeps recorded courses and what programs read.
-    with_imu : bool
-        Whether scans bring along the IMU's measurements.
-    layout : str
-        The format that a program reads.
-    """
+    """Opens the sequences of a study by name, in any process."""
 
     recordings: Mapping[str, SequenceConfig]
     courses: Mapping[str, Course]
-    views: Mapping[str, ViewConfig]
-    folder: Path
-    with_imu: bool = False
-    layout: Layout = "bag"
+    views: Mapping[str, ViewConfig]  # views that may be had of every sequence
+    folder: Path  # the study's folder, which keeps recorded courses and what programs read
+    with_imu: bool = False  # whether scans bring along the IMU's measurements
+    layout: Layout = "bag"  # the format that a program reads
 
     def recording(self, course: str) -> Path:
         """The bag of a simulated course."""

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,14 +12,15 @@ from typing import Any, Generic, Literal
 from typing_extensions import TypeVar
 
 from adaptune.cores import available
-from adaptune.odometry.base import WarmUp
+from adaptune.odometry.base import Description, WarmUp
 from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.registry import odometry_class
 from adaptune.sequence.names import OF_VIEW
-from adaptune.study.config import StudyConfig
+from adaptune.space import ParameterSpace
+from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.study.run_folder import check_folder, open_folder
 from adaptune.study.sequences import StudySequences
-from adaptune.study.tuned import describe_odometry, odometry_settings, tuned_space
 
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
 
@@ -27,17 +29,10 @@ Mechanism = Literal["live", "hand_over", "bank"]
 
 @dataclass(frozen=True)
 class Study(Generic[C_co]):
-    """A checked configuration and its folder.
-
-    Attributes
-    ----------
-    config : StudyConfig
-    folder : Path
-        Keeps trials, model, replays and comparison.
-    """
+    """A checked configuration and its folder."""
 
     config: C_co
-    folder: Path
+    folder: Path  # keeps trials, model, replays and comparison
 
     @property
     def name(self) -> str:
@@ -103,13 +98,13 @@ class Study(Generic[C_co]):
     @cached_property
     def warm_up(self) -> WarmUp:
         """Which scans a new instance sees before it takes over."""
-        switching = self.config.online.switching
-        usual = self.odometry.description.warm_up
-        return WarmUp(
-            usual.seconds if switching.warm_up is None else switching.warm_up,
-            usual.full_rate if switching.full_rate is None else switching.full_rate,
-            usual.stride if switching.stride is None else switching.stride,
-        )
+        switching, usual = self.config.online.switching, self.odometry.description.warm_up
+        given: dict[str, Any] = {
+            "seconds": switching.warm_up,
+            "full_rate": switching.full_rate,
+            "stride": switching.stride,
+        }
+        return usual._replace(**{k: v for k, v in given.items() if v is not None})
 
     def switch_cost(self) -> float:
         """Share by which a switch raises the RTE, as `adaptune switching` measured it.
@@ -175,3 +170,29 @@ class Study(Generic[C_co]):
             resolved["odometry"]["template"] = hashlib.sha256(text).hexdigest()[:16]
         sizes = {name: self.sequences.recording_size(name) for name in self.config.training}
         return resolved | {"recordings": sizes}
+
+
+def odometry_settings(config: OdometryConfig) -> Any:
+    """Settings of the odometry."""
+    return odometry_class(config.name).settings_type.model_validate(config.settings)
+
+
+def describe_odometry(config: OdometryConfig) -> Description:
+    """Description of the odometry with its settings."""
+    return odometry_class(config.name).describe(odometry_settings(config))
+
+
+def tuned_space(config: OdometryConfig, described: Description) -> ParameterSpace:
+    """The parameters that are tuned: those that the study names, by default all."""
+    own = described.space
+    if config.parameters is None:
+        return own or ParameterSpace({})
+    definitions = config.parameters.items()
+    return ParameterSpace.load({name: whole_definition(own, name, d) for name, d in definitions})
+
+
+def whole_definition(
+    space: ParameterSpace | None, name: str, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Definition of a parameter: the study's values, and the odometry's own for the rest."""
+    return ({} if space is None else space.parameters[name].model_dump()) | dict(given)

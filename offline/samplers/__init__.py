@@ -10,15 +10,7 @@ if TYPE_CHECKING:
 
 
 def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
-    """Make the sampler that a configuration names.
-
-    Parameters
-    ----------
-    space
-        The tuned parameters.
-    config
-        Sampler, seed, and sizes.
-    """
+    """Make the sampler that a configuration names."""
     from offline.samplers.asked import AskedSampler
     from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
 

@@ -42,11 +42,6 @@ _Trial = tuple[int, Mapping[str, Any], float]
 class Chain:
     """One chain of annealing.
 
-    Parameters
-    ----------
-    settings
-        Temperatures, and when to return to the first one.
-
     Attributes
     ----------
     params : dict or None
@@ -229,13 +224,7 @@ class AnnealingSampler(BaseSampler):
                 study.stop()
 
     def chains(self, study: Study) -> list[Chain]:
-        """The chains after the study's finished trials.
-
-        Parameters
-        ----------
-        study
-            A study with one objective.
-        """
+        """The chains after the study's finished trials."""
         return self._walk(study, self._finished(study))
 
     def stalled(self, study: Study) -> bool:
@@ -299,21 +288,7 @@ def step_from(
     temperature: float,
     rng: np.random.Generator,
 ) -> Any:
-    """Draw a neighbour of a value.
-
-    Parameters
-    ----------
-    value
-        A parameter's value.
-    distribution
-        Its range.
-    step
-        Length of the step.
-    temperature
-        Of the chain.
-    rng
-        Draws the step.
-    """
+    """Draw a neighbour of a parameter's value."""
     if isinstance(distribution, CategoricalDistribution):
         others = [c for c in distribution.choices if type(c) is not type(value) or c != value]
         if not others or rng.random() >= (CHANGE if step.change is None else step.change):

@@ -39,13 +39,6 @@ class AskedSampler(Sampler):
 
     If the sampler proposes a set that was tried before, it receives the known value at once and is
     asked again. After many attempts, a random set is taken.
-
-    Parameters
-    ----------
-    space
-        The parameters.
-    config
-        Sampler, its settings, seed, and sizes.
     """
 
     def __init__(self, space: ParameterSpace, config: OfflineConfig):

@@ -21,13 +21,6 @@ class Sampler(ABC):
     Proposals depend on the seed and on the results of the batches before, and on nothing else: not
     on the number of trials, nor on who runs them. Trial 0 is the baseline, and no set is proposed
     twice. Samplers without constraints receive bad values for sets that break limits.
-
-    Parameters
-    ----------
-    space
-        The parameters.
-    config
-        Seed, sizes and settings.
     """
 
     constrained = False

@@ -23,17 +23,6 @@ def check_sampler(
 ) -> Iterable[Mistake]:
     """Find mistakes in a sampler's settings.
 
-    Parameters
-    ----------
-    name
-        Name of the sampler.
-    settings
-        Its settings, valid for its model where the sampler is one of adaptune's own.
-    space
-        The tuned parameters.
-    budgeted
-        Whether the search has a budget.
-
     Yields
     ------
     Mistake

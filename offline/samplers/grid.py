@@ -23,26 +23,14 @@ LARGEST = 10_000
 
 @dataclass(frozen=True)
 class Axis:
-    """The values of one parameter that a grid tries.
-
-    Attributes
-    ----------
-    parameter : Float, Integer or Categorical
-    count : int
-        Number of values.
-    first, step : float
-        First number and distance of the next; in log scale if `log`.
-    log : bool
-    choices : tuple
-        The values of a category.
-    """
+    """The values of one parameter that a grid tries."""
 
     parameter: Float | Integer | Categorical
-    count: int
-    first: float = 0.0
-    step: float = 0.0
+    count: int  # number of values
+    first: float = 0.0  # the first number, in log scale if `log`
+    step: float = 0.0  # from one number to the next
     log: bool = False
-    choices: tuple[Value, ...] = ()
+    choices: tuple[Value, ...] = ()  # the values of a category
 
     def __getitem__(self, i: int) -> Value:
         if self.choices:
@@ -70,11 +58,6 @@ class Axis:
 
 class Grid:
     """All combinations of the axes' values, in row-major order: the last axis changes fastest.
-
-    Parameters
-    ----------
-    axes
-        By name.
 
     Attributes
     ----------
@@ -176,15 +159,6 @@ def check_grid(
     axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
 ) -> Iterable[Mistake]:
     """Find mistakes in a grid.
-
-    Parameters
-    ----------
-    axes
-        The values to try, by parameter.
-    space
-        The tuned parameters.
-    bounded
-        Whether the search stops before the end of a large grid.
 
     Yields
     ------

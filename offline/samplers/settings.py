@@ -38,17 +38,7 @@ class _Settings(BaseModel):
 class Step(_Settings):
     """How far a step of annealing moves a parameter.
 
-    Attributes
-    ----------
-    mu, sigma : float, optional
-        For real numbers, and whole numbers in log scale: mean and standard deviation of a normal
-        distribution, in the parameter's unit or, in log scale, of its natural logarithm. By default
-        0 and a twentieth of the range.
-    delta_max : int, optional
-        For other whole numbers: the longest step at temperature 1, by default half of the range.
-        The temperature multiplies it; a step of 1 is always possible.
-    change : float, optional
-        For categories: the probability of another category, by default 0.3.
+    ``docs/reference-offline.md`` describes the settings and their defaults.
     """
 
     mu: float | None = Field(None, allow_inf_nan=False)
@@ -60,23 +50,7 @@ class Step(_Settings):
 class AnnealingSettings(_Settings):
     """Settings of simulated annealing, with the names they have in RUSTLE.
 
-    Attributes
-    ----------
-    initial_temperature, alpha : float
-        A chain begins at the initial temperature; every step multiplies it by `alpha`.
-    energy_scale : float, optional
-        Differences of the error are divided by it before they are compared with the temperature;
-        by default the error of the first trial. 1 is the thesis's rule.
-    reanneal_fixed, reanneal_accepted, reanneal_best : int, optional
-        Return to the initial temperature after this many steps; after this many steps in a row
-        without an acceptance; or without a new best of the chain.
-    stall_accepted, stall_best : int, optional
-        Stop when every chain has made this many steps in a row without an acceptance, or without a
-        new best.
-    chains : int
-        Chains take turns: trial n belongs to chain n modulo `chains`.
-    steps : dict
-        Steps by parameter.
+    ``docs/reference-offline.md`` describes them.
     """
 
     initial_temperature: float = Field(0.1, gt=0, allow_inf_nan=False)
@@ -100,15 +74,10 @@ class Span(_Settings):
 
 
 class GridSettings(_Settings):
-    """Settings of `grid`.
+    """Settings of `grid`."""
 
-    Attributes
-    ----------
-    grid : dict
-        For every number ``[first, step, count]`` or a `Span`; for categories the choices to try,
-        by default all.
-    """
-
+    # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
+    # default all.
     grid: dict[str, Span | tuple[Value, ...]]
 
 
@@ -120,11 +89,6 @@ class RandomSettings(_Settings):
 
 def optuna_class(name: str) -> type[Any]:
     """Class of an Optuna sampler.
-
-    Parameters
-    ----------
-    name
-        One of `OPTUNA`, or ``package.module:Class``.
 
     Raises
     ------
@@ -160,15 +124,6 @@ def optuna_class(name: str) -> type[Any]:
 
 def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
     """Make an Optuna sampler.
-
-    Parameters
-    ----------
-    name
-        One of `OPTUNA`, or ``package.module:Class``.
-    settings
-        Keywords of the class.
-    seed
-        The class receives it if it takes one.
 
     Raises
     ------

@@ -2,8 +2,7 @@ import json
 
 import pytest
 
-from adaptune.study.config import RENAMED
-from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.mistakes import RENAMED, ConfigurationError
 from offline.offline_study import load_study
 
 

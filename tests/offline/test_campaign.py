@@ -1,6 +1,7 @@
 import csv
 import itertools
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -33,8 +34,9 @@ def files(folder):
 
 
 @pytest.fixture(scope="module")
-def trained(study_file, tmp_path_factory):
-    study = load_study(study_file, [], tmp_path_factory.mktemp("run") / "study")
+def trained(study_file, trained_folder, tmp_path_factory):
+    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("run") / "study")
+    study = load_study(study_file, [], folder)
     return study, train(study)
 
 

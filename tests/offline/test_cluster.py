@@ -77,10 +77,8 @@ def workers(scheduler):
 
 
 @pytest.fixture(scope="module")
-def local(study_file, tmp_path_factory):
-    study = load_study(study_file, ["offline.workers=1"], tmp_path_factory.mktemp("run") / "study")
-    train(study)
-    return kills.contents(study.folder)
+def local(trained_folder):
+    return kills.contents(trained_folder)
 
 
 def cluster_of(study, address):

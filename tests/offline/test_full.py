@@ -9,14 +9,6 @@ import kills
 import pytest
 
 
-@pytest.fixture
-def undisturbed(study_file, tmp_path):
-    """A finished campaign's folder."""
-    folder = tmp_path / "enough" / "study"
-    assert run(study_file, folder).returncode == 0
-    return folder
-
-
 def run(study_file, folder):
     return subprocess.run(
         [sys.executable, "-m", "adaptune.cli", "offline", str(study_file), "--folder", str(folder)],
@@ -34,8 +26,8 @@ def assert_full(done, words):
     assert said.endswith("make room, and run the same command again")
 
 
-def assert_as(folder, undisturbed):
-    assert kills.contents(folder) == kills.contents(undisturbed)
+def assert_as(folder, trained_folder):
+    assert kills.contents(folder) == kills.contents(trained_folder)
     kills.check_once(folder, 10, ["one", "two"])
     assert not list(folder.rglob(".*.npz"))
 
@@ -64,7 +56,7 @@ def leave(disk: Path, free: int):
     ballast.write_bytes(bytes(max(0, status.f_bavail * status.f_frsize - free)))
 
 
-def test_a_full_disk_is_told_and_nothing_is_lost(study_file, undisturbed, small_disk):
+def test_a_full_disk_is_told_and_nothing_is_lost(study_file, trained_folder, small_disk):
     folder, written = small_disk / "study", {}
     for free in (0, 60_000, 60_000):
         leave(small_disk, free)
@@ -73,8 +65,8 @@ def test_a_full_disk_is_told_and_nothing_is_lost(study_file, undisturbed, small_
         now = kills.files(folder)
         assert now.items() >= written.items()
         written = now
-    assert 0 < len(written) < len(kills.files(undisturbed))
+    assert 0 < len(written) < len(kills.files(trained_folder))
     (small_disk / "ballast").unlink()
     assert run(study_file, folder).returncode == 0
     assert kills.files(folder).items() >= written.items()
-    assert_as(folder, undisturbed)
+    assert_as(folder, trained_folder)

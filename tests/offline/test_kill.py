@@ -4,11 +4,10 @@ import kills
 import numpy as np
 
 
-def test_killed_campaigns_end_as_undisturbed_ones(study_file, tmp_path):
+def test_killed_campaigns_end_as_undisturbed_ones(study_file, trained_folder, tmp_path):
     rng = np.random.default_rng(1)
-    kills.disturb(study_file, tmp_path / "a" / "study", 0, 0, rng)
-    n_files = len(kills.files(tmp_path / "a" / "study"))
-    killed = kills.disturb(study_file, tmp_path / "b" / "study", 4, n_files, rng)
+    n_files = len(kills.files(trained_folder))
+    killed = kills.disturb(study_file, tmp_path / "study", 4, n_files, rng)
     assert sum(killed) >= 2
-    assert kills.contents(tmp_path / "b" / "study") == kills.contents(tmp_path / "a" / "study")
-    kills.check_once(tmp_path / "b" / "study", 10, ["one", "two"])
+    assert kills.contents(tmp_path / "study") == kills.contents(trained_folder)
+    kills.check_once(tmp_path / "study", 10, ["one", "two"])

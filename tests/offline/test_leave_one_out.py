@@ -1,4 +1,5 @@
 import itertools
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,6 @@ from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, LabelledSequence
 from offline.leave_one_out import BANK, LeftOut, Validation, ValidationError, leave_one_out
 from offline.offline_study import load_study
-from offline.train import train
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings, tune, tune_bank
 from offline.validate import validate
 
@@ -235,9 +235,8 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
         assert data.fixed == labelled(judged).fixed() == TRIALS[expected]
 
 
-def test_validates_a_study(study_file, tmp_path):
-    study = load_study(study_file, [], tmp_path / "study")
-    train(study)
+def test_validates_a_study(study_file, trained_folder, tmp_path):
+    study = load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
     validation, rows, learning, banks = validate(study, curve=True, sizes=True)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])

@@ -1,5 +1,6 @@
 """What becomes of a study whose files were damaged, whose recordings changed, or that is in use."""
 
+import shutil
 import subprocess
 import sys
 
@@ -12,44 +13,64 @@ from offline.offline_study import load_study
 from offline.train import train
 
 
+def load(folder):
+    return load_study(folder / "small.yaml", ["offline.trials=4"], folder / "run")
+
+
+def write(study_file, folder):
+    for name in ("one", "two"):
+        shutil.copy2(study_file.parent / f"{name}.bag", folder)
+    text = study_file.read_text().replace("bag: three.bag", "bag: two.bag")
+    (folder / "small.yaml").write_text(text)
+    return load(folder)
+
+
 @pytest.fixture
 def study(study_file, tmp_path):
-    for name in ("one", "two"):
-        (tmp_path / f"{name}.bag").write_bytes((study_file.parent / f"{name}.bag").read_bytes())
-    (tmp_path / "small.yaml").write_text(
-        study_file.read_text().replace("bag: three.bag", "bag: two.bag")
-    )
-    return load_study(tmp_path / "small.yaml", ["offline.trials=4"], tmp_path / "run")
+    return write(study_file, tmp_path)
 
 
-def test_frames_that_are_damaged_or_removed_are_made_again(study):
-    train(study)
-    frames = study.folder / "trials/one/frames.npz"
+@pytest.fixture(scope="module")
+def finished(study_file, tmp_path_factory):
+    """A folder with recordings, a study, and its run; not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    train(write(study_file, folder))
+    return folder
+
+
+@pytest.fixture
+def trained(finished, tmp_path):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    configuration = tmp_path / "run/study.yaml"
+    configuration.write_text(configuration.read_text().replace(str(finished), str(tmp_path)))
+    return load(tmp_path)
+
+
+def test_frames_that_are_damaged_or_removed_are_made_again(trained):
+    frames = trained.folder / "trials/one/frames.npz"
     before = frames.read_bytes()
     frames.write_bytes(before[:100])
-    train(study)
+    train(trained)
     assert frames.read_bytes() == before
     frames.unlink()
-    train(study)
+    train(trained)
     assert frames.read_bytes() == before
 
 
-def test_a_damaged_trial_is_named(study):
-    train(study)
-    trial = study.folder / "trials/two/00002.npz"
+def test_a_damaged_trial_is_named(trained):
+    trial = trained.folder / "trials/two/00002.npz"
     trial.write_bytes(trial.read_bytes()[:1000])
     with pytest.raises(AdaptuneError, match=r"00002\.npz: is damaged .* remove it"):
-        train(study)
+        train(trained)
     trial.unlink()
-    train(study)
+    train(trained)
 
 
-def test_another_recording_in_its_place_is_noticed(study, tmp_path):
-    train(study)
+def test_another_recording_in_its_place_is_noticed(trained, tmp_path):
     (tmp_path / "one.bag").unlink()
     drives.write_bag(tmp_path / "one.bag", drives.scans(7, 40))
     with pytest.raises(ConfigurationError, match=r"other values of recordings\.one"):
-        train(load_study(tmp_path / "small.yaml", ["offline.trials=4"], study.folder))
+        train(load_study(tmp_path / "small.yaml", ["offline.trials=4"], trained.folder))
 
 
 @pytest.mark.usefixtures("study")

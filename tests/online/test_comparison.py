@@ -1,6 +1,7 @@
 import csv
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,6 @@ from adaptune.selection import Selection
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.offline_study import load_study
-from offline.train import train
 from online.comparison import compare
 from online.modes import ModeError, ReplaySetup
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
@@ -22,10 +22,9 @@ MODES = ["baseline", "fixed", "paired", "paper"]
 
 
 @pytest.fixture(scope="module")
-def trained(study_file, tmp_path_factory):
-    study = load_study(study_file, [], tmp_path_factory.mktemp("run") / "study")
-    train(study)
-    return study
+def trained(study_file, trained_folder, tmp_path_factory):
+    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("run") / "study")
+    return load_study(study_file, [], folder)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 FIRST_STAMP = 1_700_000_000_123_456_789
+STUDY_FILE = "small.yaml"
 STUDY = """\
 odometry:
   name: gicp
@@ -113,8 +114,8 @@ def write_bag(
 
 
 def write_study(folder: Path) -> Path:
-    """Write a study of three short drives, with its bags, and tell its file."""
+    """Write a study of three short drives, with its bags, and return its file."""
     for seed, name in enumerate(("one", "two", "three")):
         write_bag(folder / f"{name}.bag", scans(seed, 40))
-    (folder / "small.yaml").write_text(STUDY)
-    return folder / "small.yaml"
+    (folder / STUDY_FILE).write_text(STUDY)
+    return folder / STUDY_FILE

@@ -8,17 +8,16 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from adaptune.geometry import Poses, invert
-from adaptune.odometry.base import BaseSettings, Description, OdometryError
-from adaptune.odometry.evalio.point_layout import (
+from adaptune.odometry.base import (
     MIN_POINTS,
-    Prepared,
-    cloud,
-    crop,
-    evalio_modules,
-    image,
-    to_evalio,
+    BaseSettings,
+    Description,
+    OdometryError,
+    RangeSettings,
 )
-from adaptune.odometry.own_frame import OwnFrameOdometry
+from adaptune.odometry.evalio import point_layout
+from adaptune.odometry.evalio.point_layout import Prepared, evalio_modules, to_evalio
+from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, Value, nearest
@@ -26,22 +25,18 @@ from adaptune.space import ParameterSet, Value, nearest
 GRAVITY = 9.80665
 
 
-class Settings(BaseSettings):
+NO_FIELD = "{} needs to know {}, and the scans do not say; record clouds with a {} field"
+
+
+class Settings(RangeSettings):
     """Settings of all pipelines.
 
     Attributes
     ----------
-    min_range, max_range : float
-        Metres.
-    deskew : bool
-        Take the motion out of scans whose points have times, where the pipeline can.
     parameters : dict
         Values of any of the pipeline's parameters, where they are not tuned.
     """
 
-    min_range: float = Field(1.0, ge=0)
-    max_range: float = Field(100.0, gt=0)
-    deskew: bool = True
     parameters: dict[str, Value] = Field(default_factory=dict)
 
 
@@ -82,7 +77,7 @@ class Pipeline(OwnFrameOdometry):
         when late; class attribute.
     """
 
-    settings_type: ClassVar[type[BaseSettings]] = Settings
+    settings_type = Settings
     live = False
     # Some end the process at unexpected scans, some share state between instances.
     clean = False
@@ -101,23 +96,16 @@ class Pipeline(OwnFrameOdometry):
 
     @classmethod
     def describe(cls, settings: Any) -> Description:
-        """See `Odometry.describe`.
-
-        Raises
-        ------
-        OdometryError
-            If the settings hold an unknown parameter, or a value of another type.
-        """
         if settings is not None and settings.parameters:
-            cls(settings=settings)
+            cls(settings=settings)  # raises if a parameter is unknown, or a value of another type
         return super().describe(settings)
 
     def _typed(self, name: str, value: Value) -> Value:
         """A value in the type that the pipeline needs: it takes no 1 for a float."""
         if name not in self._defaults:
+            help_ = nearest(name, self._defaults)
             raise OdometryError(
-                f"parameters.{name}: {self.pipeline} has no such parameter; "
-                f"{nearest(name, self._defaults)}"
+                f"parameters.{name}: {self.pipeline} has no such parameter; {help_}"
             )
         default = self._defaults[name]
         if isinstance(default, float) and type(value) is int:
@@ -129,22 +117,16 @@ class Pipeline(OwnFrameOdometry):
         return value
 
     def prepare(self, scan: Scan) -> Prepared:
-        """See `Odometry.prepare`."""
         if self.needs_imu and scan.imu is None:
-            raise OdometryError(
-                f"{self.pipeline} needs an IMU, and the scans do not bring along what one measured"
-            )
-        cropped = crop(scan, self.settings.min_range, self.settings.max_range)
+            raise OdometryError(NO_IMU.format(self.pipeline))
+        cropped = point_layout.crop(scan, self.settings.min_range, self.settings.max_range)
         cloud, shape = self._layout(cropped)
         timed = cropped.times is not None and bool(np.ptp(cropped.times) if len(cropped) else 0)
-        return Prepared(scan.stamp, cloud, shape, len(cropped), timed, scan.imu)
+        return Prepared(scan.stamp, cloud, shape, len(cropped) >= MIN_POINTS, timed, scan.imu)
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         """Points as `FIELDS` has them, and their numbers of rows and columns."""
-        return cloud(scan, 4), (1, len(scan))
-
-    def _usable(self, prepared: Prepared) -> bool:
-        return prepared.size >= MIN_POINTS
+        return point_layout.cloud(scan, 4), (1, len(scan))
 
     def _begin(self, prepared: Prepared) -> None:
         pipelines, types, _ = evalio_modules()
@@ -156,14 +138,10 @@ class Pipeline(OwnFrameOdometry):
         self._needs_times = bool(parameters.get("deskew"))
         pipeline = pipelines.all_pipelines()[self.pipeline]()
         pipeline.set_params(parameters)
-        pipeline.set_lidar_params(
-            types.LidarParams(
-                num_rows=self._shape[0],
-                num_columns=self._shape[1],
-                min_range=self.settings.min_range,
-                max_range=self.settings.max_range,
-            )
-        )
+        ranges = {"min_range": self.settings.min_range, "max_range": self.settings.max_range}
+        rows, columns = self._shape
+        lidar = types.LidarParams(num_rows=rows, num_columns=columns, **ranges)
+        pipeline.set_lidar_params(lidar)
         self._T_imu_sensor = np.eye(4)
         if prepared.imu is not None:
             self._T_imu_sensor = invert(prepared.imu.T_sensor_imu)
@@ -173,41 +151,30 @@ class Pipeline(OwnFrameOdometry):
         self._pipeline = pipeline
 
     def _process(self, prepared: Prepared) -> Poses | None:
-        self._measure(prepared.imu)
-        if not self._usable(prepared) or (self._needs_times and not prepared.timed):
+        if self.needs_imu and prepared.imu is not None:
+            self._measure(prepared.imu)
+        if not prepared.usable or (self._needs_times and not prepared.timed):
             return None
         return self._estimate(prepared)
 
-    def _measure(self, imu: Imu | None) -> None:
+    def _measure(self, imu: Imu) -> None:
         """Pass on what the IMU measured."""
-        if imu is None or not self.needs_imu:
-            return
         types = evalio_modules()[1]
-        for stamp, gyro, acceleration in zip(
-            imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True
-        ):
-            self._pipeline.add_imu(
-                types.ImuMeasurement(types.Stamp.from_nsec(stamp), gyro, acceleration)
-            )
+        stamps = map(types.Stamp.from_nsec, imu.stamps.tolist())
+        for measured in zip(stamps, imu.angular_velocity, imu.acceleration, strict=True):
+            self._pipeline.add_imu(types.ImuMeasurement(*measured))
 
     def _estimate(self, prepared: Prepared) -> Poses | None:
         """Pass a scan on, and return the last pose that comes back."""
         self._pipeline.add_lidar(to_evalio(prepared))
         estimates = self._pipeline.saved_estimates()
-        if not estimates:
-            return None
-        T_own_imu: Poses = estimates[-1][1].to_mat()
-        return T_own_imu @ self._T_imu_sensor
+        return estimates[-1][1].to_mat() @ self._T_imu_sensor if estimates else None
 
 
 def _imu_parameters(imu: Imu) -> Any:
-    noise = imu.noise
     rate = 1e9 / float(np.median(np.diff(imu.stamps))) if len(imu) > 1 else 100.0
     return evalio_modules()[1].ImuParams(
-        gyro=noise.gyroscope,
-        accel=noise.accelerometer,
-        gyro_bias=noise.gyroscope_walk,
-        accel_bias=noise.accelerometer_walk,
+        **dict(zip(("gyro", "accel", "gyro_bias", "accel_bias"), imu.noise, strict=True)),
         gravity=np.array([0.0, 0.0, -GRAVITY]),
         rate=rate,
     )
@@ -216,28 +183,23 @@ def _imu_parameters(imu: Imu) -> Any:
 class RingedPipeline(Pipeline):
     """A pipeline that needs to know which laser measured each point."""
 
-    settings_type: ClassVar[type[BaseSettings]] = GridSettings
-
-    def __init__(
-        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
-    ):
-        super().__init__(parameters, settings)
-        self._rows, self._columns = self.settings.rows, self.settings.columns
+    settings_type = GridSettings
+    # What the settings leave open follows from the first scan.
+    _rows = _columns = 0
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         if scan.rings is None:
             raise OdometryError(
-                f"{self.pipeline} needs to know which laser measured each point, and the scans do "
-                f"not say; record clouds with a `ring` field"
+                NO_FIELD.format(self.pipeline, "which laser measured each point", "`ring`")
             )
-        points = cloud(scan, 5)
+        points = point_layout.cloud(scan, 5)
         if len(scan) < MIN_POINTS:
             return points, (1, len(scan))
         counts = np.bincount(scan.rings)
-        self._rows = self._rows or next(
-            n for n in (16, 32, 64, 128, 256, 65536) if n >= len(counts)
-        )
-        self._columns = self._columns or max(16, int(counts.max()))
+        if not self._rows:
+            sizes = (16, 32, 64, 128, 256, 65536)
+            self._rows = self.settings.rows or next(n for n in sizes if n >= len(counts))
+            self._columns = self.settings.columns or max(16, int(counts.max()))
         if len(counts) > self._rows:
             raise OdometryError(
                 f"odometry.settings.rows: {self._rows} rows do not hold laser number "
@@ -251,12 +213,12 @@ class GridPipeline(RingedPipeline):
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         points, shape = super()._layout(scan)
-        return points if len(scan) < MIN_POINTS else image(scan, points, *shape), shape
+        return points if len(scan) < MIN_POINTS else point_layout.image(scan, points, *shape), shape
 
     def _estimate(self, prepared: Prepared) -> Poses | None:
         if prepared.shape != self._shape:
+            before, now = ("{} x {}".format(*shape) for shape in (self._shape, prepared.shape))
             raise OdometryError(
-                f"{self.pipeline} began with scans of {self._shape[0]} x {self._shape[1]} points "
-                f"and cannot go on with {prepared.shape[0]} x {prepared.shape[1]}"
+                f"{self.pipeline} began with scans of {before} points and cannot go on with {now}"
             )
         return super()._estimate(prepared)

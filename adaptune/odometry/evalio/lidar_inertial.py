@@ -1,7 +1,6 @@
 """The pipelines of evalio that need a LiDAR and an IMU."""
 
 from collections import deque
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -32,18 +31,14 @@ class LioSam(RingedPipeline):
     pipeline = "liosam"
     needs_imu = True
     untuned: ClassVar[ParameterSet] = {"numberOfCores": 1, "mappingProcessInterval": 0.0}
-    space = ParameterSpace(
-        {
-            "edgeThreshold": Float(low=0.1, high=10.0, baseline=1.0, log=True),
-            "surfThreshold": Float(low=0.01, high=1.0, baseline=0.1, log=True),
-            "odometrySurfLeafSize": Float(low=0.1, high=1.5, baseline=0.4, log=True),
-            "mappingCornerLeafSize": Float(low=0.05, high=1.0, baseline=0.2, log=True),
-            "mappingSurfLeafSize": Float(low=0.1, high=1.5, baseline=0.4, log=True),
-            "surroundingkeyframeAddingDistThreshold": Float(
-                low=0.2, high=5.0, baseline=1.0, log=True
-            ),
-            "surroundingKeyframeSearchRadius": Float(low=10.0, high=100.0, baseline=50.0, log=True),
-        }
+    space = ParameterSpace.of(
+        edgeThreshold=Float(low=0.1, high=10.0, baseline=1.0, log=True),
+        surfThreshold=Float(low=0.01, high=1.0, baseline=0.1, log=True),
+        odometrySurfLeafSize=Float(low=0.1, high=1.5, baseline=0.4, log=True),
+        mappingCornerLeafSize=Float(low=0.05, high=1.0, baseline=0.2, log=True),
+        mappingSurfLeafSize=Float(low=0.1, high=1.5, baseline=0.4, log=True),
+        surroundingkeyframeAddingDistThreshold=Float(low=0.2, high=5.0, baseline=1.0, log=True),
+        surroundingKeyframeSearchRadius=Float(low=10.0, high=100.0, baseline=50.0, log=True),
     )
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
@@ -79,7 +74,7 @@ class LioSam(RingedPipeline):
         return T_own_sensor
 
 
-def _turned(measured: Sequence[Imu], start: int, stop: int) -> NDArray[np.float64]:
+def _turned(measured: list[Imu], start: int, stop: int) -> NDArray[np.float64]:
     """Rotation of the LiDAR from one stamp to another, by the gyroscope's mean rate."""
     stamps = np.concatenate([imu.stamps for imu in measured])
     rates = np.concatenate([imu.angular_velocity for imu in measured])
@@ -108,15 +103,13 @@ class Dlio(Pipeline):
         "calibrate_gyro": False,
         "calibrate_accel": False,
     }
-    space = ParameterSpace(
-        {
-            "vf_res": Float(low=0.1, high=1.0, baseline=0.25, log=True),
-            "gicp_max_corr_dist": Float(low=0.2, high=3.0, baseline=0.5, log=True),
-            "gicp_k_correspondences": Integer(low=8, high=32, baseline=16, log=True),
-            "keyframe_thresh_dist": Float(low=0.3, high=10.0, baseline=1.0, log=True),
-            "submap_knn": Integer(low=2, high=30, baseline=10, log=True),
-            "geo_Kp": Float(low=1.0, high=10.0, baseline=4.5, log=True),
-            "geo_Kv": Float(low=2.0, high=25.0, baseline=11.25, log=True),
-            "geo_Kq": Float(low=1.0, high=10.0, baseline=4.0, log=True),
-        }
+    space = ParameterSpace.of(
+        vf_res=Float(low=0.1, high=1.0, baseline=0.25, log=True),
+        gicp_max_corr_dist=Float(low=0.2, high=3.0, baseline=0.5, log=True),
+        gicp_k_correspondences=Integer(low=8, high=32, baseline=16, log=True),
+        keyframe_thresh_dist=Float(low=0.3, high=10.0, baseline=1.0, log=True),
+        submap_knn=Integer(low=2, high=30, baseline=10, log=True),
+        geo_Kp=Float(low=1.0, high=10.0, baseline=4.5, log=True),
+        geo_Kv=Float(low=2.0, high=25.0, baseline=11.25, log=True),
+        geo_Kq=Float(low=1.0, high=10.0, baseline=4.0, log=True),
     )

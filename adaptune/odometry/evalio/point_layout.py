@@ -4,73 +4,36 @@ Points go over as raw bytes, not one Python object each. The conversion is evali
 PointCloud2 messages, which is not documented: hence the pinned version.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import squared_ranges
-from adaptune.odometry.base import OdometryError
+from adaptune.odometry.base import import_extra
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
-
-MIN_POINTS = 20
 
 FIELDS = ("x", "y", "z", "t", "row")
 """A point as evalio reads it, four bytes each: float32 metres, uint32 nanoseconds since the scan's
 stamp, uint32 laser. The laser is left out where the pipeline does not ask for it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A scan in evalio's layout.
-
-    Attributes
-    ----------
-    stamp : int
-    cloud : ndarray of shape (n, 4) or (n, 5)
-        float32, the last columns hold bytes of uint32, see `FIELDS`; an image row by row.
-    shape : tuple of int
-        Rows and columns.
-    size : int
-        Number of points in range.
-    timed : bool
-        Whether the points have times that differ.
-    imu : Imu, optional
-    """
+class Prepared(NamedTuple):
+    """A scan in evalio's layout; the last columns of its cloud hold bytes of uint32."""
 
     stamp: int
-    cloud: NDArray[np.float32]
-    shape: tuple[int, int]
-    size: int
-    timed: bool
+    cloud: NDArray[np.float32]  # of shape (n, 4) or (n, 5), see `FIELDS`; an image row by row
+    shape: tuple[int, int]  # rows and columns
+    usable: bool  # whether enough points are in range
+    timed: bool  # whether the points have times that differ
     imu: Imu | None
 
-    @property
-    def nbytes(self) -> int:
-        """Memory, in bytes."""
-        return 256 + self.cloud.nbytes + (0 if self.imu is None else self.imu.nbytes)
 
-
-@cache
-def evalio_modules() -> Any:
-    """The modules ``pipelines``, ``types`` and ``_cpp.helpers`` of evalio.
-
-    Raises
-    ------
-    OdometryError
-        If evalio is not installed.
-    """
-    try:
-        from evalio import pipelines, types
-        from evalio._cpp import helpers
-    except ImportError as error:
-        raise OdometryError(
-            f"evalio cannot be imported ({error}); run `pip install 'adaptune[evalio]'`"
-        ) from error
-    return pipelines, types, helpers
+def evalio_modules() -> tuple[Any, ...]:
+    """The modules ``pipelines``, ``types`` and ``_cpp.helpers`` of evalio."""
+    return import_extra("evalio", "evalio.pipelines", "evalio.types", "evalio._cpp.helpers")
 
 
 @cache
@@ -112,7 +75,8 @@ def cloud(scan: Scan, n_fields: int) -> NDArray[np.float32]:
     points = np.empty((len(scan), n_fields), np.float32)
     points[:, :3] = scan.points
     whole = points.view(np.uint32)
-    whole[:, 3] = 0 if scan.times is None else nanoseconds(scan.times)
+    # None lies before the stamp.
+    whole[:, 3] = 0 if scan.times is None else np.maximum(scan.times, 0.0) * 1e9
     if n_fields > 4:
         whole[:, 4] = 0 if scan.rings is None else scan.rings
     return points
@@ -133,8 +97,3 @@ def image(scan: Scan, points: NDArray[np.float32], rows: int, columns: int) -> N
     row[:] = np.repeat(np.arange(rows, dtype=np.uint32), columns)
     pixels[points.view(np.uint32)[:, 4] * np.int64(columns) + column] = points
     return pixels
-
-
-def nanoseconds(times: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Seconds since a scan's stamp as whole nanoseconds; none lies before the stamp."""
-    return (np.maximum(times, 0.0) * 1e9).astype(np.uint32)

@@ -68,12 +68,17 @@ def test_weights_are_of_the_places_that_are_near():
         assert weights[best] > 0.85
 
 
-@pytest.mark.parametrize(("share", "kept"), [(0.5, 0.5), (1.0, 1.0)])
-def test_the_fixed_set_keeps_its_minimum_share(share, kept):
+@pytest.mark.parametrize(
+    ("settings", "kept"),
+    [
+        (BankSettings(min_fixed_share=0.5), 0.5),
+        (BankSettings(min_fixed_share=1.0), 1.0),
+        (BankSettings(adapt=False), 1.0),
+    ],
+)
+def test_the_fixed_set_keeps_its_minimum_share(settings, kept):
     data = places(np.random.default_rng(2))
-    weights = (
-        BankRule(BankSettings(min_fixed_share=share)).fit(data).select(data.features[0]).weights
-    )
+    weights = BankRule(settings).fit(data).select(data.features[0]).weights
     assert sum(weights.values()) == pytest.approx(1.0)
     assert weights[0] == pytest.approx(kept, abs=0.05)
 

@@ -1,0 +1,183 @@
+"""The courses of `gain.py`, and what odometries do on them with several parameter sets."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.archive import Frames
+from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
+from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
+from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
+from adaptune.files import replacing
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.registry import odometry_class
+from adaptune.parameter_sets import ParameterSets
+from adaptune.simulation import Course
+from adaptune.simulation.simulate import simulate
+from adaptune.space import ParameterSpace
+from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
+from offline.config import OfflineConfig
+from offline.labelled import LabelledData, LabelledSequence
+from offline.samplers import make_sampler
+from offline.trial import TrialSettings, run_trials
+
+ODOMETRIES = ("gicp", "ndt")
+N_SETS = 16
+KINDS = ("cave", "street", "open", "garden")
+PER_KIND = 4
+WINDOW = 3
+"""Selections whose descriptors are averaged."""
+PERIOD = 10
+"""Scans from one selection to the next."""
+
+
+def training_courses(seed: int, length: float) -> dict[str, Course]:
+    """All courses by name; no world is shared with another seed's."""
+    single = {
+        f"{kind}{i}": Course(scenes=(kind,), length=length, seed=1000 * seed + 10 * k + i)
+        for k, kind in enumerate(KINDS)
+        for i in range(PER_KIND)
+    }
+    orders: tuple[tuple[str, ...], ...] = (
+        ("cave", "open", "street"),
+        ("street", "garden", "cave"),
+        ("open", "cave", "garden"),
+        ("garden", "street", "open"),
+    )
+    orders += tuple(scenes[::-1] for scenes in orders)
+    mixed = {
+        f"mixed{i}": Course(scenes=scenes, length=0.4 * length, seed=1000 * seed + 100 + i)
+        for i, scenes in enumerate(orders)
+    }
+    return single | mixed
+
+
+def factory_of(name: str) -> OdometryFactory:
+    """An odometry with its default settings, all of whose parameters are tuned."""
+    cls: Any = odometry_class(name)
+    return OdometryFactory(name, {}, cls.space, Limits())
+
+
+class Prepared:
+    """Prepared scans of a course, in place of `offline.trial.PreparedSequence`."""
+
+    def __init__(self, name: str, prepared: list[Any], frames: Frames):
+        self.name, self._prepared, self.frames = name, prepared, frames
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._prepared)
+
+
+def run(path: Path, course: Course, odometry: str, seed: int) -> None:
+    """Run all sets of an odometry on a course, and keep the errors."""
+    scans = list(simulate(course))
+    frames = Frames(
+        np.array([scan.stamp for scan in scans]),
+        np.array([scan.T_world_sensor for scan in scans]),
+        np.array([ndt_histogram(scan.points) for scan in scans], np.float32),
+        {"ndt": N_FEATURES},
+        np.array([lowest_elevation(scan) for scan in scans], np.float32),
+    )
+    factory, settings = factory_of(odometry), TrialSettings()
+    config = OfflineConfig(sampler="sobol", batch=N_SETS, seed=seed)
+    sets = make_sampler(factory.space, config).propose([])
+    one = factory()
+    prepared: Any = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
+    trials = run_trials(settings, factory, prepared, sets)
+    length, lost_track = settings.sub_trajectory, settings.lost_track
+    vectors = [error_vectors(frames, trial, length) for trial in trials]
+    motions = recorded_motions(frames, trials, lost_track)[..., :3, :]
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            stamps=frames.stamps,
+            T_world_sensor=frames.T_ref_sensor,
+            histograms=frames.descriptors.astype(np.uint16),
+            sets=factory.space.to_unit(sets),
+            errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
+            vectors=np.stack(vectors, axis=1),
+            motions=motions.astype(np.float32),
+        )
+
+
+def trials(folder: Path, odometry: str, courses: dict[str, Course], seed: int) -> list[Path]:
+    """Run what has not been run yet, and return the files."""
+    paths = []
+    for name, course in courses.items():
+        path = folder / f"{odometry}-{seed}-{course.length:.0f}-{name}.npz"
+        paths.append(path)
+        if not path.exists():
+            run(path, course, odometry, seed)
+        with np.load(path) as found:
+            errors = found["errors"]
+            means = np.minimum(errors[~np.isnan(errors).any(axis=1)], 30.0).mean(axis=0)
+            print(
+                f"{odometry} {seed} {name:8} {len(errors):4} scans   "
+                f"best {means.min():6.3f}  median {np.median(means):6.3f} %",
+                flush=True,
+            )
+    return paths
+
+
+def labelled(paths: list[Path], space: ParameterSpace) -> LabelledData:
+    """The labelled data set; columns of the files are the trial numbers."""
+    sequences = []
+    for path in paths:
+        with np.load(path) as found:
+            sequences.append(labelled_sequence(path.stem.rsplit("-", 1)[1], found))
+            unit = found["sets"]
+    sets = ParameterSets(space, tuple(range(len(unit))), tuple(space.from_unit(unit)))
+    return LabelledData(sequences, sets)
+
+
+def labelled_sequence(name: str, found: Any) -> LabelledSequence:
+    """A sequence of the labelled data set, from the arrays in its file."""
+    errors, stamps, few = found["errors"], found["stamps"], found["motions"]
+    known = ~np.isnan(errors).any(axis=1)
+    period = (stamps - stamps[0]) // 10**9
+    described = averaged(found["histograms"].astype(np.float32), stamps, WINDOW, 1.0)
+    motions: NDArray[np.float64] = np.tile(np.eye(4), (*few.shape[:2], 1, 1))
+    motions[..., :3, :] = few
+    settings = TrialSettings()
+    simulation = BankSimulation(
+        stamps,
+        found["T_world_sensor"],
+        described,
+        period,
+        settings.sub_trajectory,
+        settings.lost_track,
+        partial(np.take, motions, axis=1),
+    )
+    return LabelledSequence(
+        name,
+        period[known],
+        described[known],
+        errors[known],
+        vectors=found["vectors"][known],
+        simulation=simulation,
+    )
+
+
+def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
+    """Describe a scan each second by every descriptor, and return the files."""
+    paths = []
+    for name, course in courses.items():
+        path = folder / f"descriptors-{seed}-{course.length:.0f}-{name}.npz"
+        paths.append(path)
+        if path.exists():
+            with np.load(path) as found:
+                if set(DESCRIPTORS) <= set(found.files):
+                    continue
+        scans = list(simulate(course))[::PERIOD]
+        of = {d: np.array([descriptor(d)(s) for s in scans], np.float32) for d in DESCRIPTORS}
+        stamps, poses = zip(*((scan.stamp, scan.T_world_sensor) for scan in scans), strict=True)
+        of[MOTION] = speed_and_turn_rate(np.array(stamps), np.array(poses)).astype(np.float32)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **of)  # type: ignore[arg-type]
+        print(f"{name} is described", flush=True)
+    return paths
