@@ -1,5 +1,6 @@
 """The documentation leads where it says, and names commands that exist."""
 
+import ast
 import re
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 GUIDE = [page for page in (ROOT / "docs").glob("*.md") if page.stem != "README"]
 CODE = re.compile(r"^```.*?^```|^    .*?$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
+IMPORTS = (ast.Import, ast.ImportFrom)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 
 
@@ -63,3 +65,11 @@ def test_commands_exist(page):
     code = "\n".join(CODE.findall(page.read_text(encoding="utf-8")))
     named = set(re.findall(r"(?:^|[\s`/])adaptune ([a-z]+)\b", code))
     assert named <= set(get_command(app).commands)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_imports_in_examples_exist(page):
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
+        imports = [node for node in ast.parse(block).body if isinstance(node, IMPORTS)]
+        ours = [node for node in imports if re.search("adaptune|offline|online", ast.unparse(node))]
+        exec(ast.unparse(ast.Module(ours, [])), {})

@@ -8,7 +8,7 @@ import drives
 import numpy as np
 import pytest
 
-from adaptune.model import BankSettings, PairedSettings
+from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.trajectory import read_tum
 from offline.offline_study import load_study
 from offline.train import train
@@ -35,15 +35,15 @@ def test_the_example_is_what_adaptune_online_does(folder, monkeypatch, bank):
     monkeypatch.chdir(folder)
     overrides = ["offline.trials=6", "online.switching.cores=2"]
     study = load_study("my.yaml", overrides)
-    from adaptune.model import ErrorModel
-
     model = ErrorModel.load(study.model_path)
     settings = BankSettings() if bank else BankSettings(adapt=False)
     replace(model, paired=PairedSettings(), bank_settings=settings).save(study.model_path)
     run_replays(study, study.model_path)
     poses = []
     example = EXAMPLE.replace('"my.yaml"', f'"my.yaml", {overrides}')
-    exec(example + "    poses.append(T_odom_sensor)\n", {"poses": poses})
+    last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
+    assert last in example
+    exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})
     replayed = read_tum(study.folder / "replays/home/paired/trajectory.tum")
     np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
     weights = (study.folder / "replays/home/paired/selections.csv").read_text()
