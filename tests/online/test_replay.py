@@ -215,10 +215,8 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
         {"max_correspondence_distance": 0.7, "keyframe_interval": 3.0},
     ]
 
-    results = [
-        replay(drive, InProcess(KeyframeGicp(sets[0])), HealthCheck(), Chooser(sets))
-        for _ in range(2)
-    ]
+    odometries = [InProcess(KeyframeGicp(sets[0])) for _ in range(2)]
+    results = [replay(drive, one, HealthCheck(), Chooser(sets)) for one in odometries]
     a, b = (r.trajectory.T_world_sensor for r in results)
     np.testing.assert_array_equal(a, b)
     assert abs(a[-1, 0, 3] - 24 * 0.3) < 0.1

@@ -90,7 +90,7 @@ def test_faults_are_told_and_another_start_goes_on(fault, caplog):
         (ProcessSettings(command=("no-such-program",)), "no-such-program: not found"),
         (
             ProcessSettings(address="tcp://127.0.0.1:9"),
-            r"nothing listens at tcp://127.0.0.1:9 \(.*\): start the program",
+            r"nothing listens at tcp://127.0.0.1:9 \(Conn.*\): start the program there first",
         ),
         (ProcessSettings(address="unix:/nowhere/there"), r"nothing listens at unix:/nowhere/there"),
         (ProcessSettings(address="127.0.0.1:9000"), "neither tcp://HOST:PORT nor unix:PATH"),
