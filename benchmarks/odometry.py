@@ -25,7 +25,7 @@ import small_gicp
 from adaptune import cores, open3d
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import OdometryInstance, WarmUp
+from adaptune.odometry import InProcess, OdometryInstance, WarmUp
 from adaptune.odometry.hand_over import HandOver
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
@@ -156,7 +156,7 @@ def adapters(path: Path, length: float) -> None:
         isolated = ""
         if not cls.clean:
             some = scans[:SOME]
-            here = run(cls(), some)[1]
+            here = run(InProcess(cls()), some)[1]
             there = run(Isolated(name, {}, cls.settings_type(), Limits()), some)[1]
             isolated = f"{there - here:.2f}"
         rte = np.nanmean(sub_trajectory_rte(T_ref, poses, length))
@@ -185,9 +185,9 @@ def rte_of(
     return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
 
 
-def there_and_back(odometry: Any) -> None:
+def there_and_back(odometry: InProcess) -> None:
     """Change all real numbers a little and back, so that an odometry does the work of a switch."""
-    real = {name: v for name, v in odometry.parameters.items() if isinstance(v, float)}
+    real = {name: v for name, v in odometry.odometry.parameters.items() if isinstance(v, float)}
     odometry.apply(Selection(0, {name: v * (1.0 + 1e-9) for name, v in real.items()}))
     odometry.apply(Selection(0, real))
 
@@ -201,7 +201,9 @@ def switching(path: Path, names: list[str]) -> None:
         cls = odometry_class(name)
 
         def make(_: Any, name: str = name, cls: Any = cls) -> OdometryInstance:
-            return cls() if cls.clean else Isolated(name, {}, cls.settings_type(), Limits())
+            if cls.clean:
+                return InProcess(cls())
+            return Isolated(name, {}, cls.settings_type(), Limits())
 
         row = [rte_of(make({}), scans, T_ref)]
         for warm_up in WARM_UPS:
@@ -210,7 +212,7 @@ def switching(path: Path, names: list[str]) -> None:
             row.append(rte_of(odometry, scans, T_ref, switch))
         itself = ""
         if cls.live:
-            live: Any = cls()
+            live = InProcess(cls())
             itself = f"{rte_of(live, scans, T_ref, lambda _, live=live: there_and_back(live)):8.3f}"
         print(
             f"{name:16} {row[0]:7.3f} " + "".join(f"{r:10.3f}" for r in row[1:]), itself, flush=True

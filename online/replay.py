@@ -82,7 +82,7 @@ class Schedule:
         return True
 
 
-class Step(NamedTuple):
+class RegisteredScan(NamedTuple):
     """What became of a scan."""
 
     stamp: int
@@ -99,12 +99,12 @@ class Tracker:
 
     odometry: OdometryInstance  # a new instance
     health: HealthCheck
-    _last: Step | None = field(default=None, init=False)
+    _last: RegisteredScan | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._guard = Guard(self.health)
 
-    def register(self, scan: Scan) -> Step:
+    def register(self, scan: Scan) -> RegisteredScan:
         """Find the pose of the next scan."""
         begin = time.perf_counter()
         prepared = self.odometry.prepare(scan)
@@ -124,7 +124,7 @@ class Tracker:
                 T_odom_sensor = T_odom_previous @ T_healthy
                 self.odometry.start(prepared, T_odom_sensor, T_healthy)
         end = time.perf_counter()
-        self._last = Step(
+        self._last = RegisteredScan(
             scan.stamp, T_odom_sensor, registered, unhealthy, ready - begin, end - ready
         )
         return self._last
@@ -167,7 +167,7 @@ def replay(
     """
     begin = time.perf_counter()
     schedule, tracker = Schedule(period), Tracker(odometry, health)
-    steps: list[Step] = []
+    steps: list[RegisteredScan] = []
     choices: list[Choice] = []
     for scan in scans:
         if selector is not None:
@@ -184,7 +184,7 @@ def replay(
     return _recorded(steps, choices, time.perf_counter() - begin)
 
 
-def _recorded(steps: list[Step], choices: list[Choice], seconds: float) -> Replay:
+def _recorded(steps: list[RegisteredScan], choices: list[Choice], seconds: float) -> Replay:
     stamps, poses, registered, unhealthy, prepare, register = zip(*steps, strict=True)
     return Replay(
         Trajectory(np.array(stamps, np.int64), np.array(poses)),

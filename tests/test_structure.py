@@ -115,6 +115,17 @@ def test_no_two_modules_share_a_name() -> None:
     report(" and ".join(sorted(files)) for files in places.values() if len(files) > 1)
 
 
+def test_no_two_classes_share_a_name() -> None:
+    places = defaultdict(set)
+    for file in tracked(*PACKAGES):
+        for node in ast.walk(parse(file)):
+            if isinstance(node, ast.ClassDef) and not is_private(node.name):
+                places[node.name].add(f"{file}:{node.lineno}")
+    report(
+        f"{name}: {' and '.join(sorted(where))}" for name, where in places.items() if len(where) > 1
+    )
+
+
 def is_module(name: str) -> bool:
     path = ROOT.joinpath(*name.split("."))
     return path.is_dir() or path.with_suffix(".py").exists()

@@ -9,3 +9,4 @@ from adaptune.odometry.base import OdometryInstance as OdometryInstance
 from adaptune.odometry.base import Registration as Registration
 from adaptune.odometry.base import Usage as Usage
 from adaptune.odometry.base import WarmUp as WarmUp
+from adaptune.odometry.in_process import InProcess as InProcess

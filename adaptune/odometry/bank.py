@@ -6,7 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, mean_motion, rectify
-from adaptune.odometry.base import Motions, OdometryError, Recorded, Registration, Usage, WarmUp
+from adaptune.odometry.base import (
+    LastMotion,
+    Motions,
+    OdometryError,
+    OdometryInstance,
+    Registration,
+    Usage,
+    WarmUp,
+)
 from adaptune.odometry.warm_up import Make, PreparedScan, RecentScans
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
@@ -16,7 +24,7 @@ TRUST = 0.3
 """By how much the vote of a bank's first member exceeds its weight where members disagree."""
 
 
-class Bank(Recorded):
+class Bank(OdometryInstance):
     """Several instances, each with its own parameters and each on every scan.
 
     The pose moves by the weighted mean of their motions. A member whose motion departs from those
@@ -51,6 +59,7 @@ class Bank(Recorded):
         self._weights = np.eye(len(sets))[0]
         self._lost_track = lost_track
         self._recent = RecentScans(warm_up, self._members[0])
+        self._last_motion = LastMotion()
 
     @property
     def faults(self) -> list[str]:
@@ -64,7 +73,7 @@ class Bank(Recorded):
     def motions(self) -> Motions:
         # Of a member before it was restarted.
         members = dict(zip(self.trials, self._T_previous_current, strict=True))
-        return super().motions._replace(members=members)
+        return self._last_motion.motions._replace(members=members)
 
     def prepare(self, scan: Scan) -> PreparedScan:
         return PreparedScan.by(self._members[0], scan)
@@ -74,7 +83,10 @@ class Bank(Recorded):
         weights = {selection.trial: 1.0} if selection.weights is None else selection.weights
         if unknown := sorted(set(weights) - set(self.trials)):
             held, others = (", ".join(map(str, trials)) for trials in (self.trials, unknown))
-            raise OdometryError(f"the bank holds trials {held}, not {others}")
+            raise OdometryError(
+                f"the bank holds trials {held}, not {others}: select among its members, or make it "
+                f"with these trials"
+            )
         self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
 
     def start(
@@ -84,6 +96,7 @@ class Bank(Recorded):
             member.start(prepared.prepared, T_odom_sensor, T_previous_current)
         self._T_previous_current = self._member_motions()
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
+        self._last_motion.start(T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: PreparedScan) -> None:
         self._submitted = prepared
@@ -97,11 +110,14 @@ class Bank(Recorded):
         seconds = (prepared.stamp - self._recent.last.scan.stamp) * 1e-9
         agreeing = agreement(T_previous_current, self._weights, self._lost_track * seconds)
         if not agreeing.any():
-            return Registration(np.full((4, 4), np.nan), registered=False)
+            T_odom_sensor = np.full((4, 4), np.nan)
+            self._last_motion.move(T_odom_sensor)
+            return Registration(T_odom_sensor, registered=False)
         shares = share(self._weights, agreeing)[agreeing]
         T_moved = mean_motion(T_previous_current[agreeing], shares)
         T_odom_sensor = rectify(self._recent.last.T_odom_sensor @ T_moved)
         self._recent.add(prepared, T_odom_sensor)
+        self._last_motion.move(T_odom_sensor)
         for i in np.flatnonzero(~agreeing):
             # A single member may be the only one that is not lost.
             if agreeing.sum() > 1 or not np.isfinite(T_previous_current[i]).all():

@@ -1,9 +1,8 @@
 """What every odometry offers, and the base class of adapters."""
 
-import functools
-import time
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -50,8 +49,8 @@ class WarmUp(NamedTuple):
     """Which of the last scans a new instance sees before it takes over."""
 
     seconds: float = 12.0  # how far back they go
-    full_rate: float = 4.0  # of the most recent scans, those of so many seconds are all seen
-    stride: int = 1  # of the scans before, every so many is seen
+    full_rate: float = 4.0  # seconds before the newest scan in which it sees every scan
+    stride: int = 1  # of the scans before those, it sees every `stride`-th
 
 
 class Registration(NamedTuple):
@@ -178,85 +177,33 @@ class OdometryInstance(Protocol):
         """End all processes of this odometry."""
 
 
-class _Record:
-    """The last two poses of an instance, and the CPU time of its registrations."""
+class LastMotion:
+    """The motion over the last scan, from one pose to the next."""
 
     def __init__(self) -> None:
-        self.busy, self.cpu = False, 0.0
-        self._started_with: Poses | None = np.eye(4)
-        self._T_before = self._T_now = np.eye(4)
+        self.start(np.eye(4))
 
-    def start(
-        self,
-        prepared: Any,  # noqa: ARG002
-        T_odom_sensor: Poses,
-        T_previous_current: Poses | None = None,
-    ) -> None:
+    def start(self, T_odom_sensor: Poses, T_previous_current: Poses | None = None) -> None:
+        """Begin at a pose, with the motion that led there; None if the sensor stood still."""
         self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
+        self._T_before: Poses | None = None
         self._T_now = np.array(T_odom_sensor)
 
-    def register(self, T_odom_sensor: Poses, cpu: float) -> None:
+    def move(self, T_odom_sensor: Poses) -> None:
+        """Move to the pose of the next scan."""
         # A copy, in case the odometry changes its pose in place.
         self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor)
-        self._started_with = None
-        self.cpu += cpu
-
-    @property
-    def motion(self) -> Poses:
-        if self._started_with is not None:
-            return self._started_with
-        return invert(self._T_before) @ self._T_now
-
-
-def _recorded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method that records its calls, except those that are part of another one."""
-
-    @functools.wraps(method)
-    def recorded(self: "Recorded", *arguments: Any, **named: Any) -> Any:
-        record, begin = self._odometry_record, time.process_time()
-        if record.busy:
-            return method(self, *arguments, **named)
-        record.busy = True
-        try:
-            registration = method(self, *arguments, **named)
-        finally:
-            record.busy = False
-        if name == "start":
-            record.start(*arguments, **named)
-        else:
-            record.register(registration.T_odom_sensor, time.process_time() - begin)
-        return registration
-
-    return recorded
-
-
-class Recorded(OdometryInstance):
-    """Records motion and CPU time, whatever a subclass does to find poses.
-
-    For that it wraps `start`, `register` and `collect` of each subclass.
-    """
-
-    def __init_subclass__(cls, **keywords: Any):
-        super().__init_subclass__(**keywords)
-        for name in {"start", "register", "collect"} & vars(cls).keys():
-            setattr(cls, name, _recorded(name, vars(cls)[name]))
-
-    @functools.cached_property
-    def _odometry_record(self) -> _Record:
-        return _Record()
-
-    @property
-    def usage(self) -> Usage:
-        """CPU time of the registrations; the memory is that of this process."""
-        return Usage(self._odometry_record.cpu, None)
 
     @property
     def motions(self) -> Motions:
-        return Motions(self._odometry_record.motion, {})
+        """The motion, without members."""
+        if self._T_before is None:
+            return Motions(self._started_with, {})
+        return Motions(invert(self._T_before) @ self._T_now, {})
 
 
-class Odometry(Recorded):
-    """A LiDAR odometry in this process; base class of adapters.
+class Odometry(ABC):
+    """A LiDAR odometry; base class of adapters. `InProcess` runs one as an instance.
 
     A new instance knows nothing; `start` places it, `register` moves it on scan by scan. All of
     it runs on one thread, so that the same scans give the same poses. An adapter implements
@@ -300,7 +247,6 @@ class Odometry(Recorded):
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
     warm_up: ClassVar[WarmUp] = WarmUp()
-    faults: Sequence[str] = ()
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -314,17 +260,18 @@ class Odometry(Recorded):
         return Description(cls.space, cls.live, cls.needs_imu, cls.warm_up)
 
     @abstractmethod
+    def prepare(self, scan: Scan) -> Any:
+        """Prepare a scan for all instances with the same settings; see `OdometryInstance`."""
+
+    @abstractmethod
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        """Forget all scans and begin with this one; see `OdometryInstance`."""
+
+    @abstractmethod
     def register(self, prepared: Any) -> Registration:
         """Find the pose of the next scan."""
-
-    def submit(self, prepared: Any) -> None:
-        self.__submitted = prepared
-
-    def collect(self) -> Registration:
-        return self.register(self.__submitted)
-
-    def apply(self, selection: Selection) -> None:
-        self.configure(selection.parameters)
 
     def configure(self, parameters: ParameterSet) -> None:
         """Change parameters between scans; the others stay.
@@ -335,7 +282,10 @@ class Odometry(Recorded):
             If the odometry is not `live`, or has no such parameter.
         """
         if not self.live:
-            raise OdometryError(f"{type(self).__name__} cannot change its parameters between scans")
+            raise OdometryError(
+                f"{type(self).__name__} cannot change its parameters between scans: "
+                f"set online.switching.mechanism to hand_over or bank"
+            )
         self.parameters |= self._known(parameters)
 
     def _known(self, parameters: ParameterSet) -> ParameterSet:
@@ -345,7 +295,7 @@ class Odometry(Recorded):
         return parameters
 
 
-@functools.cache
+@cache
 def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
     """Import modules of a package that one of adaptune's extras installs; an error without it."""
     try:

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from logging import getLogger
@@ -18,7 +19,16 @@ from pydantic import AfterValidator
 
 from adaptune.geometry import Poses, invert
 from adaptune.odometry import isolation
-from adaptune.odometry.base import BaseSettings, Description, OdometryError, Recorded, Registration
+from adaptune.odometry.base import (
+    BaseSettings,
+    Description,
+    LastMotion,
+    Motions,
+    OdometryError,
+    OdometryInstance,
+    Registration,
+    Usage,
+)
 from adaptune.odometry.frame_check import check_frame
 from adaptune.odometry.isolation import Arguments, Limits
 from adaptune.odometry.program_input import ProgramInput
@@ -38,7 +48,7 @@ _COVERAGE = 0.9
 _PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
 
 
-class Settings(BaseSettings):
+class CommandSettings(BaseSettings):
     """A program and its files.
 
     Attributes
@@ -68,7 +78,7 @@ class Settings(BaseSettings):
     extrinsic: Transform | None = None
 
 
-class Command(Recorded):
+class Command(OdometryInstance):
     """A program that runs once on a whole recording, and its trajectory.
 
     It cannot restart on the way: where `start` places it elsewhere, its motions go on from there.
@@ -88,12 +98,12 @@ class Command(Recorded):
     """
 
     faults: Sequence[str] = ()
-    settings_type = Settings
+    settings_type = CommandSettings
 
     def __init__(
         self,
         parameters: ParameterSet,
-        settings: Settings,
+        settings: CommandSettings,
         limits: Limits,
         read: Callable[[], ProgramInput] | None = None,
         strict: bool = False,
@@ -102,14 +112,24 @@ class Command(Recorded):
         self._limits, self._read_input, self._strict = limits, read, strict
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_odom_own = np.eye(4)
+        self._cpu = 0.0
+        self._last_motion = LastMotion()
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(self._cpu, None)
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
 
     @staticmethod
-    def describe(settings: Settings) -> Description:  # noqa: ARG004
+    def describe(settings: CommandSettings) -> Description:  # noqa: ARG004
         """The study defines the parameters, and nothing can change on the way."""
         return Description(space=None, live=False, whole=True)
 
     @staticmethod
-    def check(settings: Settings, parameters: ParameterSet) -> None:
+    def check(settings: CommandSettings, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if there is no such program, or no way for a parameter to it."""
         program, *arguments = settings.command
         if shutil.which(program) is None:
@@ -126,10 +146,7 @@ class Command(Recorded):
         return np.array(scan.stamp, np.int64)  # nothing else is needed
 
     def start(
-        self,
-        prepared: Any,
-        T_odom_sensor: Poses,
-        T_previous_current: Poses | None = None,  # noqa: ARG002
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         if self._T_own_sensor is None:
             if self._read_input is None:
@@ -138,16 +155,22 @@ class Command(Recorded):
             poses = self._run(given)
             self._T_own_sensor = dict(zip(given.stamps.tolist(), poses, strict=True))
         self._T_odom_own = T_odom_sensor @ invert(self._own(prepared))
+        self._last_motion.start(T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: NDArray[np.int64]) -> None:
         self._submitted = prepared
 
     def collect(self) -> Registration:
+        begin = time.process_time()
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
+        self._last_motion.move(T_odom_sensor)
+        self._cpu += time.process_time() - begin
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
 
     def apply(self, selection: Selection) -> None:  # noqa: ARG002
-        raise OdometryError("a program that runs whole recordings cannot change its parameters")
+        raise OdometryError(
+            "a program that runs whole recordings cannot change its parameters: give it one set"
+        )
 
     def _own(self, stamp: NDArray[np.int64]) -> Poses:
         assert self._T_own_sensor is not None

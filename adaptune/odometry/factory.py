@@ -7,6 +7,7 @@ from typing import Any
 
 from adaptune.odometry.base import Description, OdometryInstance
 from adaptune.odometry.command import Command
+from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import Process
 from adaptune.odometry.program_input import ProgramInput
@@ -95,5 +96,5 @@ class OdometryFactory:
         if issubclass(cls, Process):
             return cls(given, self.settings, self.limits)
         if cls.clean and not isolated:
-            return cls(given, self.settings)
+            return InProcess(cls(given, self.settings))
         return Isolated(self.name, given, self.settings, self.limits)

@@ -8,7 +8,13 @@ import small_gicp
 
 from adaptune.geometry import Poses
 from adaptune.odometry.base import MIN_POINTS
-from adaptune.odometry.keyframe import Alignment, KeyframeOdometry, Prepared, Settings, crop
+from adaptune.odometry.keyframe import (
+    Alignment,
+    KeyframeOdometry,
+    KeyframeSettings,
+    PreparedCloud,
+    crop,
+)
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 
@@ -16,25 +22,27 @@ from adaptune.space import Float, ParameterSpace
 class _SmallGicp(KeyframeOdometry):
     """A keyframe odometry on small_gicp."""
 
-    settings_type = Settings
+    settings_type = KeyframeSettings
 
-    def prepare(self, scan: Scan) -> Prepared:
+    def prepare(self, scan: Scan) -> PreparedCloud:
         points = crop(scan, self.settings.min_range)
         # small_gicp crashes on an empty target, and calls a guess from too few points converged.
         if len(points) < MIN_POINTS:
-            return Prepared(scan.stamp, None, usable=False, nbytes=0)
+            return PreparedCloud(scan.stamp, None, usable=False, nbytes=0)
         cloud, tree = small_gicp.preprocess_points(
             points, downsampling_resolution=self.settings.downsampling, num_threads=1
         )
         # Points, normals, covariances (4 + 4 + 16 doubles) and the tree.
         nbytes = 4096 + 230 * cloud.size()
-        return Prepared(scan.stamp, cloud, cloud.size() >= MIN_POINTS, nbytes, tree)
+        return PreparedCloud(scan.stamp, cloud, cloud.size() >= MIN_POINTS, nbytes, tree)
 
     @abstractmethod
-    def _pair(self, target: Prepared, source: Prepared) -> tuple[tuple[Any, ...], Any]:
+    def _pair(self, target: PreparedCloud, source: PreparedCloud) -> tuple[tuple[Any, ...], Any]:
         """What small_gicp aligns, and the greatest distance of correspondences in metres."""
 
-    def align(self, target: Prepared, source: Prepared, T_target_guess: Poses) -> Alignment:
+    def align(
+        self, target: PreparedCloud, source: PreparedCloud, T_target_guess: Poses
+    ) -> Alignment:
         clouds, distance = self._pair(target, source)
         result = small_gicp.align(
             *clouds,
@@ -54,7 +62,7 @@ class KeyframeGicp(_SmallGicp):
         keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True),
     )
 
-    def _pair(self, target: Prepared, source: Prepared) -> tuple[tuple[Any, ...], Any]:
+    def _pair(self, target: PreparedCloud, source: PreparedCloud) -> tuple[tuple[Any, ...], Any]:
         distance = self.parameters["max_correspondence_distance"]
         return (target.cloud, source.cloud, target.tree), distance
 
@@ -67,9 +75,9 @@ class KeyframeVgicp(_SmallGicp):
         keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True),
     )
     # The keyframe's cells, with the cloud and the resolution that they were made from.
-    _cells: tuple[Prepared, Any, Any] | None = None
+    _cells: tuple[PreparedCloud, Any, Any] | None = None
 
-    def _pair(self, target: Prepared, source: Prepared) -> tuple[tuple[Any, ...], Any]:
+    def _pair(self, target: PreparedCloud, source: PreparedCloud) -> tuple[tuple[Any, ...], Any]:
         resolution = self.parameters["resolution"]
         if self._cells is None or self._cells[0] is not target or self._cells[1] != resolution:
             cells = small_gicp.GaussianVoxelMap(resolution)

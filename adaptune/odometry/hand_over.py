@@ -3,14 +3,21 @@
 import numpy as np
 
 from adaptune.geometry import Poses, invert, rectify
-from adaptune.odometry.base import OdometryInstance, Recorded, Registration, Usage, WarmUp
+from adaptune.odometry.base import (
+    LastMotion,
+    Motions,
+    OdometryInstance,
+    Registration,
+    Usage,
+    WarmUp,
+)
 from adaptune.odometry.warm_up import Make, PreparedScan, RecentScans, Successor
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 
 
-class HandOver(Recorded):
+class HandOver(OdometryInstance):
     """An odometry that a new instance replaces when its parameters change.
 
     The new instance first sees the scans of the last seconds, from the pose and the motion that
@@ -44,6 +51,7 @@ class HandOver(Recorded):
         self._T_odom_own = np.eye(4)
         self._ended_faults: list[str] = []
         self._ended_usage = Usage(0.0, None)
+        self._last_motion = LastMotion()
 
     @property
     def faults(self) -> list[str]:
@@ -52,6 +60,10 @@ class HandOver(Recorded):
     @property
     def usage(self) -> Usage:
         return Usage.total([self._ended_usage, *(one.usage for one in self._instances)], max)
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
 
     @property
     def _instances(self) -> list[OdometryInstance]:
@@ -69,6 +81,7 @@ class HandOver(Recorded):
         self._current.start(prepared.prepared, T_odom_sensor, T_previous_current)
         self._T_odom_own = np.eye(4)
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
+        self._last_motion.start(T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: PreparedScan) -> None:
         self._submitted = prepared
@@ -81,6 +94,7 @@ class HandOver(Recorded):
             successor.catch_up(self._catch_up_scans - 1)
         T_own_sensor, registered = self._current.collect()
         T_odom_sensor = self._T_odom_own @ T_own_sensor
+        self._last_motion.move(T_odom_sensor)
         if np.isfinite(T_odom_sensor).all():
             self._recent.add(self._submitted, T_odom_sensor)
             if successor is not None:

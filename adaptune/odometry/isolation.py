@@ -20,7 +20,15 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
-from adaptune.odometry.base import BaseSettings, OdometryError, Recorded, Registration, Usage
+from adaptune.odometry.base import (
+    BaseSettings,
+    LastMotion,
+    Motions,
+    OdometryError,
+    OdometryInstance,
+    Registration,
+    Usage,
+)
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
@@ -66,11 +74,11 @@ class Limits(BaseModel):
     memory: float = Field(4.0, gt=0)
 
 
-class Isolated(Recorded):
+class Isolated(OdometryInstance):
     """An odometry that lives in another process, a new one with every start.
 
-    If that process ends, or returns a pose that is none, this is a *fault*: the pose of that scan
-    is NaN, and so are all that follow until a new start. A fault quotes the last lines that the
+    If that process ends, or returns an invalid pose, this is a *fault*: the pose of that scan is
+    NaN, and so are all that follow until a new start. A fault quotes the last lines that the
     odometry wrote.
 
     Parameters
@@ -96,10 +104,15 @@ class Isolated(Recorded):
         }
         self._limits = limits
         self._stream: BinaryIO | None = None
+        self._last_motion = LastMotion()
 
     @property
     def usage(self) -> Usage:
         return Usage(self._cpu, self._memory)
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
 
     def prepare(self, scan: Scan) -> Scan:
         return scan  # the other process prepares
@@ -107,6 +120,7 @@ class Isolated(Recorded):
     def start(
         self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
+        self._last_motion.start(T_odom_sensor, T_previous_current)
         if self._fresh:
             self.close()
         if self._stream is None:
@@ -126,6 +140,12 @@ class Isolated(Recorded):
         self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
 
     def collect(self) -> Registration:
+        registration = self._registration()
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _registration(self) -> Registration:
+        """The answer to the submitted scan; NaN if there is none, or a wrong one."""
         answer, lost = self._receive(), Registration(np.full((4, 4), np.nan), registered=False)
         if answer is None:
             return lost
@@ -149,8 +169,12 @@ class Isolated(Recorded):
         return Registration(T_odom_sensor.copy(), bool(registered))
 
     def apply(self, selection: Selection) -> None:
-        self.parameters |= selection.parameters
-        self._ask({"type": "configure", "parameters": selection.parameters})
+        self.configure(selection.parameters)
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """Change parameters between scans; the others stay."""
+        self.parameters |= parameters
+        self._ask({"type": "configure", "parameters": parameters})
 
     def close(self) -> None:
         if self._stream is not None:

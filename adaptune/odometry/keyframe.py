@@ -15,7 +15,7 @@ JITTER = 0.1
 turns more steadily than its stamps say, and a missing scan doubles the time."""
 
 
-class Settings(BaseSettings):
+class KeyframeSettings(BaseSettings):
     """Settings of keyframe odometries, in metres."""
 
     downsampling: float = Field(0.5, gt=0)
@@ -23,7 +23,7 @@ class Settings(BaseSettings):
     iterations: int = Field(20, ge=1)
 
 
-class Prepared(NamedTuple):
+class PreparedCloud(NamedTuple):
     """A downsampled cloud, whether it has enough points, its bytes, and its tree if it has one."""
 
     stamp: int

@@ -16,7 +16,7 @@ from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 
 
-class Prepared(NamedTuple):
+class KissScan(NamedTuple):
     """Points, their times as shares of the turn, and whether enough are in range."""
 
     points: NDArray[np.float64]
@@ -74,7 +74,7 @@ class Kiss(Odometry):
                 begin.adaptive_threshold.initial_threshold = kiss.adaptive_threshold.get_threshold()
             kiss.adaptive_threshold = get_threshold_estimator(begin)
 
-    def prepare(self, scan: Scan) -> Prepared:
+    def prepare(self, scan: Scan) -> KissScan:
         points = scan.points.astype(np.float64)
         n_in_range = count_within(points, self.settings.min_range, self.settings.max_range)
         times = np.empty(0)
@@ -83,10 +83,10 @@ class Kiss(Odometry):
             first, last = float(scan.times.min()), float(scan.times.max())
             if last > first:
                 times = (scan.times.astype(np.float64) - first) / (last - first)
-        return Prepared(points, times, n_in_range >= MIN_POINTS)
+        return KissScan(points, times, n_in_range >= MIN_POINTS)
 
     def start(
-        self, prepared: Prepared, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+        self, prepared: KissScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self._kiss = KissICP(self._config())
         self._kiss.last_delta = np.eye(4) if T_previous_current is None else T_previous_current
@@ -94,7 +94,7 @@ class Kiss(Odometry):
         self._kiss.last_pose = T_odom_sensor @ np.linalg.inv(self._kiss.last_delta)
         self.register(prepared)
 
-    def register(self, prepared: Prepared) -> Registration:
+    def register(self, prepared: KissScan) -> Registration:
         kiss = self._kiss
         if not prepared.usable:
             kiss.last_pose = kiss.last_pose @ kiss.last_delta

@@ -6,12 +6,12 @@ from adaptune import open3d
 from adaptune.geometry import Poses
 from adaptune.odometry import keyframe
 from adaptune.odometry.base import MIN_POINTS
-from adaptune.odometry.keyframe import Alignment, KeyframeOdometry, Prepared
+from adaptune.odometry.keyframe import Alignment, KeyframeOdometry, PreparedCloud
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 
 
-class Settings(keyframe.Settings):
+class NdtSettings(keyframe.KeyframeSettings):
     """Settings of keyframe NDT, in metres."""
 
     iterations: int = Field(30, ge=1)
@@ -25,16 +25,18 @@ class KeyframeNdt(KeyframeOdometry):
         # The paper's range begins at 0, where a logarithm has no place.
         keyframe_interval=Float(low=0.1, high=10.0, baseline=4.0, log=True),
     )
-    settings_type = Settings
+    settings_type = NdtSettings
 
-    def prepare(self, scan: Scan) -> Prepared:
+    def prepare(self, scan: Scan) -> PreparedCloud:
         o3d = open3d.load()
         points = o3d.utility.Vector3dVector(keyframe.crop(scan, self.settings.min_range))
         cloud = o3d.geometry.PointCloud(points).voxel_down_sample(self.settings.downsampling)
         size = len(cloud.points)
-        return Prepared(scan.stamp, cloud, size >= MIN_POINTS, nbytes=4096 + 24 * size)
+        return PreparedCloud(scan.stamp, cloud, size >= MIN_POINTS, nbytes=4096 + 24 * size)
 
-    def align(self, target: Prepared, source: Prepared, T_target_guess: Poses) -> Alignment:
+    def align(
+        self, target: PreparedCloud, source: PreparedCloud, T_target_guess: Poses
+    ) -> Alignment:
         registration = open3d.load().pipelines.registration
         option = registration.NormalDistributionsTransformOption(
             voxel_size=self.parameters["resolution"], max_iteration=self.settings.iterations

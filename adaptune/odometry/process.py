@@ -30,7 +30,7 @@ def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
     return socket.AF_INET, (host, int(port))
 
 
-class Settings(BaseSettings):
+class ProcessSettings(BaseSettings):
     """How to reach a program that speaks `adaptune.odometry.wire`.
 
     Attributes
@@ -68,10 +68,10 @@ class Process(Isolated):
         How to reach the program.
     """
 
-    settings_type = Settings
+    settings_type = ProcessSettings
     _fresh = False
 
-    def __init__(self, parameters: ParameterSet, settings: Settings, limits: Limits):
+    def __init__(self, parameters: ParameterSet, settings: ProcessSettings, limits: Limits):
         name = settings.command[0] if settings.command else str(settings.address)
         super().__init__(name, parameters, settings, limits)
         self._hello = {"odometry": None, "settings": settings.settings}
@@ -81,7 +81,7 @@ class Process(Isolated):
         self._written: Any = None
 
     @staticmethod
-    def describe(settings: Settings) -> Description:
+    def describe(settings: ProcessSettings) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json())
 
@@ -105,7 +105,8 @@ class Process(Isolated):
                 self._socket.connect(where)
             except OSError as error:
                 self._socket.close()
-                raise OdometryError(f"nothing listens at {address} ({error.strerror})") from error
+                what = f"nothing listens at {address} ({error.strerror})"
+                raise OdometryError(f"{what}: start the program there first") from error
         self._socket.settimeout(max(self._limits.seconds, _FIRST_ANSWER))
         return cast("BinaryIO", self._socket.makefile("rwb"))
 
@@ -141,7 +142,7 @@ class Process(Isolated):
 
 @cache
 def _describe(settings: str) -> Description:
-    program = Process({}, Settings.model_validate_json(settings), Limits())
+    program = Process({}, ProcessSettings.model_validate_json(settings), Limits())
     program._stream = program._connect()
     try:
         answer = program._ask(wire.hello(**program._hello, parameters={}))

@@ -23,7 +23,7 @@ _LATER = 10**9
 """Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
 
 
-class Settings(RangeSettings):
+class RkoLioSettings(RangeSettings):
     """Settings of RKO-LIO.
 
     Attributes
@@ -35,7 +35,7 @@ class Settings(RangeSettings):
     double_downsample: bool = True
 
 
-class Prepared(NamedTuple):
+class RkoLioScan(NamedTuple):
     """A scan in its types: float64 points, and the nanoseconds of all, the first and the last."""
 
     points: NDArray[np.float64]
@@ -74,11 +74,11 @@ class RkoLio(OwnFrameOdometry):
         max_expected_jerk=Float(low=0.3, high=30.0, baseline=3.0, log=True),
         min_beta=Float(low=10.0, high=5000.0, baseline=200.0, log=True),
     )
-    settings_type = Settings
+    settings_type = RkoLioSettings
     live = False
     needs_imu = True
 
-    def prepare(self, scan: Scan) -> Prepared:
+    def prepare(self, scan: Scan) -> RkoLioScan:
         if scan.imu is None:
             raise OdometryError(NO_IMU.format("rko_lio"))
         points = scan.points.astype(np.float64)
@@ -89,9 +89,9 @@ class RkoLio(OwnFrameOdometry):
         begin = end = scan.stamp + _LATER
         if len(scan):
             begin, end = int(stamps.min()), int(stamps.max())
-        return Prepared(points, stamps.tolist(), begin, end, n_in_range >= MIN_POINTS, scan.imu)
+        return RkoLioScan(points, stamps.tolist(), begin, end, n_in_range >= MIN_POINTS, scan.imu)
 
-    def _begin(self, prepared: Prepared) -> None:
+    def _begin(self, prepared: RkoLioScan) -> None:
         bindings = _bindings()
         config = bindings._LIOConfig()
         for name, value in self.parameters.items():
@@ -109,7 +109,7 @@ class RkoLio(OwnFrameOdometry):
         self._T_base_imu = self._T_base_sensor @ T_sensor_imu
         self._early: Sequence[tuple[int, Any, Any]] = ()
 
-    def _process(self, prepared: Prepared) -> Poses | None:
+    def _process(self, prepared: RkoLioScan) -> Poses | None:
         imu = prepared.imu
         stamps = (imu.stamps + _LATER).tolist()
         new = zip(stamps, imu.acceleration, imu.angular_velocity, strict=True)

@@ -7,24 +7,39 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from adaptune.odometry import wire
-from adaptune.odometry.base import BaseSettings, OdometryError, OdometryInstance
-from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.base import BaseSettings, OdometryError, Registration
+from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import parse_address
-from adaptune.odometry.registry import odometry_class
-from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.sequence.scan import Scan
+from adaptune.space import ParameterSet
 
 _log = logging.getLogger(__name__)
 
 
+class _Elsewhere(Isolated):
+    """An odometry in a process of its own; where it ends, there is a `wire.FaultError`."""
+
+    def register(self, prepared: Scan) -> Registration:
+        registration = super().register(prepared)
+        if self.faults and not np.isfinite(registration.T_odom_sensor).all():
+            raise wire.FaultError(self.faults[-1])
+        return registration
+
+
 def serve(reader: wire.Readable, writer: BinaryIO, name: str | None = None) -> None:
     """Do `wire.serve`, but let an odometry that is not clean run in a process of its own."""
+    if name is not None:
+        wire.python_class(name)
     wire.serve(reader, writer, name, _make)
 
 
-def _make(name: str, parameters: ParameterSet, settings: BaseSettings) -> OdometryInstance:
-    return OdometryFactory(name, settings, ParameterSpace({}), Limits())(parameters)
+def _make(name: str, parameters: ParameterSet, settings: BaseSettings) -> wire.Served:
+    if wire.python_class(name).clean:
+        return wire.make_here(name, parameters, settings)
+    return _Elsewhere(name, parameters, settings, Limits())
 
 
 def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
@@ -35,11 +50,11 @@ def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
     address
         ``tcp://HOST:PORT``, any free port if that is 0, or ``unix:PATH``.
     name
-        The odometry.
+        The odometry, not a program of the user.
     ready
         Called with the address when connections are accepted.
     """
-    odometry_class(name)
+    wire.python_class(name)
     family, where = parse_address(address)
     with socket.socket(family) as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

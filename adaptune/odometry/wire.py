@@ -43,9 +43,8 @@ from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.odometry import BaseSettings, Description, Odometry, OdometryError, OdometryInstance
+from adaptune.odometry import BaseSettings, Description, Odometry, OdometryError, Registration
 from adaptune.odometry.registry import odometry_class
-from adaptune.selection import Selection
 from adaptune.sequence.imu import Imu, ImuNoise
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
@@ -138,19 +137,37 @@ def to_scan(message: Message) -> Scan:
     return Scan(message.header["stamp"], imu=imu, **columns)
 
 
-Make = Callable[[str, ParameterSet, BaseSettings], OdometryInstance]
+class FaultError(AdaptuneError):
+    """A served odometry has ended, in a process of its own."""
+
+
+class Served(Protocol):
+    """What a served odometry does, as `Odometry` describes it; a fault is a `FaultError`."""
+
+    def prepare(self, scan: Scan) -> Any: ...
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None: ...
+
+    def register(self, prepared: Any) -> Registration: ...
+
+    def configure(self, parameters: ParameterSet) -> None: ...
+
+
+Make = Callable[[str, ParameterSet, BaseSettings], Served]
 """Makes an odometry by its name."""
 
 
 def python_class(name: str) -> type[Odometry]:
-    """Class of an odometry that this process can run; an error for programs of the user."""
+    """Class of an odometry that can be served; an error for programs of the user."""
     cls = odometry_class(name)
     if not issubclass(cls, Odometry):
-        raise OdometryError(f"{name}: is a program of the user, not a class that can be served")
+        raise OdometryError(f"{name} is a program of the user: serve an odometry such as gicp")
     return cls
 
 
-def make_here(name: str, parameters: ParameterSet, settings: BaseSettings) -> OdometryInstance:
+def make_here(name: str, parameters: ParameterSet, settings: BaseSettings) -> Odometry:
     """Make an odometry in this process."""
     return python_class(name)(parameters, settings)
 
@@ -187,7 +204,7 @@ def serve(
     make
         Makes it.
     """
-    odometry: OdometryInstance | None = None
+    odometry: Served | None = None
     while (message := receive(reader)) is not None:
         try:
             _check(message)
@@ -198,6 +215,8 @@ def serve(
                 raise OdometryError("the first message must be a hello")
             else:
                 _answer(odometry, message, writer)
+        except FaultError as fault:
+            send(writer, {"type": "fault", "message": str(fault)})
         except AdaptuneError as error:
             send(writer, {"type": "refused", "message": str(error)})
 
@@ -214,9 +233,7 @@ def _check(message: Message) -> None:
         raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
 
 
-def _make(
-    hello: Mapping[str, Any], only: str | None, make: Make
-) -> tuple[OdometryInstance, dict[str, Any]]:
+def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Served, dict[str, Any]]:
     """The odometry that a hello asks for, and what the answer reports about it."""
     if (version := hello["version"]) != VERSION:
         raise OdometryError(f"adaptune speaks version {VERSION} of the protocol, not {version}")
@@ -234,14 +251,11 @@ def _make(
     return make(name, hello["parameters"], settings), {"odometry": name, **about}
 
 
-def _answer(odometry: OdometryInstance, message: Message, writer: BinaryIO) -> None:
+def _answer(odometry: Served, message: Message, writer: BinaryIO) -> None:
     header, arrays = message
     if header["type"] == "register":
         T_odom_sensor, registered = odometry.register(odometry.prepare(to_scan(message)))
         pose: Poses = np.asarray(T_odom_sensor, np.float64)
-        if odometry.faults and not np.isfinite(pose).all():
-            send(writer, {"type": "fault", "message": odometry.faults[-1]})
-            return
         answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
         used = resource.getrusage(resource.RUSAGE_SELF)
         usage = {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
@@ -252,6 +266,5 @@ def _answer(odometry: OdometryInstance, message: Message, writer: BinaryIO) -> N
         motion = arrays["motion"].copy() if "motion" in arrays else None
         odometry.start(odometry.prepare(to_scan(message)), arrays["pose"].copy(), motion)
     else:
-        # A single odometry applies the parameters only.
-        odometry.apply(Selection(trial=-1, parameters=header["parameters"]))
+        odometry.configure(header["parameters"])
     send(writer, {"type": "done"})

@@ -9,6 +9,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import Odometry, OdometryError, Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.in_process import InProcess
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
@@ -88,7 +89,7 @@ def test_selects_at_the_first_scan_and_then_every_period_before_registering():
     odometry = Scripted()
     selector = Chooser([{"speed": 3.0}, {"speed": 4.0}])
     stamps = [0.0, 0.4, 0.8, 1.0, 1.2, 1.9, 2.3, 4.95, 5.0, 5.05]
-    result = replay(scans(stamps), odometry, HEALTH, selector)
+    result = replay(scans(stamps), InProcess(odometry), HEALTH, selector)
     assert [s / 1e9 for s in selector.asked] == [0.0, 1.0, 2.3, 4.95, 5.0]
     assert [c.stamp for c in result.choices] == selector.asked
     # Every scan is observed, with the motion over the scan before it.
@@ -104,13 +105,13 @@ def test_selects_at_the_first_scan_and_then_every_period_before_registering():
 
 def test_the_selector_sees_healthy_motions():
     selector = Chooser([{"speed": 3.0}] * 2)
-    replay(scans(np.arange(6) / 10), Scripted([0.1, 0.2, 3.0, 0.2]), HEALTH, selector)
+    replay(scans(np.arange(6) / 10), InProcess(Scripted([0.1, 0.2, 3.0, 0.2])), HEALTH, selector)
     np.testing.assert_allclose([x for _, x in selector.seen], [0, 0, 0.1, 0.2, 0.2, 0.2])
 
 
 def test_without_a_selector_nothing_is_changed():
     odometry = Scripted()
-    result = replay(scans(np.arange(30) / 10), odometry, HEALTH)
+    result = replay(scans(np.arange(30) / 10), InProcess(odometry), HEALTH)
     assert not [event for event in odometry.events if event[0] == "configure"]
     assert result.choices == []
     np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], np.arange(30) * 0.1)
@@ -119,7 +120,7 @@ def test_without_a_selector_nothing_is_changed():
 @pytest.mark.parametrize("jump", [3.0, -2.0, np.nan, np.inf])
 def test_an_impossible_step_restarts_at_the_last_healthy_motion(jump):
     odometry = Scripted([0.1, 0.2, jump, 0.2])
-    result = replay(scans(np.arange(6) / 10), odometry, HEALTH)
+    result = replay(scans(np.arange(6) / 10), InProcess(odometry), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [3]
     x = result.trajectory.T_world_sensor[:, 0, 3]
     np.testing.assert_allclose(x, [0.0, 0.1, 0.3, 0.5, 0.7, 0.8])
@@ -136,7 +137,7 @@ def test_an_impossible_turn_restarts():
                 T[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]  # 900 degrees a second
             return Registration(T)
 
-    result = replay(scans(np.arange(6) / 10), Turning(), HEALTH)
+    result = replay(scans(np.arange(6) / 10), InProcess(Turning()), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [3]
     np.testing.assert_allclose(result.trajectory.T_world_sensor[-1, :3, :3], np.eye(3))
 
@@ -144,14 +145,14 @@ def test_an_impossible_turn_restarts():
 def test_a_platform_that_did_change_its_motion_is_believed_in_the_end():
     # From 0.1 to 0.45 m a scan is 3.5 m/s at once; the bound grows with the time unseen.
     odometry = Scripted([0.1, 0.1, *[0.45] * 6])
-    result = replay(scans(np.arange(9) / 10), odometry, HEALTH)
+    result = replay(scans(np.arange(9) / 10), InProcess(odometry), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [3]
     assert np.diff(result.trajectory.T_world_sensor[:, 0, 3])[-1] == pytest.approx(0.45)
 
 
 def test_after_a_dropped_scan_the_last_motion_goes_on_for_longer():
     odometry = Scripted([0.1, 0.1, 50.0, 0.1])
-    result = replay(scans([0.0, 0.1, 0.2, 0.5, 0.6]), odometry, HEALTH)
+    result = replay(scans([0.0, 0.1, 0.2, 0.5, 0.6]), InProcess(odometry), HEALTH)
     assert result.restarted.tolist() == [False, False, False, True, False]
     x = result.trajectory.T_world_sensor[:, 0, 3]
     np.testing.assert_allclose(x, [0.0, 0.1, 0.2, 0.5, 0.6])
@@ -162,22 +163,22 @@ def test_after_a_dropped_scan_the_last_motion_goes_on_for_longer():
 def test_a_frozen_pose_restarts():
     odometry = Scripted([0.1, 0.1] + [0.0] * 6 + [0.1])
     check = HEALTH.model_copy(update={"max_freeze": 0.45})
-    result = replay(scans(0.1 * np.arange(9)), odometry, check)
+    result = replay(scans(0.1 * np.arange(9)), InProcess(odometry), check)
     assert np.flatnonzero(result.restarted).tolist() == [7]
     np.testing.assert_allclose(result.trajectory.T_world_sensor[7, 0, 3], 0.3)
 
 
 def test_a_robot_that_comes_to_a_stand_has_not_frozen():
     odometry = Scripted([0.1, 0.08, 0.06, 0.04, 0.02] + [0.0] * 40)
-    result = replay(scans(0.1 * np.arange(40)), odometry, HEALTH)
+    result = replay(scans(0.1 * np.arange(40)), InProcess(odometry), HEALTH)
     assert not result.restarted.any()
     odometry = Scripted([0.0] * 40)
-    assert not replay(scans(0.1 * np.arange(40)), odometry, HEALTH).restarted.any()
+    assert not replay(scans(0.1 * np.arange(40)), InProcess(odometry), HEALTH).restarted.any()
 
 
 def test_poor_scans_are_counted(tmp_path):
     odometry = Scripted([0.1, None, 0.1])
-    result = replay(scans(np.arange(5) / 10), odometry, HEALTH)
+    result = replay(scans(np.arange(5) / 10), InProcess(odometry), HEALTH)
     assert result.registered.tolist() == [True, True, False, True, True]
     write_replay(tmp_path, result, ABOUT)
     assert json.loads((tmp_path / "replay.json").read_text())["poor_scans"] == 1
@@ -186,7 +187,7 @@ def test_poor_scans_are_counted(tmp_path):
 def test_too_many_scans_that_do_not_register_restart(tmp_path):
     odometry = Scripted([0.1, 0.1, *[None] * 7, 0.1])
     check = HEALTH.model_copy(update={"max_unregistered": 3})
-    result = replay(scans(np.arange(11) / 10), odometry, check)
+    result = replay(scans(np.arange(11) / 10), InProcess(odometry), check)
     assert np.flatnonzero(result.restarted).tolist() == [5, 8]
     assert result.unhealthy == {"max_unregistered": 2}
     write_replay(tmp_path, result, ABOUT)
@@ -196,7 +197,7 @@ def test_too_many_scans_that_do_not_register_restart(tmp_path):
 
 def test_no_scans():
     with pytest.raises(AdaptuneError, match="no scan"):
-        replay([], Scripted(), HEALTH)
+        replay([], InProcess(Scripted()), HEALTH)
 
 
 def test_an_odometry_that_is_not_live_is_refused():
@@ -204,7 +205,7 @@ def test_an_odometry_that_is_not_live_is_refused():
         live = False
 
     with pytest.raises(OdometryError, match="cannot change its parameters"):
-        replay(scans([0.0]), Stiff(), HEALTH, Chooser([{"speed": 1.0}] * 2))
+        replay(scans([0.0]), InProcess(Stiff()), HEALTH, Chooser([{"speed": 1.0}] * 2))
 
 
 def test_a_real_replay_is_the_same_every_time(tmp_path):
@@ -214,7 +215,8 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
         {"max_correspondence_distance": 0.7, "keyframe_interval": 3.0},
     ]
 
-    results = [replay(drive, KeyframeGicp(sets[0]), HealthCheck(), Chooser(sets)) for _ in range(2)]
+    odometries = [InProcess(KeyframeGicp(sets[0])) for _ in range(2)]
+    results = [replay(drive, one, HealthCheck(), Chooser(sets)) for one in odometries]
     a, b = (r.trajectory.T_world_sensor for r in results)
     np.testing.assert_array_equal(a, b)
     assert abs(a[-1, 0, 3] - 24 * 0.3) < 0.1

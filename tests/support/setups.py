@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from adaptune.odometry import InProcess
 from offline.trial import TrialSettings, TrialSetup
 
 
@@ -11,13 +12,13 @@ def setup_of(study, odometry=None, **settings):
     return TrialSetup(of_study, odometry or study.odometry, study.sequences)
 
 
-def made_of(odometry_class, study, instances=None):
-    """Make instances of a class with a study's settings, and append them to a list."""
+def made_of(odometry_class, study, made=None):
+    """Make instances of a class with a study's settings, and append its odometries to a list."""
 
     def make(parameters=None, _sequence=None, isolated=False):  # noqa: ARG001
-        made = odometry_class(parameters, study.odometry.settings)
-        if instances is not None:
-            instances.append(made)
-        return made
+        odometry = odometry_class(parameters, study.odometry.settings)
+        if made is not None:
+            made.append(odometry)
+        return InProcess(odometry)
 
     return make

@@ -11,6 +11,7 @@ import numpy as np
 import program
 
 from adaptune.odometry.command import Command
+from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Limits
 from adaptune.odometry.process import Process
 from adaptune.odometry.program_input import ProgramInput
@@ -33,7 +34,12 @@ def make(name, parameters=None):
         settings, recording = command_on_the_street()
         Command.check(settings, given)
         return Command(given, settings, Limits(seconds=10.0), lambda: recording, strict=True)
-    return odometry_class(name)(parameters)
+    return InProcess(odometry_class(name)(parameters))
+
+
+def parameters_of(odometry):
+    """The present parameters of what `make` has made."""
+    return (odometry.odometry if isinstance(odometry, InProcess) else odometry).parameters
 
 
 def space_of(name):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.odometry import Odometry, Registration, WarmUp
+from adaptune.odometry import InProcess, Odometry, Registration, WarmUp
 from adaptune.selection import Selection
 from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
@@ -72,11 +72,22 @@ def x_on(odometry, seconds):
 
 
 def makes(scripts=None):
-    """What makes walkers, and the list of those it made."""
+    """What makes instances of walkers, and the list of the walkers it made."""
     made = []
 
     def make(parameters):
         made.append(Walker(parameters, (scripts or {}).get(parameters["speed"])))
-        return made[-1]
+        return InProcess(made[-1])
 
     return make, made
+
+
+def kept(make):
+    """`make`, and the list of the instances it made."""
+    instances = []
+
+    def keep(parameters):
+        instances.append(make(parameters))
+        return instances[-1]
+
+    return keep, instances

@@ -16,7 +16,7 @@ from adaptune.odometry.base import (
     RangeSettings,
 )
 from adaptune.odometry.evalio import point_layout
-from adaptune.odometry.evalio.point_layout import Prepared, evalio_modules, to_evalio
+from adaptune.odometry.evalio.point_layout import EvalioScan, evalio_modules, to_evalio
 from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
@@ -28,7 +28,7 @@ GRAVITY = 9.80665
 NO_FIELD = "{} needs to know {}, and the scans do not say; record clouds with a {} field"
 
 
-class Settings(RangeSettings):
+class EvalioSettings(RangeSettings):
     """Settings of all pipelines.
 
     Attributes
@@ -40,7 +40,7 @@ class Settings(RangeSettings):
     parameters: dict[str, Value] = Field(default_factory=dict)
 
 
-class GridSettings(Settings):
+class RangeImageSettings(EvalioSettings):
     """Settings of pipelines that see scans as images.
 
     Attributes
@@ -77,7 +77,7 @@ class Pipeline(OwnFrameOdometry):
         when late; class attribute.
     """
 
-    settings_type = Settings
+    settings_type = EvalioSettings
     live = False
     # Some end the process at unexpected scans, some share state between instances.
     clean = False
@@ -113,19 +113,19 @@ class Pipeline(OwnFrameOdometry):
             raise OdometryError(f"{where} takes a value like {default!r}, not {value!r}")
         return value
 
-    def prepare(self, scan: Scan) -> Prepared:
+    def prepare(self, scan: Scan) -> EvalioScan:
         if self.needs_imu and scan.imu is None:
             raise OdometryError(NO_IMU.format(self.pipeline))
         cropped = point_layout.crop(scan, self.settings.min_range, self.settings.max_range)
         cloud, shape = self._layout(cropped)
         timed = cropped.times is not None and bool(np.ptp(cropped.times) if len(cropped) else 0)
-        return Prepared(scan.stamp, cloud, shape, len(cropped) >= MIN_POINTS, timed, scan.imu)
+        return EvalioScan(scan.stamp, cloud, shape, len(cropped) >= MIN_POINTS, timed, scan.imu)
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         """Points as `FIELDS` has them, and their numbers of rows and columns."""
         return point_layout.cloud(scan, 4), (1, len(scan))
 
-    def _begin(self, prepared: Prepared) -> None:
+    def _begin(self, prepared: EvalioScan) -> None:
         pipelines, types, _ = evalio_modules()
         self._shape = prepared.shape
         parameters = self._defaults | self.untuned | self._given
@@ -147,7 +147,7 @@ class Pipeline(OwnFrameOdometry):
         pipeline.initialize()
         self._pipeline = pipeline
 
-    def _process(self, prepared: Prepared) -> Poses | None:
+    def _process(self, prepared: EvalioScan) -> Poses | None:
         if self.needs_imu and prepared.imu is not None:
             self._measure(prepared.imu)
         if not prepared.usable or (self._needs_times and not prepared.timed):
@@ -161,7 +161,7 @@ class Pipeline(OwnFrameOdometry):
         for measured in zip(stamps, imu.angular_velocity, imu.acceleration, strict=True):
             self._pipeline.add_imu(types.ImuMeasurement(*measured))
 
-    def _estimate(self, prepared: Prepared) -> Poses | None:
+    def _estimate(self, prepared: EvalioScan) -> Poses | None:
         """Pass a scan on, and return the last pose that comes back."""
         self._pipeline.add_lidar(to_evalio(prepared))
         estimates = self._pipeline.saved_estimates()
@@ -180,7 +180,7 @@ def _imu_parameters(imu: Imu) -> Any:
 class RingedPipeline(Pipeline):
     """A pipeline that needs to know which laser measured each point."""
 
-    settings_type = GridSettings
+    settings_type = RangeImageSettings
     # What the settings leave open follows from the first scan.
     _rows = _columns = 0
 
@@ -212,7 +212,7 @@ class GridPipeline(RingedPipeline):
         points, shape = super()._layout(scan)
         return points if len(scan) < MIN_POINTS else point_layout.image(scan, points, *shape), shape
 
-    def _estimate(self, prepared: Prepared) -> Poses | None:
+    def _estimate(self, prepared: EvalioScan) -> Poses | None:
         if prepared.shape != self._shape:
             before, now = ("{} x {}".format(*shape) for shape in (self._shape, prepared.shape))
             raise OdometryError(

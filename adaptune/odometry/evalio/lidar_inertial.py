@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses
 from adaptune.odometry.evalio.base import Pipeline, RingedPipeline
-from adaptune.odometry.evalio.point_layout import Prepared
+from adaptune.odometry.evalio.point_layout import EvalioScan
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
@@ -48,12 +48,12 @@ class LioSam(RingedPipeline):
             points = np.concatenate([points, points[[int(scan.times.argmax())]]])
         return points, shape
 
-    def _begin(self, prepared: Prepared) -> None:
-        self._scans: deque[Prepared] = deque(maxlen=_BEHIND + 1)
+    def _begin(self, prepared: EvalioScan) -> None:
+        self._scans: deque[EvalioScan] = deque(maxlen=_BEHIND + 1)
         self._own: deque[tuple[int, Poses]] = deque(maxlen=_SMOOTH + 1)
         super()._begin(prepared)
 
-    def _estimate(self, prepared: Prepared) -> Poses | None:
+    def _estimate(self, prepared: EvalioScan) -> Poses | None:
         T_own_then = super()._estimate(prepared)
         self._scans.append(prepared)
         if T_own_then is None or len(self._scans) <= _BEHIND:

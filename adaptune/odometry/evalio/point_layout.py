@@ -20,7 +20,7 @@ FIELDS = ("x", "y", "z", "t", "row")
 stamp, uint32 laser. The laser is left out where the pipeline does not ask for it."""
 
 
-class Prepared(NamedTuple):
+class EvalioScan(NamedTuple):
     """A scan in evalio's layout; the last columns of its cloud hold bytes of uint32."""
 
     stamp: int
@@ -45,7 +45,7 @@ def _fields() -> Any:
     return [helpers.Field(name=name, datatype=kind, offset=at) for name, kind, at in fields]
 
 
-def to_evalio(prepared: Prepared) -> Any:
+def to_evalio(prepared: EvalioScan) -> Any:
     """A prepared scan as evalio's own measurement."""
     _, types, helpers = evalio_modules()
     size, n_fields = prepared.cloud.shape

@@ -1,18 +1,24 @@
 import numpy as np
 import pytest
 import turns
-from walker import at, every, makes, selected, x_of, x_on
+from walker import at, every, kept, makes, selected, x_of, x_on
 
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.bank import Bank
-from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.selection import Selection
 
 NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 FAR = {"max_correspondence_distance": 1.0, "keyframe_interval": 4.0}
+
+
+def gicp(parameters):
+    return InProcess(KeyframeGicp(parameters))
 
 
 def weigh(bank, *weights):
@@ -100,7 +106,7 @@ def test_a_bank_has_no_other_sets():
 
 
 def test_motions_of_the_members_by_trial_number():
-    make, made = makes({1.02: {5: 4.0}})
+    make, made = kept(makes({1.02: {5: 4.0}})[0])
     bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1)
     x_of(bank, range(6))
     whole, members = bank.motions
@@ -114,7 +120,7 @@ def test_motions_of_the_members_by_trial_number():
     assert [T[0, 3] for T in (bank.motions[0], *bank.motions[1].values())] == [0.3] * 4
     made[0].faults, made[2].faults = ["lost"], ["lost, too"]
     assert bank.faults == ["lost", "lost, too"]
-    assert bank.usage.cpu == sum(walker.usage.cpu for walker in made)
+    assert bank.usage.cpu == sum(instance.usage.cpu for instance in made)
 
 
 def drive(odometry, switch=None, n=30):
@@ -131,18 +137,17 @@ def drive(odometry, switch=None, n=30):
 
 
 def test_a_bank_of_equal_instances_is_the_single_run():
-    bank = Bank(lambda _: KeyframeGicp(NEAR), {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=every(1.0))
     switched = drive(bank, [0, 1], n=15)
-    np.testing.assert_allclose(switched, drive(KeyframeGicp(NEAR), n=15), atol=1e-12)
+    np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
 
 
 def test_a_bank_in_other_processes_is_the_same():
     def elsewhere(parameters):
-        return Isolated("gicp", parameters, Settings(), Limits())
+        return Isolated("gicp", parameters, KeyframeSettings(), Limits())
 
     a, b = (
-        drive(Bank(make, {0: NEAR, 1: FAR}, every(0.5)), [0, 1], 15)
-        for make in (KeyframeGicp, elsewhere)
+        drive(Bank(make, {0: NEAR, 1: FAR}, every(0.5)), [0, 1], 15) for make in (gicp, elsewhere)
     )
     np.testing.assert_array_equal(a, b)
 
@@ -151,9 +156,9 @@ def test_a_bank_in_other_processes_is_the_same():
 def test_real_odometries_go_straight_on(mechanism):
     if mechanism == "bank":
         sets = {0: NEAR, 1: FAR, 2: {**NEAR, "keyframe_interval": 2.0}}
-        poses = drive(Bank(KeyframeGicp, sets, every(0.5)), [1, 0], n=15)
+        poses = drive(Bank(gicp, sets, every(0.5)), [1, 0], n=15)
     else:
-        poses = drive(HandOver(KeyframeGicp, NEAR, every(0.5)), [FAR, NEAR], n=15)
+        poses = drive(HandOver(gicp, NEAR, every(0.5)), [FAR, NEAR], n=15)
     steps = invert(poses[:-1]) @ poses[1:]
     np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
     np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)

@@ -6,8 +6,10 @@ import pytest
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Limits
+from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
@@ -22,11 +24,13 @@ def factory(name="gicp", settings=None, space=SPACE, **rest):
 def test_it_makes_what_the_name_says():
     gicp = factory(settings={"downsampling": 0.3})
     instance = gicp({"keyframe_interval": 4.0})
-    assert type(instance) is KeyframeGicp
-    assert instance.settings == gicp.settings == Settings(downsampling=0.3)
-    assert instance.parameters == KeyframeGicp.space.baseline | {"keyframe_interval": 4.0}
+    assert isinstance(instance, InProcess)
+    odometry = instance.odometry
+    assert type(odometry) is KeyframeGicp
+    assert odometry.settings == gicp.settings == KeyframeSettings(downsampling=0.3)
+    assert odometry.parameters == KeyframeGicp.space.baseline | {"keyframe_interval": 4.0}
     # The baseline of the study's space, not the odometry's own.
-    assert gicp().parameters["keyframe_interval"] == 2.0
+    assert gicp().odometry.parameters["keyframe_interval"] == 2.0
     assert gicp.description == KeyframeGicp.describe(gicp.settings)
     assert gicp.identity == {"name": "gicp", "settings": gicp.settings.model_dump(mode="json")}
     assert "small_gicp" in gicp.versions
@@ -47,7 +51,7 @@ def test_it_pickles_with_and_without_what_it_has_looked_up():
         copy = pickle.loads(pickle.dumps(gicp))
         assert copy.identity == gicp.identity
         assert copy.description == gicp.description
-        assert copy({"keyframe_interval": 3.0}).parameters["keyframe_interval"] == 3.0
+        assert copy({"keyframe_interval": 3.0}).odometry.parameters["keyframe_interval"] == 3.0
 
 
 @pytest.mark.parametrize(

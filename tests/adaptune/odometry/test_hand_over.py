@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from walker import Walker, at, every, makes, selected, x_of, x_on
+from walker import Walker, at, every, kept, makes, selected, x_of, x_on
 
-from adaptune.odometry import WarmUp
+from adaptune.odometry import InProcess, WarmUp
 from adaptune.odometry.hand_over import HandOver
 from adaptune.sequence import Imu
 
@@ -46,7 +46,7 @@ def test_what_an_imu_measured_during_scans_that_are_left_out_is_seen(catch_up_sc
 
     def make(parameters):
         made.append(Measured(parameters))
-        return made[-1]
+        return InProcess(made[-1])
 
     def scan(second):
         stamps = np.arange(10) * 10**8 + (second - 1) * 10**9 + 1
@@ -129,7 +129,7 @@ def test_a_new_start_forgets_what_was_before():
 
 
 def test_it_keeps_what_its_instances_used_and_reported():
-    make, made = makes()
+    make, made = kept(makes()[0])
     odometry = HandOver(make, {"speed": 1.0}, every(3.0))
     x_of(odometry, range(4))
     used = odometry.usage.cpu
@@ -138,7 +138,7 @@ def test_it_keeps_what_its_instances_used_and_reported():
     x_on(odometry, range(4, 8))
     made[1].faults = ["lost again"]
     assert odometry.faults == ["lost", "lost again"]
-    assert odometry.usage.cpu == sum(walker.usage.cpu for walker in made) > used
+    assert odometry.usage.cpu == sum(instance.usage.cpu for instance in made) > used
     assert odometry.usage.memory is None
 
 

@@ -14,9 +14,10 @@ from setups import setup_of
 
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
-from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Isolated, Limits, fork_server
+from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.selection import Selection
 from adaptune.sequence import Imu, Scan
 from adaptune.sequence.imu import ImuNoise
@@ -112,7 +113,7 @@ def test_parameters_change_between_scans():
 
 def test_it_is_the_same_odometry_in_another_process():
     here = KeyframeGicp({"keyframe_interval": 1.0})
-    there = Isolated("gicp", {"keyframe_interval": 1.0}, Settings(), Limits())
+    there = Isolated("gicp", {"keyframe_interval": 1.0}, KeyframeSettings(), Limits())
     motion = np.eye(4)
     motion[0, 3] = turns.STEP
     here.start(here.prepare(turns.turn(0)), np.eye(4), motion)

@@ -1,6 +1,7 @@
 import os
 import re
 import socket
+import subprocess
 import sys
 import threading
 
@@ -11,8 +12,9 @@ import turns
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Limits
-from adaptune.odometry.process import Process, Settings
+from adaptune.odometry.process import Process, ProcessSettings
 from adaptune.odometry.serving import listen
 from adaptune.selection import Selection
 from adaptune.sequence import Scan
@@ -23,7 +25,7 @@ LIMITS = Limits(seconds=20.0)
 
 
 def program(fault="none"):
-    return Settings(command=(sys.executable, server.__file__, fault))
+    return ProcessSettings(command=(sys.executable, server.__file__, fault))
 
 
 def scan(i):
@@ -81,14 +83,17 @@ def test_faults_are_told_and_another_start_goes_on(fault, caplog):
         (program("version"), r"it speaks version 1 of the protocol, this adaptune 2"),
         (program("space"), "its answer to hello does not describe it: 'space'"),
         (
-            Settings(command=("sh", "-c", "echo no licence >&2; exit 7")),
+            ProcessSettings(command=("sh", "-c", "echo no licence >&2; exit 7")),
             "its process ended with code 7: no licence",
         ),
-        (Settings(command=("echo", "Hello, world!")), "ended|no message of adaptune's"),
-        (Settings(command=("no-such-program",)), "no-such-program: not found"),
-        (Settings(address="tcp://127.0.0.1:9"), r"nothing listens at tcp://127.0.0.1:9 \(Conn"),
-        (Settings(address="unix:/nowhere/there"), r"nothing listens at unix:/nowhere/there"),
-        (Settings(address="127.0.0.1:9000"), "neither tcp://HOST:PORT nor unix:PATH"),
+        (ProcessSettings(command=("echo", "Hello, world!")), "ended|no message of adaptune's"),
+        (ProcessSettings(command=("no-such-program",)), "no-such-program: not found"),
+        (
+            ProcessSettings(address="tcp://127.0.0.1:9"),
+            r"nothing listens at tcp://127.0.0.1:9 \(Conn.*\): start the program there first",
+        ),
+        (ProcessSettings(address="unix:/nowhere/there"), r"nothing listens at unix:/nowhere/there"),
+        (ProcessSettings(address="127.0.0.1:9000"), "neither tcp://HOST:PORT nor unix:PATH"),
     ],
 )
 def test_programs_that_do_not_serve(settings, message):
@@ -130,13 +135,13 @@ NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 @pytest.mark.parametrize("kind", ["tcp", "unix"])
 def test_it_is_the_same_odometry_behind_a_socket(listening, tmp_path, kind):
     where = "tcp://127.0.0.1:0" if kind == "tcp" else f"unix:{tmp_path / 'socket'}"
-    settings = Settings(address=listening(where, "gicp"), settings={"downsampling": 0.4})
+    settings = ProcessSettings(address=listening(where, "gicp"), settings={"downsampling": 0.4})
     described = Process.describe(settings)
     assert described.space == KeyframeGicp.space
     assert described.live
     with pytest.raises(OdometryError, match="downsmapling"):
         Process.describe(settings.model_copy(update={"settings": {"downsmapling": 1}}))
-    here = KeyframeGicp(NEAR, KeyframeGicp.settings_type(downsampling=0.4))
+    here = InProcess(KeyframeGicp(NEAR, KeyframeGicp.settings_type(downsampling=0.4)))
     there, other = (Process(NEAR, settings, LIMITS) for _ in range(2))
     other.start(turns.turn(5), np.eye(4))
     np.testing.assert_array_equal(drive(there), drive(here))
@@ -146,9 +151,46 @@ def test_it_is_the_same_odometry_behind_a_socket(listening, tmp_path, kind):
 def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     command = (sys.executable, "-m", "adaptune.cli", "serve", "gicp")
-    odometry = Process(NEAR, Settings(command=command), Limits(seconds=60.0))
-    np.testing.assert_array_equal(drive(odometry), drive(KeyframeGicp(NEAR)))
+    odometry = Process(NEAR, ProcessSettings(command=command), Limits(seconds=60.0))
+    np.testing.assert_array_equal(drive(odometry), drive(InProcess(KeyframeGicp(NEAR))))
     assert not odometry.faults
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("command", "--listen", "tcp://127.0.0.1:0"), "command is a program of the user: serve"),
+        (("process",), "process is a program of the user: serve"),
+        (("gipc",), "there is no odometry 'gipc': did you mean 'gicp'"),
+        (("gipc", "--listen", "tcp://127.0.0.1:0"), "did you mean 'gicp'"),
+    ],
+)
+def test_what_cannot_be_served(arguments, words):
+    done = subprocess.run(
+        [sys.executable, "-m", "adaptune.cli", "serve", *arguments],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert words in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+def test_a_fault_of_a_served_odometry_arrives(listening):
+    settings = ProcessSettings(
+        address=listening("tcp://127.0.0.1:0", "faulty:Faulty"), settings={"fault": "abort"}
+    )
+    odometry = Process({}, settings, LIMITS)
+    odometry.start(scan(0), np.eye(4))
+    odometry.apply(Selection(0, {"x": 1.0}))
+    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.3)
+    odometry.register(scan(2))
+    assert np.isnan(odometry.register(scan(3)).T_odom_sensor).all()
+    assert odometry.faults == ["its process was ended by SIGABRT: about to go wrong"]
 
 
 def test_a_server_that_hangs_up():
@@ -160,7 +202,7 @@ def test_a_server_that_hangs_up():
 
         threading.Thread(target=hang_up, daemon=True).start()
         with pytest.raises(OdometryError, match="it ended the conversation"):
-            Process.describe(Settings(address=address))
+            Process.describe(ProcessSettings(address=address))
 
 
 def test_garbage_ends_its_own_conversation_only(listening):
@@ -169,7 +211,7 @@ def test_garbage_ends_its_own_conversation_only(listening):
     with socket.create_connection((host, int(port))) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert not connection.recv(100)
-    assert Process.describe(Settings(address=address)).live
+    assert Process.describe(ProcessSettings(address=address)).live
 
 
 def test_a_study_takes_its_space(study_file, tmp_path):

@@ -7,9 +7,11 @@ from street import N_SCANS, drive, make, scan
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError, OdometryInstance, Usage, WarmUp
 from adaptune.odometry.bank import Bank
-from adaptune.odometry.gicp import KeyframeGicp, Settings
+from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.selection import Selection
 
 BASELINE = KeyframeGicp.space.baseline
@@ -17,18 +19,22 @@ OTHER = {"max_correspondence_distance": 1.0, "keyframe_interval": 1.0}
 WARM_UP = WarmUp(0.5, 0.5, 1)
 
 
+def gicp(parameters=None):
+    return InProcess(KeyframeGicp(parameters))
+
+
 def isolated(parameters=None):
-    return Isolated("gicp", parameters or {}, Settings(), Limits(seconds=60.0))
+    return Isolated("gicp", parameters or {}, KeyframeSettings(), Limits(seconds=60.0))
 
 
 KINDS = {
-    "odometry": KeyframeGicp,
+    "odometry": gicp,
     "isolated": isolated,
     "process": lambda: make("process"),
     "command": lambda: make("command"),
-    "hand-over": lambda: HandOver(KeyframeGicp, BASELINE, WARM_UP),
+    "hand-over": lambda: HandOver(gicp, BASELINE, WARM_UP),
     "hand-over, isolated": lambda: HandOver(isolated, BASELINE, WARM_UP, 2),
-    "bank": lambda: Bank(KeyframeGicp, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
+    "bank": lambda: Bank(gicp, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
     "bank, isolated": lambda: Bank(isolated, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
 }
 ELSEWHERE = {"isolated", "process", "hand-over, isolated", "bank, isolated"}
