@@ -171,7 +171,7 @@ class LeftOutResults(NamedTuple):
     # Of every frame; the gain is the ratio to the fixed set's error, of shape (n,).
     familiarity: NDArray[np.float64]
     gain: NDArray[np.float64]
-    portfolio: NDArray[np.float64]  # ratio if the best of 1, 2, ... sets were known.
+    portfolio: NDArray[np.float64]  # ratio if the best of 1, 2, ... sets were known
     learning: Sequence[Mapping[str, Any]]  # rows of a learning curve, or none
     banks: Sequence[Mapping[str, Any]]  # rows of banks of several sizes, or none
 

@@ -65,6 +65,11 @@ class _Range(_Parameter):
         low, high = self._bounds()
         return (self._scale(float(value)) - low) / (high - low)
 
+    def _unscaled(self, unit: float) -> float:
+        low, high = self._bounds()
+        value = low + min(max(unit, 0.0), 1.0) * (high - low)
+        return math.exp(value) if self.log else value
+
     def _scale(self, value: float) -> float:
         return math.log(value) if self.log else value
 
@@ -86,10 +91,8 @@ class Float(_Range):
 
     def from_unit(self, unit: float) -> float:
         """Map from [0, 1] to a value."""
-        low, high = self._bounds()
-        value = low + min(max(unit, 0.0), 1.0) * (high - low)
         # The exponential may overshoot a bound by a rounding error.
-        return min(max(math.exp(value) if self.log else value, self.low), self.high)
+        return min(max(self._unscaled(unit), self.low), self.high)
 
 
 class Integer(_Range):
@@ -103,10 +106,7 @@ class Integer(_Range):
 
     def from_unit(self, unit: float) -> int:
         """Map from [0, 1] to the value whose share it falls in."""
-        low, high = self._bounds()
-        scaled = low + min(max(unit, 0.0), 1.0) * (high - low)
-        value = round(math.exp(scaled) if self.log else scaled)
-        return min(max(value, self.low), self.high)
+        return min(max(round(self._unscaled(unit)), self.low), self.high)
 
     def _bounds(self) -> tuple[float, float]:
         # Half a step on either side gives the first and the last value a whole share.

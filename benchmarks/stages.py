@@ -101,8 +101,8 @@ class KeepsFixed(Selector):
     """Does all the work of a selection, then keeps the fixed set, as the bare loop does."""
 
     def __init__(self, model: ErrorModel, rule: str):
-        super().__init__(model, rule, ())
         self._parameters = model.sets[model.fixed]
+        super().__init__(model, rule, ())
 
     def select(self) -> Selection:
         """See `Selector.select`."""

@@ -106,22 +106,9 @@ def averaged(
 ) -> NDArray[np.float32]:
     """Mean of each frame's descriptor and of those one period before, two before, and so on.
 
-    A selector that describes one scan each period and remembers the last `n` has the same mean.
-
-    Parameters
-    ----------
-    descriptors
-        Of shape (n_frames, n_features), along a sequence.
-    stamps
-        Nanoseconds, rising, of shape (n_frames,).
-    n
-        How many to average; fewer near the sequence's start.
-    period
-        Seconds.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_features)
+    A selector that describes one scan each period and remembers the last `n` has the same mean. It
+    is of fewer near the sequence's start. Descriptors and means are of shape (n_frames,
+    n_features), stamps are rising nanoseconds, and the period is in seconds.
     """
     total = descriptors.astype(np.float64)
     number = np.ones(len(stamps))

@@ -54,12 +54,10 @@ class Bank(Recorded):
 
     @property
     def faults(self) -> list[str]:
-        """Faults of all members."""
         return [fault for member in self._members for fault in member.faults]
 
     @property
     def usage(self) -> Usage:
-        """CPU time and memory of all members together."""
         return Usage.total((member.usage for member in self._members), sum)
 
     @property

@@ -47,51 +47,25 @@ class RangeSettings(BaseSettings):
 
 
 class WarmUp(NamedTuple):
-    """Which of the last scans a new instance sees before it takes over.
+    """Which of the last scans a new instance sees before it takes over."""
 
-    Attributes
-    ----------
-    seconds : float
-        How far back they go.
-    full_rate : float
-        Of the most recent scans, those of so many seconds are all seen.
-    stride : int
-        Of the scans before, every so many is seen.
-    """
-
-    seconds: float = 12.0
-    full_rate: float = 4.0
-    stride: int = 1
+    seconds: float = 12.0  # how far back they go
+    full_rate: float = 4.0  # of the most recent scans, those of so many seconds are all seen
+    stride: int = 1  # of the scans before, every so many is seen
 
 
 class Registration(NamedTuple):
-    """Where an odometry believes the sensor was.
+    """Where an odometry believes the sensor was at the scan's stamp."""
 
-    Attributes
-    ----------
-    T_odom_sensor : ndarray of shape (4, 4)
-        Pose at the scan's stamp.
-    registered : bool
-        False if the scan was too poor to register: the last motion then goes on.
-    """
-
-    T_odom_sensor: Poses
-    registered: bool = True
+    T_odom_sensor: Poses  # of shape (4, 4)
+    registered: bool = True  # False if the scan was too poor: the last motion then goes on
 
 
 class Usage(NamedTuple):
-    """What an odometry has used so far.
+    """What an odometry has used so far."""
 
-    Attributes
-    ----------
-    cpu : float
-        Seconds of CPU time.
-    memory : float or None
-        Peak megabytes of the odometry's own processes; None if it shares this process.
-    """
-
-    cpu: float
-    memory: float | None
+    cpu: float  # seconds of CPU time
+    memory: float | None  # peak megabytes of its own processes; None if it shares this process
 
     @classmethod
     def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":

@@ -161,8 +161,7 @@ class Command(Recorded):
             folder.mkdir()
             output = folder / self.settings.output
             output.parent.mkdir(parents=True, exist_ok=True)
-            command = self._command(given, output, Path(name))
-            log = Path(name) / "output"
+            command, log = self._command(given, output, Path(name)), Path(name) / "output"
             failure = self._execute(command, folder, log, len(given.stamps))
             if failure is None:
                 try:

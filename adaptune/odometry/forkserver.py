@@ -69,7 +69,10 @@ def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:
         os.dup2(output, 1)
         os.dup2(output, 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        _bound_memory(limits.memory)
+        statm = Path("/proc/self/statm")
+        pages = int(statm.read_text().split()[0]) if statm.exists() else 0
+        bound = pages * resource.getpagesize() + int(limits.memory * 1e9)
+        resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
         with connection.makefile("rb") as reader, connection.makefile("wb") as writer:
             wire.serve(_Timed(reader, limits.seconds), writer)
         code = 0
@@ -81,13 +84,6 @@ def _run(connection: socket.socket, output: int, limits: Limits) -> NoReturn:
     finally:
         # Exit handlers belong to the server.
         os._exit(code)
-
-
-def _bound_memory(gigabytes: float) -> None:
-    statm = Path("/proc/self/statm")
-    now = int(statm.read_text().split()[0]) * resource.getpagesize() if statm.exists() else 0
-    bound = now + int(gigabytes * 1e9)
-    resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
 
 
 class _Timed:

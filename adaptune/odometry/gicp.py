@@ -20,8 +20,7 @@ class _SmallGicp(KeyframeOdometry):
 
     def prepare(self, scan: Scan) -> Prepared:
         points = crop(scan, self.settings.min_range)
-        # small_gicp crashes on an empty target, and with too few points returns the guess as
-        # converged.
+        # small_gicp crashes on an empty target, and calls a guess from too few points converged.
         if len(points) < MIN_POINTS:
             return Prepared(scan.stamp, None, usable=False, nbytes=0)
         cloud, tree = small_gicp.preprocess_points(

@@ -47,12 +47,10 @@ class HandOver(Recorded):
 
     @property
     def faults(self) -> list[str]:
-        """Faults of all instances so far."""
         return [*self._ended_faults, *(fault for one in self._instances for fault in one.faults)]
 
     @property
     def usage(self) -> Usage:
-        """CPU time of all instances together, and the most memory that one of them took."""
         return Usage.total([self._ended_usage, *(one.usage for one in self._instances)], max)
 
     @property

@@ -84,20 +84,21 @@ class Isolated(Recorded):
     """
 
     faults: Sequence[str] = ()
-    _fresh = True
-    """Whether each start needs a new process."""
+    _fresh = True  # each start needs a new process
 
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
         self.name = name
         self.parameters = dict(parameters)
-        self._cpu = self._cpu_before = self._memory = 0.0
-        self._settings = settings.model_dump(mode="json")
+        self._cpu = self._cpu_before = self._memory = 0.0  # as the other processes report
+        self._hello: dict[str, Any] = {
+            "odometry": name,
+            "settings": settings.model_dump(mode="json"),
+        }
         self._limits = limits
         self._stream: BinaryIO | None = None
 
     @property
     def usage(self) -> Usage:
-        """CPU time and peak memory that the other processes report."""
         return Usage(self._cpu, self._memory)
 
     def prepare(self, scan: Scan) -> Scan:
@@ -112,7 +113,7 @@ class Isolated(Recorded):
             if len(self.faults) >= MOST_FAULTS:
                 return
             self._stream = self._connect()
-            self._ask(self._hello())
+            self._ask(wire.hello(**self._hello, parameters=self.parameters))
         self._ask(
             {"type": "start", "stamp": prepared.stamp},
             **wire.scan_arrays(prepared),
@@ -132,16 +133,16 @@ class Isolated(Recorded):
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
             cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
-        except (KeyError, TypeError, ValueError) as error:
-            lacking = isinstance(error, KeyError)
-            what = f"without {error}" if lacking else f"of other types ({error})"
-            self._fault(f"it gave an answer {what}")
-            return lost
-        wrong = pose_fault(T_odom_sensor)
-        if late:
-            wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
-        if wrong is not None:
-            self._fault(f"it gave a pose {wrong}")
+            wrong = pose_fault(T_odom_sensor)
+            if late:
+                wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
+            wrong = wrong and f"a pose {wrong}"
+        except KeyError as error:
+            wrong = f"an answer without {error}"
+        except (TypeError, ValueError) as error:
+            wrong = f"an answer of other types ({error})"
+        if wrong:
+            self._fault(f"it gave {wrong}")
             return lost
         self._cpu = self._cpu_before + cpu
         self._memory = max(self._memory, memory)
@@ -161,12 +162,9 @@ class Isolated(Recorded):
     def __del__(self) -> None:
         self.close()
 
-    def _hello(self) -> dict[str, Any]:
-        return wire.hello(self.name, self.parameters, self._settings)
-
-    def _ask(self, header: dict[str, Any], **arrays: Any) -> None:
+    def _ask(self, header: dict[str, Any], **arrays: Any) -> wire.Message | None:
         self._send(header, **arrays)
-        self._receive()
+        return self._receive()
 
     def _send(self, header: dict[str, Any], **arrays: Any) -> None:
         if self._stream is not None:

@@ -74,6 +74,7 @@ class Process(Isolated):
     def __init__(self, parameters: ParameterSet, settings: Settings, limits: Limits):
         name = settings.command[0] if settings.command else str(settings.address)
         super().__init__(name, parameters, settings, limits)
+        self._hello = {"odometry": None, "settings": settings.settings}
         self._reach = settings
         self._socket: socket.socket | None = None
         self._program: subprocess.Popen[bytes] | None = None
@@ -93,14 +94,11 @@ class Process(Isolated):
             isolation.end_group(self._program)
             self._program = None
 
-    def _hello(self) -> dict[str, Any]:
-        return wire.hello(None, self.parameters, self._reach.settings)
-
     def _connect(self) -> BinaryIO:
-        if self._reach.command is not None:
-            self._socket = self._begin(self._reach.command)
+        address = self._reach.address
+        if address is None:
+            self._socket = self._begin(self._reach.command or ())
         else:
-            address = cast("str", self._reach.address)
             family, where = parse_address(address)
             self._socket = socket.socket(family)
             try:
@@ -146,8 +144,7 @@ def _describe(settings: str) -> Description:
     program = Process({}, Settings.model_validate_json(settings), Limits())
     program._stream = program._connect()
     try:
-        program._send(program._hello())
-        answer = program._receive()
+        answer = program._ask(wire.hello(**program._hello, parameters={}))
         if answer is None:
             raise OdometryError(program.faults[-1])
         return wire.announced(answer)

@@ -79,9 +79,9 @@ def _own_bag(config: SequenceConfig, layout: Layout) -> Path | None:
     if not isinstance(config.bag, str) or layout == "kitti":
         return None
     plain = SequenceConfig(bag=config.bag)
-    for key in ("start", "stop", "stride", "views", "compensate"):
-        if getattr(config, key) != getattr(plain, key):
-            return None
+    changes = ("start", "stop", "stride", "views", "compensate")
+    if any(getattr(config, key) != getattr(plain, key) for key in changes):
+        return None
     path = Path(config.bag)
     right = path.is_file() and path.suffix == ".bag"
     if layout == "ros2":

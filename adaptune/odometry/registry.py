@@ -1,5 +1,6 @@
 """The odometries by name, imported when they are asked for."""
 
+from contextlib import suppress
 from importlib import metadata
 from typing import TYPE_CHECKING
 
@@ -79,8 +80,6 @@ def versions(odometry: "AnyOdometry") -> dict[str, str]:
         names |= set(metadata.packages_distributions().get(top, ()))
     found = {}
     for name in sorted(names):
-        try:
+        with suppress(metadata.PackageNotFoundError):  # written by the user, or built in
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue  # written by the user, or built in
     return found

@@ -13,17 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import (
-    MIN_POINTS,
-    BaseSettings,
-    OdometryError,
-    RangeSettings,
-    import_extra,
-)
+from adaptune.odometry.base import MIN_POINTS, OdometryError, RangeSettings, import_extra
 from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
-from adaptune.space import Float, ParameterSet, ParameterSpace
+from adaptune.space import Float, ParameterSpace
 
 _LATER = 10**9
 """Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
@@ -83,12 +77,6 @@ class RkoLio(OwnFrameOdometry):
     settings_type = Settings
     live = False
     needs_imu = True
-
-    def __init__(
-        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
-    ):
-        super().__init__(parameters, settings)
-        _bindings()
 
     def prepare(self, scan: Scan) -> Prepared:
         if scan.imu is None:

@@ -19,10 +19,7 @@ _log = logging.getLogger(__name__)
 
 
 def serve(reader: wire.Readable, writer: BinaryIO, name: str | None = None) -> None:
-    """Answer messages until the stream ends; an odometry that is not clean gets its own process.
-
-    See `adaptune.odometry.wire.serve`.
-    """
+    """Do `wire.serve`, but let an odometry that is not clean run in a process of its own."""
     wire.serve(reader, writer, name, _make)
 
 

@@ -55,8 +55,7 @@ class RecentScans:
     """
 
     def __init__(self, warm_up: WarmUp, odometry: OdometryInstance):
-        self._warm_up = warm_up
-        self._odometry = odometry
+        self._warm_up, self._odometry = warm_up, odometry
         self._past: deque[PastScan] = deque()
         self._n_dropped = 0
 
@@ -65,9 +64,7 @@ class RecentScans:
 
     def start(self, scan: PreparedScan, T_odom_sensor: Poses, motion: Poses | None) -> None:
         """Forget all scans and begin with this one."""
-        self._past.clear()
-        self._past.append(PastScan(scan, T_odom_sensor, motion))
-        self._n_dropped = 0
+        self._past, self._n_dropped = deque([PastScan(scan, T_odom_sensor, motion)]), 0
 
     def add(self, scan: PreparedScan, T_odom_sensor: Poses) -> None:
         """Add the newest scan and drop those that are too old."""

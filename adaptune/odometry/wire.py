@@ -155,9 +155,7 @@ def make_here(name: str, parameters: ParameterSet, settings: BaseSettings) -> Od
     return python_class(name)(parameters, settings)
 
 
-def hello(
-    odometry: str | None, parameters: ParameterSet, settings: Mapping[str, Any]
-) -> dict[str, Any]:
+def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
     """First message of a conversation; no name if the other side serves one odometry only."""
     name: dict[str, Any] = {"type": "hello", "version": VERSION, "odometry": odometry}
     return name | {"parameters": parameters, "settings": settings}
@@ -221,9 +219,7 @@ def _make(
 ) -> tuple[OdometryInstance, dict[str, Any]]:
     """The odometry that a hello asks for, and what the answer reports about it."""
     if (version := hello["version"]) != VERSION:
-        raise OdometryError(
-            f"this adaptune speaks version {VERSION} of the protocol, not {version}"
-        )
+        raise OdometryError(f"adaptune speaks version {VERSION} of the protocol, not {version}")
     name = hello.get("odometry") or only
     if name is None:
         raise OdometryError("the hello names no odometry; name it, or serve one: adaptune serve X")

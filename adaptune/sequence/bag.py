@@ -196,10 +196,8 @@ class BagSource:
     def check(self, reference: str | None, imu: str | None) -> None:
         """Make sure that the named topics are there, and that the points can be decoded."""
         if self.topics[self.points] in velodyne.TYPES and find_spec("velodyne_decoder") is None:
-            raise SequenceError(
-                f"{self.name}: {self.points} holds raw packets of a Velodyne; install "
-                f"adaptune[velodyne], which decodes them"
-            )
+            help_ = "install adaptune[velodyne] to decode them"
+            raise SequenceError(f"{self.name}: {self.points} holds a Velodyne's packets; {help_}")
         if reference is not None:
             self.topic(reference, POSES, "poses")
         if imu is not None:
@@ -219,9 +217,8 @@ class BagSource:
                 try:
                     yield reader.deserialize(data, connection.msgtype)
                 except Exception as error:
-                    raise SequenceError(
-                        f"{self.name}: message {number} on {topic} is damaged ({error})"
-                    ) from error
+                    what = f"message {number} on {topic} is damaged ({error})"
+                    raise SequenceError(f"{self.name}: {what}") from error
 
     @contextmanager
     def open(self) -> Iterator[AnyReader]:
@@ -255,9 +252,9 @@ class BagSource:
             except StopIteration:
                 return
             except Exception as error:
+                help_ = "the bag is damaged, `stop` before the damage or repair it"
                 raise SequenceError(
-                    f"{self.name}: cannot read on ({_say(error)}); the bag is damaged, `stop` "
-                    f"before the damage or repair it"
+                    f"{self.name}: cannot read on ({_say(error)}); {help_}"
                 ) from error
             yield message
 

@@ -20,9 +20,8 @@ def bag_paths(given: Sequence[str]) -> list[Path]:
             paths += _in_folder(path)
         elif path.exists():
             if path.suffix not in SUFFIXES:
-                raise SequenceError(
-                    f"{path}: not a bag; bags are .bag, .mcap and .db3 files and ROS 2 folders"
-                )
+                bags = "bags are .bag, .mcap and .db3 files and ROS 2 folders"
+                raise SequenceError(f"{path}: not a bag; {bags}")
             paths.append(path)
         elif found := sorted(path.parent.glob(path.name)):
             paths += bag_paths([str(match) for match in found])

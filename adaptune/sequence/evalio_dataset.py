@@ -38,15 +38,11 @@ def evalio_source(name: str) -> Source:
     except Exception as error:
         dataset = error
     if isinstance(dataset, Exception):
-        raise SequenceError(
-            f"{name}: evalio knows no such sequence ({dataset or type(dataset).__name__}); "
-            f"`evalio ls` lists them"
-        ) from dataset
+        what = f"evalio knows no such sequence ({str(dataset) or type(dataset).__name__})"
+        raise SequenceError(f"{name}: {what}; `evalio ls` lists them") from dataset
     if not dataset.is_downloaded():
-        raise SequenceError(
-            f"{name}: not in evalio's data folder ({dataset.folder}); fetch it with "
-            f"`evalio dl {name}`, or set EVALIO_DATA to where it is"
-        )
+        help_ = f"fetch it with `evalio dl {name}`, or set EVALIO_DATA to where it is"
+        raise SequenceError(f"{name}: not in evalio's data folder ({dataset.folder}); {help_}")
     recording = dataset.data_iter()
     if isinstance(recording, datasets.RosbagIter):
         return EvalioBag(dataset, recording)

@@ -138,10 +138,11 @@ def _clouds(messages: Messages, scans: Iterable[Scan]) -> Iterator[Message]:
     """Each cloud when its scan is over."""
     for scan in scans:
         header = messages.header(POINTS, scan.stamp, "lidar")
-        yield POINTS, scan.stamp + max(scan.span, 0), messages.cloud(header, _structured(scan))
+        yield POINTS, scan.stamp + max(scan.span, 0), messages.cloud(header, structured(scan))
 
 
-def _structured(scan: Scan) -> NDArray[Any]:
+def structured(scan: Scan) -> NDArray[Any]:
+    """Points as Velodyne's driver writes them, with rings and times where the scan has them."""
     x, y, z = scan.points.T
     light = np.zeros(len(scan)) if scan.intensities is None else scan.intensities
     columns = {"x": x, "y": y, "z": z, "intensity": light, "ring": scan.rings, "time": scan.times}

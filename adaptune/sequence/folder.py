@@ -70,9 +70,8 @@ class FileSource:
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """The LiDAR's poses stored with the files; a TrajectoryError if they cannot be read."""
         if name is not None or child_frame is not None:
-            raise SequenceError(
-                f"{self.name}: has no topics; `reference` must be a file of poses, or be left out"
-            )
+            help_ = "`reference` must be a file of poses, or be left out"
+            raise SequenceError(f"{self.name}: has no topics; {help_}")
         return None if self.own_poses is None else self.own_poses()
 
     def first_pose(self, name: str) -> int | None:

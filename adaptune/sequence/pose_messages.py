@@ -50,10 +50,8 @@ def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]
     """Poses of one child frame; of the only one if `frame` is None, else a SequenceError."""
     frames = sorted({name for _, name, *_ in poses})
     if frame is None and len(frames) > 1:
-        raise SequenceError(
-            f"{topic} has the transforms of several frames, name one of them as `child_frame`: "
-            f"{', '.join(frames)}"
-        )
+        help_ = f"name one of them as `child_frame`: {', '.join(frames)}"
+        raise SequenceError(f"{topic} has the transforms of several frames, {help_}")
     if frame is not None and frame not in frames:
         raise SequenceError(f"{topic}: no frame {frame}; {nearest(frame, frames)}")
     return [pose for pose in poses if frame in (None, pose[1])]

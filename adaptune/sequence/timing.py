@@ -71,10 +71,8 @@ class Timing:
         elif not absolute and max(abs(low), abs(high)) * scale > _LONGEST:
             what = f"reach {high * scale:g} s from the scan's stamp"
         if what:
-            raise TimingError(
-                f"the times of the points {what}; if they are in another unit, name it with "
-                f"`time_unit: s|ms|us|ns`"
-            )
+            help_ = "if they are in another unit, name it with `time_unit: s|ms|us|ns`"
+            raise TimingError(f"the times of the points {what}; {help_}")
         zero, begin = self._start(stamp, extent, scale, absolute)
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:
             times = np.ascontiguousarray(values)

@@ -282,10 +282,10 @@ class WithImu:
             if first is None:
                 begin, end = imu.stamps[0], imu.stamps[-1]
                 if not begin - _LATE < scan.stamp < end:
+                    first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
                     raise SequenceError(
-                        f"{self.name}: the IMU covers {begin * 1e-9:.3f} s to {end * 1e-9:.3f} s, "
-                        f"the first scan is of {scan.stamp * 1e-9:.3f} s: "
-                        f"they are not on the same clock"
+                        f"{self.name}: the IMU covers {' to '.join(covered)}, the first scan is of "
+                        f"{first_scan}: they are not on the same clock"
                     )
                 # Those during the first scan, and the one before.
                 first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)

@@ -1,9 +1,9 @@
 """Configuration of a simulated recording."""
 
 from collections.abc import Collection
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from adaptune.errors import AdaptuneError
 from adaptune.simulation.motions import MOTIONS
@@ -19,10 +19,13 @@ class SimulationError(AdaptuneError):
     """A recording that cannot be made."""
 
 
-def _known(kind: str, name: str, names: Collection[str]) -> str:
-    if name not in names:
-        raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(sorted(names))}")
-    return name
+def _known(kind: str, names: Collection[str]) -> AfterValidator:
+    def check(name: Any) -> Any:
+        if isinstance(name, str) and name not in names:
+            raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(sorted(names))}")
+        return name
+
+    return AfterValidator(check)
 
 
 class SceneLeg(BaseModel):
@@ -30,14 +33,9 @@ class SceneLeg(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    scene: str  # a name from `SCENES`
+    scene: Annotated[str, _known("scene", SCENES)]
     # Metres driven in it; the course's `length` if not given.
     length: Annotated[float, Field(ge=10.0, le=LONGEST)] | None = None
-
-    @field_validator("scene")
-    @classmethod
-    def _scene(cls, name: str) -> str:
-        return _known("scene", name, SCENES)
 
 
 class Course(BaseModel):
@@ -46,11 +44,11 @@ class Course(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     # Scenes in driving order, by name or with a length of their own.
-    scenes: tuple[str | SceneLeg, ...] = Field(min_length=1)
+    scenes: tuple[Annotated[str | SceneLeg, _known("scene", SCENES)], ...] = Field(min_length=1)
     # Metres driven in every scene that has no length of its own.
     length: float = Field(default=60.0, ge=10.0, le=LONGEST)
-    sensor: str = "hdl32e"  # a name from `SENSORS`
-    motion: str = "robot"  # a name from `MOTIONS`
+    sensor: Annotated[str, _known("sensor", SENSORS)] = "hdl32e"
+    motion: Annotated[str, _known("motion", MOTIONS)] = "robot"
     # Another seed is another world, another drive and other noise.
     seed: int = Field(default=0, ge=0, lt=2**31)
     # Turns of the sensor in a second; the sensor's own if not given.
@@ -60,23 +58,9 @@ class Course(BaseModel):
     # Hz of the inertial measurements; none are made if not given.
     imu: Literal[200, 400] | None = None
     moving_objects: bool = False  # whether cars and walkers move about
-    weather: str = "clear"  # a name from `WEATHERS`
+    weather: Annotated[str, _known("weather", WEATHERS)] = "clear"
     # Whether a recording's headers mark the start or the end of each scan.
     stamp: Literal["start", "end"] = "start"
-
-    @field_validator("scenes")
-    @classmethod
-    def _scenes(cls, scenes: tuple[str | SceneLeg, ...]) -> tuple[str | SceneLeg, ...]:
-        for scene in scenes:
-            if isinstance(scene, str):
-                _known("scene", scene, SCENES)
-        return scenes
-
-    @field_validator("sensor", "motion", "weather")
-    @classmethod
-    def _names(cls, name: str, info: ValidationInfo) -> str:
-        kind = str(info.field_name)
-        return _known(kind, name, {"sensor": SENSORS, "motion": MOTIONS, "weather": WEATHERS}[kind])
 
     @model_validator(mode="after")
     def _rate_follows_motion(self) -> Self:

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from adaptune import geometry
 from adaptune.files import replacing, replacing_folder
-from adaptune.sequence.export import Message, Messages, write_kitti_times
+from adaptune.sequence.export import Message, Messages, structured, write_kitti_times
 from adaptune.simulation.course import Course, SimulationError
 from adaptune.simulation.inertial import Inertial, measure
 from adaptune.simulation.rig import IMU, POINTS, POSES
@@ -26,10 +26,6 @@ Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
 
 Progress = Callable[[int, int], None]
-
-_FIELDS = ("x", "y", "z", "intensity", "ring", "time")
-CLOUD = np.dtype([(name, "<u2" if name == "ring" else "<f4") for name in _FIELDS])
-"""A point as Velodyne's driver writes it: 22 bytes, time in seconds from the header's stamp."""
 
 _MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
 """Marks of a recording's folder, which may be overwritten."""
@@ -170,15 +166,11 @@ class _Composer(Messages):
         return t["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
 
     def _cloud(self, scan: SimulatedScan, end: int) -> Any:
-        at_end = self._drive.course.stamp == "end"
-        stamp = end if at_end else scan.stamp
-        cloud = np.empty(len(scan), CLOUD)
-        cloud["x"], cloud["y"], cloud["z"] = scan.points.T
-        cloud["intensity"], cloud["ring"] = scan.intensities, scan.rings
-        cloud["time"] = scan.times
+        at_end, cloud = self._drive.course.stamp == "end", structured(scan)
         if at_end:
             cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
-        return self.cloud(self.header(POINTS, stamp, "velodyne"), cloud)
+        header = self.header(POINTS, end if at_end else scan.stamp, "velodyne")
+        return self.cloud(header, cloud)
 
 
 def _write_bag(
@@ -222,13 +214,7 @@ def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> 
 
 
 def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:
-    """Points as if all had been measured at the scan's start, by the true motion.
-
-    Returns
-    -------
-    ndarray of shape (n, 3)
-        float32 metres in the sensor's frame at the scan's stamp.
-    """
+    """Points (n, 3) as if all had been measured at the scan's stamp, by the true motion."""
     assert scan.times is not None
     times, column = np.unique(scan.times, return_inverse=True)
     T_world_column = drive.ride.poses((scan.stamp - drive.stamps()[0]) * 1e-9 + times.astype(float))

@@ -102,18 +102,15 @@ class Pipeline(OwnFrameOdometry):
 
     def _typed(self, name: str, value: Value) -> Value:
         """A value in the type that the pipeline needs: it takes no 1 for a float."""
+        where = f"parameters.{name}: {self.pipeline}"
         if name not in self._defaults:
             help_ = nearest(name, self._defaults)
-            raise OdometryError(
-                f"parameters.{name}: {self.pipeline} has no such parameter; {help_}"
-            )
+            raise OdometryError(f"{where} has no such parameter; {help_}")
         default = self._defaults[name]
         if isinstance(default, float) and type(value) is int:
             return float(value)
         if type(value) is not type(default):
-            raise OdometryError(
-                f"parameters.{name}: {self.pipeline} takes a value like {default!r}, not {value!r}"
-            )
+            raise OdometryError(f"{where} takes a value like {default!r}, not {value!r}")
         return value
 
     def prepare(self, scan: Scan) -> Prepared:

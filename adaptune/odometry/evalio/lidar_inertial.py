@@ -82,8 +82,7 @@ def _turned(measured: list[Imu], start: int, stop: int) -> NDArray[np.float64]:
     if not len(rates):
         return np.eye(3)
     turn = measured[0].T_sensor_imu[:3, :3] @ rates.mean(axis=0) * (stop - start) * 1e-9
-    R: NDArray[np.float64] = Rotation.from_rotvec(turn).as_matrix()
-    return R
+    return np.asarray(Rotation.from_rotvec(turn).as_matrix())
 
 
 class Dlio(Pipeline):

@@ -40,11 +40,9 @@ def evalio_modules() -> tuple[Any, ...]:
 def _fields() -> Any:
     """The description of `FIELDS`."""
     helpers = evalio_modules()[2]
-    kinds = (*(helpers.DataType.FLOAT32,) * 3, *(helpers.DataType.UINT32,) * 2)
-    return [
-        helpers.Field(name=name, datatype=kind, offset=4 * i)
-        for i, (name, kind) in enumerate(zip(FIELDS, kinds, strict=True))
-    ]
+    kinds = [helpers.DataType.FLOAT32] * 3 + [helpers.DataType.UINT32] * 2
+    fields = zip(FIELDS, kinds, range(0, 20, 4), strict=True)
+    return [helpers.Field(name=name, datatype=kind, offset=at) for name, kind, at in fields]
 
 
 def to_evalio(prepared: Prepared) -> Any:

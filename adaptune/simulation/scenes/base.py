@@ -55,6 +55,11 @@ class Tile:
     rng: np.random.Generator = field(compare=False)  # its own random numbers
     seed: int  # seed of the whole world, for shapes that continue from tile to tile
 
+    @property
+    def ends(self) -> list[float]:
+        """Stations at which another scene is next to the leg."""
+        return [self.start] * self.opens + [self.stop] * self.closes
+
     def at(self, s: ArrayLike, d: ArrayLike, lift: ArrayLike = 0.0) -> Floats:
         """Points of shape (..., 3) `lift` metres above the ground at stations and offsets."""
         s, d = np.broadcast_arrays(np.asarray(s, np.float64), np.asarray(d, np.float64))

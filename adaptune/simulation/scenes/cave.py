@@ -36,9 +36,8 @@ def _rooms(s: Floats, seed: int) -> Floats:
     for n in range(int(np.floor(s.min() / _ROOMS)) - 1, int(np.floor(s.max() / _ROOMS)) + 2):
         rng = np.random.default_rng([seed, 32, n + 1000])
         middle, half = (n + rng.uniform(0.3, 0.7)) * _ROOMS, rng.uniform(0.5, 0.8)
-        share = np.minimum(
-            share, 1.0 - rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4))
-        )
+        narrow = rng.uniform(0.9, 1.0) * np.exp(-(((s - middle) / half) ** 4))
+        share = np.minimum(share, 1.0 - narrow)
     return share
 
 
@@ -65,18 +64,12 @@ def _build(tile: Tile) -> list[Mesh]:
     # Above one line, so that the roof does not follow the rubble below it.
     rock[..., 2] = tile.at(s, 0.0)[..., 2] + z
     meshes = [grid(rock, Material.ROCK)]
-    meshes.extend(
-        _face(tile, end, angle)
-        for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes))
-        if used
-    )
+    meshes.extend(_face(tile, end, angle) for end in tile.ends)
     meshes.extend(_dripstones(tile))
     s_rocks, d_rocks = tile.scatter(0.05, 1.8, 4.5)
     boulders = [parts.boulder(v) for v in range(parts.VARIANTS)]
-    meshes.append(
-        parts.strew(tile, boulders, s_rocks, d_rocks, tile.rng.uniform(0.2, 0.55, len(s_rocks)))
-    )
-    return meshes
+    sizes = tile.rng.uniform(0.2, 0.55, len(s_rocks))
+    return [*meshes, parts.strew(tile, boulders, s_rocks, d_rocks, sizes)]
 
 
 def _face(tile: Tile, end: float, angle: Floats) -> Mesh:
@@ -98,11 +91,8 @@ def _dripstones(tile: Tile) -> list[Mesh]:
     s, d = tile.scatter(0.10, 1.5, 3.2, margin=2.0)
     n = len(s)
     radius, height = tile.rng.uniform(0.12, 0.35, n), tile.rng.uniform(0.4, 2.2, n)
-    cone = tube(
-        [[0, 0, -0.4, 1.3], [0, 0, 0.1, 1.0], [0.08, 0, 0.5, 0.55], [0, 0.1, 1.0, 0.1]],
-        Material.ROCK,
-        9,
-    )
+    rings = [[0, 0, -0.4, 1.3], [0, 0, 0.1, 1.0], [0.08, 0, 0.5, 0.55], [0, 0.1, 1.0, 0.1]]
+    cone = tube(rings, Material.ROCK, 9)
     scale = np.column_stack([radius, radius, height])
     standing = place(cone, tile.at(s, d), tile.rng.uniform(0.0, 6.28, n), scale)
     s, d = tile.scatter(0.06, 0.0, 2.5, margin=2.0)

@@ -30,9 +30,8 @@ def _build(tile: Tile) -> list[Mesh]:
         meshes.append(parts.wall(tile, s, d, _HEIGHT, Material.PLASTER))
         for door in doors:
             lintel = box((_DOOR, _RECESS, _HEIGHT - 2.1), Material.PLASTER, (0.0, 0.0, 2.1))
-            handle = box(
-                (0.12, 0.08, 0.04), Material.METAL, (0.38, side * (_RECESS / 2 - 0.04), 1.05)
-            )
+            spot = (0.38, side * (_RECESS / 2 - 0.04), 1.05)
+            handle = box((0.12, 0.08, 0.04), Material.METAL, spot)
             middle = door + _DOOR / 2
             at = tile.at(middle, side * (_HALF + _RECESS / 2))
             meshes.append(place(merge([lintel, handle]), at, tile.heading(middle)))
@@ -51,9 +50,8 @@ def _build(tile: Tile) -> list[Mesh]:
             station, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
             at = tile.at(station, side * (_HALF - size[1] / 2))
             meshes.append(place(box(size, Material.METAL), at, tile.heading(station)))
-    for end, used in ((tile.start, tile.opens), (tile.stop, tile.closes)):
-        if used:
-            meshes.extend(_front(tile, end))
+    for end in tile.ends:
+        meshes.extend(_front(tile, end))
     return meshes
 
 

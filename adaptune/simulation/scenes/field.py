@@ -19,9 +19,8 @@ def _build(tile: Tile) -> list[Mesh]:
     boulders = [parts.boulder(v) for v in range(parts.VARIANTS)]
     s, d = tile.scatter(0.002, 4.0, 50.0, margin=3.0)
     meshes = [parts.strew(tile, boulders, s, d, rng.uniform(0.25, 0.6, len(s)))]
-    post = merge(
-        [box((0.12, 0.12, 1.5), Material.WOOD), box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))]
-    )
+    tip = box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))
+    post = merge([box((0.12, 0.12, 1.5), Material.WOOD), tip])
     # An old fence on one side, some of its posts missing.
     stations = np.arange(np.ceil(tile.start / 4.0), tile.stop / 4.0) * 4.0
     stations = stations[rng.random(len(stations)) < 0.75]

@@ -7,13 +7,15 @@ from adaptune.simulation.noise import fractal_plane
 from adaptune.simulation.scenes import parts
 from adaptune.simulation.scenes.base import TILE, Floats, Scene, Spots, Tile, beyond, paved
 
-_KINDS = ("wood", "avenue", "hedges", "clearing", "bridge")
+_KINDS = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}
+"""Trees on a square metre of each kind of tile."""
 _BANK, _RIVER = -13.0, -30.0
 """Offsets of the river's near and far bank."""
 
 
 def _kind(index: int, seed: int) -> str:
-    return _KINDS[int(np.random.default_rng([seed, 71, index + 1000]).integers(len(_KINDS)))]
+    number = np.random.default_rng([seed, 71, index + 1000]).integers(len(_KINDS))
+    return list(_KINDS)[number]
 
 
 def _channel(spots: Spots, seed: int) -> Floats:
@@ -49,11 +51,8 @@ def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
 def _build(tile: Tile) -> list[Mesh]:
     rng, kind = tile.rng, _kind(tile.index, tile.seed)
     bushes = [parts.bush(v) for v in range(parts.VARIANTS)]
-    density = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}[
-        kind
-    ]
     near = 9.0 if kind == "clearing" else 3.2
-    s, d = _on_land(*tile.scatter(density, near, 32.0, margin=4.0))
+    s, d = _on_land(*tile.scatter(_KINDS[kind], near, 32.0, margin=4.0))
     meshes = [_trees(tile, s, d, (0.7, 1.3))]
     s, d = _on_land(*tile.scatter(0.02, 2.4, 14.0, margin=4.0))
     meshes.append(parts.strew(tile, bushes, s, d, rng.uniform(0.4, 1.2, len(s))))
@@ -90,9 +89,8 @@ def _hedges(tile: Tile) -> list[Mesh]:
             heart = box((length, 0.6, height), Material.LEAVES, (0.0, 0.0, -0.2))
             n = int(40 * length)
             spread = rng.uniform(-0.5, 0.5, (n, 3)) * [length, 0.9, height + 0.2]
-            leaves = foliage(
-                spread + np.array([0.0, 0.0, height / 2.0]), 0.15, 0.16, int(rng.integers(2**31))
-            )
+            spread += np.array([0.0, 0.0, height / 2.0])
+            leaves = foliage(spread, 0.15, 0.16, int(rng.integers(2**31)))
             at = tile.at(middle, side * 2.3)
             meshes.append(place(merge([heart, leaves]), at, tile.heading(middle)))
             s += length + rng.uniform(1.2, 3.0)

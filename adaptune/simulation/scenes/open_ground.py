@@ -11,11 +11,8 @@ from adaptune.simulation.scenes.base import Floats, Scene, Spots, Tile, beyond, 
 def _relief(spots: Spots, seed: int) -> Floats:
     swell = fractal_plane(spots.x, spots.y, 22.0, seed + 41, 3)
     hills = 7.0 + 6.0 * fractal_plane(spots.x, spots.y, 40.0, seed + 42, 3)
-    return (
-        0.05 * swell
-        + 0.9 * beyond(spots.d, 3.0, 15.0) * swell
-        + beyond(spots.d, 45.0, 40.0) * hills
-    )
+    rise = 0.05 * swell + 0.9 * beyond(spots.d, 3.0, 15.0) * swell
+    return rise + beyond(spots.d, 45.0, 40.0) * hills
 
 
 def _build(tile: Tile) -> list[Mesh]:
@@ -35,12 +32,8 @@ def _build(tile: Tile) -> list[Mesh]:
     if rng.random() < 0.45:
         s = rng.uniform(tile.start, tile.stop, 1)
         d = rng.choice([-1.0, 1.0], 1) * rng.uniform(22.0, 40.0)
-        shed = merge(
-            [
-                box((12.0, 7.0, 3.6), Material.WOOD),
-                box((12.8, 3.0, 1.2), Material.WOOD, (0.0, 0.0, 3.5)),
-            ]
-        )
+        roof = box((12.8, 3.0, 1.2), Material.WOOD, (0.0, 0.0, 3.5))
+        shed = merge([box((12.0, 7.0, 3.6), Material.WOOD), roof])
         meshes.append(parts.strew(tile, [shed], s, d, 1.0, sink=0.3))
     return meshes
 

@@ -52,10 +52,8 @@ def _extrude(profile: ArrayLike, width: float, material: Material) -> Mesh:
     """Make a body with a convex profile in x and z, `width` metres wide along y."""
     outline = np.asarray(profile, np.float64)
     n = len(outline)
-    sides = [
-        np.column_stack([outline[:, 0], np.full(n, y), outline[:, 1]])
-        for y in (-width / 2.0, width / 2.0)
-    ]
+    x, z = outline.T
+    sides = [np.column_stack([x, np.full(n, y), z]) for y in (-width / 2.0, width / 2.0)]
     closed = np.stack([np.vstack([side, side[:1]]) for side in sides])
     fan = np.array([[0, i, i + 1] for i in range(1, n - 1)])
     return merge([grid(closed, material), *(mesh(side, fan, material) for side in sides)])
@@ -64,43 +62,25 @@ def _extrude(profile: ArrayLike, width: float, material: Material) -> Mesh:
 @cache
 def car() -> Mesh:
     """Car of 4.3 m, heading along x."""
-    body = [
-        (-2.1, 0.3),
-        (2.15, 0.3),
-        (2.15, 0.62),
-        (1.95, 0.75),
-        (1.0, 0.86),
-        (-2.0, 0.92),
-        (-2.15, 0.7),
-    ]
-    cabin = [(-1.9, 0.9), (1.0, 0.85), (0.3, 1.42), (-0.3, 1.48), (-1.3, 1.42)]
+    rear, front = [(-2.0, 0.92), (-2.15, 0.7)], [(2.15, 0.62), (1.95, 0.75), (1.0, 0.86)]
+    body = _extrude([(-2.1, 0.3), (2.15, 0.3), *front, *rear], 1.76, Material.METAL)
+    windows = [(-1.9, 0.9), (1.0, 0.85), (0.3, 1.42), (-0.3, 1.48), (-1.3, 1.42)]
+    cabin = _extrude(windows, 1.5, Material.GLASS)
+    roof = box((1.5, 1.5, 0.04), Material.METAL, (-0.5, 0.0, 1.45))
     turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    wheel = _extrude(
-        np.column_stack([0.31 * np.cos(turn), 0.31 + 0.31 * np.sin(turn)]), 0.2, Material.METAL
-    )
+    rim = np.column_stack([0.31 * np.cos(turn), 0.31 + 0.31 * np.sin(turn)])
     wheels = [[x, y, 0.0] for x in (-1.3, 1.35) for y in (-0.78, 0.78)]
-    return merge(
-        [
-            _extrude(body, 1.76, Material.METAL),
-            _extrude(cabin, 1.5, Material.GLASS),
-            box((1.5, 1.5, 0.04), Material.METAL, (-0.5, 0.0, 1.45)),
-            meshes.place(wheel, wheels),
-        ]
-    )
+    return merge([body, cabin, roof, meshes.place(_extrude(rim, 0.2, Material.METAL), wheels)])
 
 
 @cache
 def walker() -> Mesh:
     """Person of 1.75 m in mid-step."""
+    torso = [[0.0, 0.0, 0.85, 0.16], [0.0, 0.0, 1.1, 0.17]]
     limbs = [
         [[-0.25, 0.1, 0.0, 0.06], [-0.05, 0.1, 0.5, 0.07], [0.0, 0.08, 0.9, 0.1]],
         [[0.3, -0.1, 0.0, 0.06], [0.15, -0.1, 0.5, 0.07], [0.0, -0.08, 0.9, 0.1]],
-        [
-            [0.0, 0.0, 0.85, 0.16],
-            [0.0, 0.0, 1.1, 0.17],
-            [0.02, 0.0, 1.42, 0.19],
-            [0.02, 0.0, 1.5, 0.06],
-        ],
+        [*torso, [0.02, 0.0, 1.42, 0.19], [0.02, 0.0, 1.5, 0.06]],
         [[0.03, 0.0, 1.48, 0.06], [0.04, 0.0, 1.62, 0.1], [0.04, 0.0, 1.75, 0.03]],
         [[0.2, 0.26, 0.85, 0.04], [0.02, 0.24, 1.4, 0.05]],
         [[-0.2, -0.26, 0.85, 0.04], [0.02, -0.24, 1.4, 0.05]],
@@ -111,37 +91,25 @@ def walker() -> Mesh:
 @cache
 def lamp() -> Mesh:
     """Street lamp of 6 m whose arm reaches out along y."""
-    return merge(
-        [
-            tube([[0, 0, -0.2, 0.11], [0, 0, 1.0, 0.09], [0, 0, 6.0, 0.06]], Material.METAL, 8),
-            box((0.08, 1.4, 0.06), Material.METAL, (0.0, 0.7, 5.9)),
-            box((0.2, 0.6, 0.1), Material.METAL, (0.0, 1.3, 5.85)),
-        ]
-    )
+    pole = tube([[0, 0, -0.2, 0.11], [0, 0, 1.0, 0.09], [0, 0, 6.0, 0.06]], Material.METAL, 8)
+    arm = box((0.08, 1.4, 0.06), Material.METAL, (0.0, 0.7, 5.9))
+    return merge([pole, arm, box((0.2, 0.6, 0.1), Material.METAL, (0.0, 1.3, 5.85))])
 
 
 @cache
 def sign() -> Mesh:
     """Road sign at 2.2 m, facing along x."""
-    return merge(
-        [
-            tube([[0, 0, -0.2, 0.04], [0, 0, 2.7, 0.04]], Material.METAL, 6),
-            box((0.03, 0.6, 0.6), Material.METAL, (0.05, 0.0, 2.1)),
-        ]
-    )
+    pole = tube([[0, 0, -0.2, 0.04], [0, 0, 2.7, 0.04]], Material.METAL, 6)
+    return merge([pole, box((0.03, 0.6, 0.6), Material.METAL, (0.05, 0.0, 2.1))])
 
 
 @cache
 def bench() -> Mesh:
     """Bench of 1.8 m along x, facing -y."""
-    return merge(
-        [
-            box((1.8, 0.45, 0.06), Material.WOOD, (0.0, 0.0, 0.42)),
-            box((1.8, 0.06, 0.4), Material.WOOD, (0.0, 0.22, 0.5)),
-            box((0.1, 0.45, 0.45), Material.METAL, (-0.75, 0.0, 0.0)),
-            box((0.1, 0.45, 0.45), Material.METAL, (0.75, 0.0, 0.0)),
-        ]
-    )
+    seat = box((1.8, 0.45, 0.06), Material.WOOD, (0.0, 0.0, 0.42))
+    back = box((1.8, 0.06, 0.4), Material.WOOD, (0.0, 0.22, 0.5))
+    feet = [box((0.1, 0.45, 0.45), Material.METAL, (x, 0.0, 0.0)) for x in (-0.75, 0.75)]
+    return merge([seat, back, *feet])
 
 
 def strew(
@@ -151,14 +119,9 @@ def strew(
     scale = np.broadcast_to(np.asarray(scale, np.float64), len(s))
     yaw = tile.rng.uniform(0.0, 2.0 * np.pi, len(s))
     at = tile.at(s, d, -sink * scale)
-    n = len(models)
-    return merge(
-        [
-            meshes.place(m, at[i::n], yaw[i::n], scale[i::n])
-            for i, m in enumerate(models)
-            if len(s) > i
-        ]
-    )
+    n, used = len(models), models[: len(s)]
+    placed = [meshes.place(m, at[i::n], yaw[i::n], scale[i::n]) for i, m in enumerate(used)]
+    return merge(placed)
 
 
 def wall(tile: Tile, s: ArrayLike, d: ArrayLike, height: ArrayLike, material: Material) -> Mesh:

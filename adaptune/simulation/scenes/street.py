@@ -44,9 +44,8 @@ def _house(width: float, depth: float, floors: int, rng: np.random.Generator) ->
         box((width + 0.3, 0.5, 0.25), plain, (0.0, 0.1, height)),
     ]
     if rng.random() < 0.4:
-        parts_.extend(
-            box((opening + 0.8, 1.0, 1.0), Material.METAL, (m, -0.5, storey)) for m in middle[1::2]
-        )
+        size = (opening + 0.8, 1.0, 1.0)
+        parts_.extend(box(size, Material.METAL, (m, -0.5, storey)) for m in middle[1::2])
     return merge(parts_)
 
 

@@ -8,7 +8,7 @@ from adaptune.geometry import invert, rotation_angle, steps
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import open_sequence
 from adaptune.simulation import Course, SimulationError
-from adaptune.simulation.recording import CLOUD, record, undistort
+from adaptune.simulation.recording import record, undistort
 from adaptune.simulation.simulate import Drive, simulate
 from adaptune.trajectory import read_kitti, read_tum
 
@@ -16,6 +16,10 @@ COURSE = Course(
     scenes=("corridor",), length=10.0, sensor="vlp16", columns=60, imu=200, motion="car"
 )
 RECORDINGS = {"ros1": "run.bag", "mcap": "run.mcap", "ros2": "run"}
+# A point as Velodyne's driver writes it, without padding.
+CLOUD = np.dtype(
+    [*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("ring", "<u2"), ("time", "<f4")]
+)
 
 
 @pytest.fixture(scope="module")
