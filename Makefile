@@ -5,12 +5,12 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STUDY := configs/demo.yaml
 
-.PHONY: help demo test lint types pytest format clean
+.PHONY: help demo test quick lint types pytest format clean
 
 help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests"
-	@echo "make quick   run a part of the tests, in less than 45 seconds"
+	@echo "make quick   run linters and the fast tests, in less than 45 seconds"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 
@@ -22,6 +22,9 @@ demo: $(VENV)/.installed
 
 test: lint types pytest
 
+quick: PYTEST_OPTIONS = -m "not slow"
+quick: lint pytest
+
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -31,7 +34,7 @@ types: $(VENV)/.installed
 	$(BIN)/mypy
 
 pytest: $(VENV)/.installed
-	$(BIN)/pytest -n auto --dist loadfile
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder $(PYTEST_OPTIONS)
 
 format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .

@@ -118,7 +118,7 @@ def draw_tracks(
                 axis.set_yscale("log")
             axis.set_ylabel(name.replace("_", "\n"), fontsize=8)
     axes[0].set_ylabel(f"RTE over {length:g} m [%]")
-    if any(np.isfinite(t.errors).any() for t in tracks.values()):
+    if any((np.isfinite(t.errors) & (t.errors > 0.0)).any() for t in tracks.values()):
         axes[0].set_yscale("log")
     axes[0].set_title(title, loc="left")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)

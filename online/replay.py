@@ -117,7 +117,8 @@ class Tracker:
             T_odom_previous = self._last.T_odom_sensor
             T_odom_sensor, registered = self.odometry.register(prepared)
             elapsed = (scan.stamp - self._last.stamp) * 1e-9
-            T_previous_current = invert(T_odom_previous) @ T_odom_sensor
+            with np.errstate(invalid="ignore"):  # the pose may be infinite
+                T_previous_current = invert(T_odom_previous) @ T_odom_sensor
             unhealthy = self._guard.check(T_previous_current, elapsed, registered)
             if unhealthy is not None:
                 T_healthy = self._guard.go_on(elapsed)

@@ -14,10 +14,51 @@ from offline.train import train
 
 Factory = pytest.TempPathFactory
 
+SLOW = [
+    "offline/test_kill.py",
+    "offline/test_leave_one_out.py",
+    "adaptune/odometry/test_conformance.py",
+    "adaptune/test_cli.py",
+    "offline/test_cluster.py",
+    "online/test_comparison.py",
+    "offline/test_campaign.py",
+    "adaptune/odometry/test_conformance_isolated.py",
+    "adaptune/odometry/test_gicp.py",
+    "offline/test_full.py",
+    "adaptune/odometry/test_protocol.py",
+    "adaptune/test_inspect.py",
+    "offline/test_resume.py",
+    "adaptune/odometry/test_command.py",
+    "offline/test_objective.py",
+    "adaptune/simulation/test_recording.py",
+    "offline/test_search.py",
+    "offline/samplers/test_conformance.py",
+    "test_readme.py",
+    "offline/test_budget.py",
+    "adaptune/simulation/test_scenes.py",
+    "offline/test_pruning.py",
+    "adaptune/simulation/test_simulate.py",
+    "offline/test_trial.py",
+    "adaptune/test_selector.py",
+    "adaptune/model/test_knn.py",
+    "online/test_switch_cost.py",
+    "offline/test_storage.py",
+    "adaptune/odometry/test_isolation.py",
+    "adaptune/odometry/test_process.py",
+]
+"""Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run slow tests first, so that all processes end at about the same time."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    """Run the longest files first, so that all processes end at about the same time."""
+    tests = Path(__file__).parent
+    place = {tests / name: i for i, name in enumerate(SLOW)}
+    if missing := [str(path) for path in place if not path.exists()]:
+        raise pytest.UsageError(f"{__file__}: SLOW lists {', '.join(missing)}")
+    items.sort(key=lambda item: place.get(item.path, len(place)))
+    for item in items:
+        if item.path in place:
+            item.add_marker("slow")
 
 
 @pytest.fixture(scope="session", autouse=True)

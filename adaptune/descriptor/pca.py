@@ -39,7 +39,8 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             # Many scans take a tenth of the time by their covariance; few have none.
             solver = "covariance_eigh" if len(block) > block.shape[1] else "full"
             pca = PCA(min(self.n_components, *block.shape), svd_solver=solver)
-            deviations = pca.fit_transform(block).std(axis=0)
+            with np.errstate(invalid="ignore"):  # a block may be constant
+                deviations = pca.fit_transform(block).std(axis=0)
             self.mean_[begin:end] = pca.mean_
             components.append(np.zeros((len(deviations), X.shape[1])))
             components[-1][:, begin:end] = pca.components_

@@ -5,8 +5,10 @@ import sys
 import time
 
 import pytest
+from typer.testing import CliRunner
 
 from adaptune.archive import Archive
+from adaptune.cli import app
 
 
 def adaptune(*arguments, cwd):
@@ -47,11 +49,18 @@ def test_the_whole_way(study_file, tmp_path):
         (["online", "STUDY", "--model", "STUDY"], "is not an error model, or damaged"),
     ],
 )
-def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words):
-    arguments = [study_file if a == "STUDY" else a for a in arguments]
-    done = adaptune(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
+def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, [str(study_file) if a == "STUDY" else a for a in arguments])
+    assert done.exit_code == 2
     assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_process_ends_with_a_sentence_too(tmp_path):
+    done = adaptune("offline", "none.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "none.yaml: there is no such file" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
@@ -23,11 +24,13 @@ SETS = ParameterSets(SPACE, (3, 5), ({"speed": 1.0}, {"speed": 8.0}))
 STILL = Motions(np.eye(4), {})
 
 
+@cache
 def drive_cave(sensor, seed):
     course = Course(scenes=("cave",), length=10.0, sensor=sensor, seed=seed)
     return [Scan(s.stamp, s.points) for s in list(simulate(course))[::10]]
 
 
+@cache
 def of_two_caves():
     """Fitted to scans of an HDL-32E."""
     drives = [drive_cave("hdl32e", seed) for seed in (1, 2)]

@@ -33,6 +33,12 @@ def replayed(trained):
     return trained
 
 
+@pytest.fixture
+def own(replayed, study_file, tmp_path):
+    """A copy of `replayed` that a test may change."""
+    return load_study(study_file, [], shutil.copytree(replayed.folder, tmp_path / "study"))
+
+
 def test_rows_and_files(replayed):
     rows = compare(replayed)
     assert [(row.sequence, row.mode) for row in rows] == [("three", mode) for mode in MODES]
@@ -79,11 +85,11 @@ def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
 
 
 @pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
-def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism):
-    model = ErrorModel.load(trained.folder / "model.safetensors")
+def test_an_odometry_that_is_not_live_adapts_too(own, study_file, mechanism):
+    model = ErrorModel.load(own.folder / "model.safetensors")
     given = [f"online.switching.mechanism={mechanism}", "online.switching.warm_up=0.5"]
-    study = load_study(study_file, [*given, "online.period=0.5"], trained.folder)
-    assert run_replays(study, trained.folder / "model.safetensors") == 4
+    study = load_study(study_file, [*given, "online.period=0.5"], own.folder)
+    assert run_replays(study, own.folder / "model.safetensors") == 4
     row = next(row for row in compare(study) if row.mode == "paired")
     assert row.rte < 3.0
     folder = study.folder / "replays/three/paired"
@@ -99,18 +105,17 @@ def test_an_odometry_that_is_not_live_adapts_too(trained, study_file, mechanism)
         assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
         # Two training sequences do not show that a bank pays.
         assert row["weights"] == ""
-    run_replays(trained, trained.folder / "model.safetensors")
 
 
-def test_a_bank_that_pays_is_weighed(trained, study_file):
+def test_a_bank_that_pays_is_weighed(own, study_file):
     """And what is replayed does not end in failure."""
-    model = ErrorModel.load(trained.folder / "model.safetensors")
+    model = ErrorModel.load(own.folder / "model.safetensors")
     assert len(model.bank) == 4
     assert not model.bank_adapts
     paying = replace(model, bank_settings=BankSettings(min_fixed_share=0.5))
-    path = trained.folder / "paying.safetensors"
+    path = own.folder / "paying.safetensors"
     paying.save(path)
-    study = load_study(study_file, ["online.switching.mechanism=bank"], trained.folder)
+    study = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     run_replays(study, path)
     folder = study.folder / "replays/three"
     with (folder / "paired/selections.csv").open() as file:
@@ -125,12 +130,11 @@ def test_a_bank_that_pays_is_weighed(trained, study_file):
     with (folder / "paper/selections.csv").open() as file:
         assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.bank)
     assert next(row.rte for row in compare(study) if row.mode == "paired") < 3.0
-    more = load_study(study_file, ["online.switching.mechanism=bank"], trained.folder)
+    more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
         ReplaySetup.of(more).members(replace(model, bank=model.bank[:3]))
     with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
         ReplaySetup.of(more).members(replace(model, bank=model.bank[::-1]))
-    run_replays(trained, trained.folder / "model.safetensors")
 
 
 def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file):

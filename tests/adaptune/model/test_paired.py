@@ -71,7 +71,8 @@ def plain_ratios(data, feature, m, h, tau, c):
     names = sorted(set(data.sequence.tolist()))
     distances, means, fixed = plain_evidence(data, feature, m, names)
     ratios = [[(y + 0.02) / (f + 0.02) for y in of] for of, f in zip(means, fixed, strict=True)]
-    middle = statistics.median(distances)
+    # In the very same place as most sequences, distances count as they are.
+    middle = statistics.median(distances) or 1.0
     weights = [math.exp(-tau * (a - min(distances)) / middle) for a in distances]
     weights = [w / sum(weights) for w in weights]
     familiar = min(1.0, plain_familiarity(data, min(distances), m) / 0.1)
