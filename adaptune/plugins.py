@@ -1,4 +1,4 @@
-"""Load what a name stands for: ours, another package's, or ``module:attribute``."""
+"""Import an object by its name: a built-in one, one of another package, or ``module:attribute``."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -10,11 +10,11 @@ from adaptune.space import nearest
 
 
 class PluginError(AdaptuneError):
-    """A name that stands for nothing."""
+    """A name for which there is no object."""
 
 
 def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> Any:
-    """Import what a name stands for.
+    """Import an object by its name.
 
     Parameters
     ----------
@@ -22,13 +22,13 @@ def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -
         One of `ours`, one that an installed package announces in the entry-point group, or
         ``module:attribute``.
     kind
-        What it is, for messages, as "odometry".
+        Word for the object in messages, as "odometry".
     ours
-        Ours by name, as ``module:attribute``.
+        The built-in objects by name, as ``module:attribute``.
     group
-        Of entry points.
+        The entry-point group.
     sort
-        Of Python object: ``Class``, or ``function``.
+        Kind of Python object: ``Class``, or ``function``.
     """
     path = ours.get(name) or (name if ":" in name else None)
     if path is None:

@@ -225,7 +225,7 @@ def _draw_novelty(axes: Any, found: LeftOutResults, default: str) -> None:
 
 
 def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
-    """Ratio over the number of sets, of instances and of training sequences."""
+    """Ratio over the number of sets, of members and of training sequences."""
     label = "of so many sets the best, if known"
     sizes = np.arange(1, len(found.portfolio) + 1)
     axes.plot(sizes, found.portfolio, "s--", color="#bbbbbb", label=label)

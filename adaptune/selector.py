@@ -91,7 +91,7 @@ class Selector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all scans and selections, as before a new drive."""
+        """Forget all scans and selections, as before a new recording."""
         self._scan: Scan | None = None
         self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
         self._found: deque[Selection] = deque(maxlen=SMOOTHING)

@@ -69,7 +69,7 @@ class LeftOut(NamedTuple):
     def interval(self, mode: str) -> Interval:
         """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
 
-        It is about this drive, and says nothing about other places.
+        It is about this sequence, and says nothing about other places.
         """
         intervals = bootstrap(self.errors[mode], self.errors["fixed"], self.block)
         return intervals and intervals[1]

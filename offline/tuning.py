@@ -21,15 +21,15 @@ from adaptune.model.bank_weights import (
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 MIN_SEQUENCES = 6
-"""Fewer say too little about places they are not to advise for adapting."""
+"""With fewer training sequences, a rule does not adapt: they say too little about other places."""
 NO_WORSE = 1.05
-"""A rule may not have more than this much of the fixed set's error on any sequence left out."""
+"""Largest ratio to the fixed set's error that is allowed on a sequence left out."""
 TINY = 1e-6
-"""Percent, which is no error: what has none can still be compared."""
+"""Percent, added to mean errors so that errors of zero can be compared."""
 SHARPNESS = (6.0, 12.0, 24.0, 48.0)
-"""What `tune` chooses from; of equally good ones the first."""
+"""`tune` chooses one of these; of equally good ones the first."""
 BANK_FRAMES = 1000
-"""Nearest frames of each sequence: products of errors take more to be known than their means."""
+"""Nearest frames of each sequence in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
     [
         BankSettings(sharpness=sharpness, min_fixed_share=share, clip=clip, n_frames=BANK_FRAMES)
@@ -38,7 +38,7 @@ BANK_SETTINGS = [
     ]
     for clip in (6.0, 18.0)
 ]
-"""What `tune_bank` chooses from, by clip."""
+"""`tune_bank` chooses one of these; the lists share their clip."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
 NO_BANK = BankSettings(adapt=False)
 

@@ -24,8 +24,8 @@ class Validated(NamedTuple):
     validation: Validation
     # Ratio to the fixed set's error of every mode on every sequence left out.
     rows: list[dict[str, Any]]
-    learning: list[dict[str, Any]]  # see `learning_curve`; empty where nobody asked
-    banks: list[dict[str, Any]]  # see `bank_curve`; empty where nobody asked
+    learning: list[dict[str, Any]]  # see `learning_curve`; empty if not asked for
+    banks: list[dict[str, Any]]  # see `bank_curve`; empty if not asked for
 
 
 def validate(

@@ -18,7 +18,7 @@ Interval = tuple[float, float] | None
 
 
 class Reference(NamedTuple):
-    """Errors are measured against this."""
+    """The reference that errors are measured against, and over which length."""
 
     trajectory: Trajectory | None  # None where nothing is known
     length: float  # metres of a sub-trajectory

@@ -65,7 +65,7 @@ class Alternating:
 def measure_switching(
     study: Study, seconds: float = 60.0, progress: Progress = lambda *_: None
 ) -> list[dict[str, Any]]:
-    """Switch every 5 s to the same parameters, which ought to change nothing.
+    """Switch every 5 s to the same parameters: whatever changes is the cost of switching.
 
     Parameters
     ----------

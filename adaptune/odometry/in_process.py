@@ -23,7 +23,7 @@ class InProcess(OdometryInstance):
     Parameters
     ----------
     odometry
-        The adapter, which nothing else may drive.
+        The adapter, which nothing else may use.
     """
 
     faults: Sequence[str] = ()

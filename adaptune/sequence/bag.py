@@ -254,7 +254,7 @@ class BagSource:
             except Exception as error:
                 help_ = "the bag is damaged, `stop` before the damage or repair it"
                 raise SequenceError(
-                    f"{self.name}: cannot read on ({_say(error)}); {help_}"
+                    f"{self.name}: the rest cannot be read ({_say(error)}); {help_}"
                 ) from error
             yield message
 
