@@ -111,9 +111,9 @@ def simulate(
     Each course under `courses:` becomes a bag in the BotanicGarden layout, with a TUM file of its
     ground truth and a picture.
     """
+    loaded = _load(study, override, folder)
     from adaptune.simulation.recording import record
 
-    loaded = _load(study, override, folder)
     if not loaded.config.courses:
         raise AdaptuneError(f"{study}: courses: there is none to simulate")
     loaded.open()
@@ -150,10 +150,10 @@ def offline(
     (the odometry's own parameters), the *fixed* set (the best set over all training sequences),
     and the best set of each sequence. Stop it with Ctrl-C, and run it again to resume.
     """
+    loaded = _load(study, override, folder)
     from adaptune import report
     from offline.train import train
 
-    loaded = _load(study, override, folder)
     say(f"Seed {loaded.config.offline.seed}.")
     with progress() as show:
         training = train(loaded, show, cluster)
@@ -208,11 +208,11 @@ def trials(
     sequences and the RTE on each of them, the number of lost tracks, of ended processes and of
     steps that the health check rejects, and the other metrics.
     """
+    loaded = _load(study, override, folder)
     from adaptune import report
     from adaptune import trials as table
     from adaptune.archive import Archive
 
-    loaded = _load(study, override, folder)
     names = loaded.training
     archive = Archive(loaded.folder / "trials")
     finished = table.rows(archive, names)
@@ -248,10 +248,10 @@ def validate(
     motions of its members. Numbers are ratios to the error of the fixed set, which is chosen
     without the left-out sequence, too.
     """
+    loaded = _load(study, override, folder)
     from adaptune import report
     from offline.validate import validate as validate_study
 
-    loaded = _load(study, override, folder)
     with progress() as show:
         validation, rows, learning, banks = validate_study(loaded, curve, sizes, show)
     console.print(
@@ -294,10 +294,10 @@ def online(
     error model. Each replay writes its trajectory (TUM), every selection with its predicted error,
     and the time of each scan (CSV).
     """
+    loaded = _load(study, override, folder)
     from adaptune.cores import pin
     from online.run_replays import run_replays
 
-    loaded = _load(study, override, folder)
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
     unpin = pin(os.getpid())
@@ -324,10 +324,10 @@ def switching(
     same parameters: with every mechanism that the odometry supports, and several warm-ups. The
     study keeps the switch cost of its own mechanism, which selections take into account.
     """
+    loaded = _load(study, override, folder)
     from adaptune import report
     from online.switch_cost import measure_switching
 
-    loaded = _load(study, override, folder)
     with progress() as show:
         rows = measure_switching(loaded, seconds, show)
     console.print(
@@ -352,10 +352,10 @@ def compare(
     1, adapting is better. Intervals come from a block bootstrap over time: they hold for these
     recordings, not for other places.
     """
+    loaded = _load(study, override, folder)
     from adaptune import report
     from online.comparison import compare as compare_replays
 
-    loaded = _load(study, override, folder)
     loaded.check()
     rows = compare_replays(loaded)
     console.print(
