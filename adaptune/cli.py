@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # Every command imports what it needs, so that `adaptune --help` answers at once.
 
 app = typer.Typer(
+    context_settings={"help_option_names": ["-h", "--help"]},
     name="adaptune",
     cls=Commands,
     no_args_is_help=True,

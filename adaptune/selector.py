@@ -54,6 +54,8 @@ class Selector:
 
     Raises
     ------
+    ModelError
+        If there is no such rule, or the model's bank lacks a member.
     DescriptorError
         If a descriptor has changed since the model was fitted.
     """
@@ -155,7 +157,7 @@ class Selector:
     def _smoothed(self, selection: Selection) -> Selection:
         """Replace the weights by the smoothed ones; what is predicted stays as it is."""
         self._found.append(selection)
-        weights = np.array([list((s.weights or {}).values()) for s in self._found])
+        weights = np.array([[(s.weights or {})[m] for m in self.members] for s in self._found])
         familiarity = np.array([s.familiarity for s in self._found])
         smooth = smooth_weights(weights, familiarity)[-1].tolist()
         weighted = weighted_selection(

@@ -211,7 +211,7 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
             near = near._replace(evidence=familiar(near.evidence))
         with patch.multiple(bank_weights, RIDGE=ridge, SMOOTHING=smoothing):
             weights = weights_along(near, its)
-        return bank_errors(sequence, members, weights)
+        return bank_errors(sequence, weights)
 
     found = {
         "bank": simulated(),

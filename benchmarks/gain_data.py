@@ -158,7 +158,7 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
         period[known],
         described[known],
         errors[known],
-        vectors=found["vectors"][known],
+        vectors=dict(enumerate(np.moveaxis(found["vectors"][known], 1, 0))),
         simulation=simulation,
     )
 

@@ -9,7 +9,7 @@ from gain_data import PERIOD, WINDOW
 from numpy.typing import NDArray
 
 from adaptune.descriptor import DESCRIPTORS, averaged
-from adaptune.model.bank_weights import clip_errors, minimum_variance_weights
+from adaptune.model.bank_weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.curves import learning_curve
 from offline.labelled import LabelledData, LabelledSequence, periods
 from offline.leave_one_out import Validation, leave_one_out
@@ -24,7 +24,7 @@ def validate(data: LabelledData, size: int) -> None:
     left_out = leave_one_out(data, bank=size).left_out
     for of, (sequence, others) in zip(left_out, data.folds(), strict=True):
         members = choose_bank(others, others.fixed(), size)
-        of.errors.update(constantly(sequence, others.sets.columns(members), members))
+        of.errors.update(constantly(sequence, members))
     validation = Validation(left_out)
     print_summary(validation, validation.ratios)
     for mode in validation.modes:
@@ -34,13 +34,10 @@ def validate(data: LabelledData, size: int) -> None:
     print(f"if the best of 1, 2, ... complementary sets were known: {known}", flush=True)
 
 
-def constantly(
-    sequence: LabelledSequence, columns: NDArray[np.intp], members: Sequence[int]
-) -> Errors:
+def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     """Errors of a bank whose weights stay the same."""
-    assert sequence.vectors is not None
     assert sequence.simulation is not None
-    vectors, lost = clip_errors(sequence.vectors[:, columns], 0)
+    vectors, lost = clip_errors(np.stack([sequence.vectors[m] for m in members], axis=1), 0)
     squares = np.einsum("ijx,ikx->jk", vectors, vectors) + np.diag((lost**2).sum(axis=0))
     modes = {
         "bank, even weights": np.full(len(members), 1.0 / len(members)),
@@ -49,7 +46,7 @@ def constantly(
     }
     n_periods = len(periods(sequence.simulation.period)[0])
     return {
-        mode: bank_errors(sequence, members, np.tile(weights, (n_periods, 1)))
+        mode: bank_errors(sequence, MemberWeights(tuple(members), np.tile(weights, (n_periods, 1))))
         for mode, weights in modes.items()
     }
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.geometry import Poses, invert, mean_motion, steps
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
+from adaptune.model.bank_weights import MemberWeights
 from adaptune.odometry.bank import agreement, share
 
 
@@ -62,22 +64,14 @@ class BankSimulation:
     lost_track: float  # metres a second
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
-    motions: Callable[[Sequence[int]], Poses]
+    motions: Callable[[tuple[int, ...]], Poses]
 
-    def errors(self, members: Sequence[int], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Capped errors of a bank at every frame, NaN without a sub-trajectory.
-
-        Parameters
-        ----------
-        members
-            Trial numbers, the fixed set's first.
-        weights
-            Of the members, of shape (n_periods, n_members).
-        """
-        T_previous_current = self.motions(members)
+    def errors(self, weights: MemberWeights) -> NDArray[np.float64]:
+        """Capped errors of a bank at every frame, NaN without a sub-trajectory."""
+        T_previous_current = self.motions(weights.members)
         T_ref_step = steps(self.T_ref_sensor)
         bounds = self.lost_track * np.diff(self.stamps) * 1e-9
-        of_steps = weights[np.unique(self.period, return_inverse=True)[1][1:]]
+        of_steps = weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
         agreeing = agreement(T_previous_current, of_steps, bounds[:, None, None])
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
@@ -130,17 +124,16 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial], lost_track: float)
 
 def motions_from_archive(
     archive: Archive, name: str, frames: Frames, lost_track: float
-) -> Callable[[Sequence[int]], Poses]:
+) -> Callable[[tuple[int, ...]], Poses]:
     """Read the motions of trials on a sequence when they are asked for; see `BankSimulation`."""
-    kept: dict[tuple[int, ...], Poses] = {}
 
-    def motions(trials: Sequence[int]) -> Poses:
-        key = tuple(trials)
-        if key not in kept:
-            # One bank after the other is asked for, each many times.
-            kept.clear()
-            read = [archive.read(name, trial) for trial in trials]
-            kept[key] = recorded_motions(frames, read, lost_track)
-        return kept[key]
+    @cache
+    def read(trial: int) -> Trial:
+        return archive.read(name, trial)
+
+    @lru_cache(maxsize=1)
+    def motions(trials: tuple[int, ...]) -> Poses:
+        # One bank after the other is asked for, each many times.
+        return recorded_motions(frames, [read(trial) for trial in trials], lost_track)
 
     return motions

@@ -9,7 +9,7 @@ import numpy as np
 from adaptune.model import ErrorModel
 from adaptune.study.config import SwitchingConfig
 from offline.labelled import LabelledData
-from offline.tuning import choose_bank, tune, tune_bank
+from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose_bank, tune, tune_bank
 
 _log = logging.getLogger(__name__)
 
@@ -55,6 +55,8 @@ def fit(
         errors=np.concatenate([s.errors for s in sequences]),
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
+        paired=DO_NOT_ADAPT,
+        bank_settings=NO_BANK,
     )
 
 
@@ -86,7 +88,7 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
 def named_members(
     model: ErrorModel, switching: SwitchingConfig, complete: LabelledData
 ) -> list[int]:
-    """Trial numbers of the members that the study names; empty if it names none, or in vain."""
+    """Trial numbers of the members that the study names; empty if they cannot be a bank."""
     named = [model.trial(n) for n in switching.sets or ()]
     members = [trial for trial in named if trial is not None and trial in complete.sets]
     if len(set(members)) == len(named):

@@ -1,7 +1,7 @@
-"""The labelled data set: what the archive holds about every training sequence, read once."""
+"""The labelled data set: what the archive holds about every training sequence."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.names import origin, places
 from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
 from offline.config import Metric, OfflineStudyConfig
-from offline.objective import margin, repeated, weighted
+from offline.objective import margin, mean_value, repeated, weighted
 from offline.search import owner
 
 
@@ -40,15 +40,14 @@ class LabelledSequence:
     values: NDArray[np.float64] | None = None
     # (n_sets, n_repeats): where trials are repeated, the objective of every run.
     repeats: NDArray[np.float64] | None = None
-    # (n_sets,): sets that were searched for on this very place, or a view of it, and on no other:
-    # they are unknown to whoever has not been there.
+    # (n_sets,): sets that were searched for on this sequence or a view of it alone. Where the
+    # sequence is left out, they are unknown.
     own: NDArray[np.bool_] | None = None
     block: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.descriptor.base.lowest_elevation`
-    # (n, n_sets, 3): the errors as vectors, NaN where nobody asks; see
-    # `adaptune.model.TrainingData`.
-    vectors: NDArray[np.float32] | None = None
-    # With all frames; without it and `vectors` there is no bank.
+    # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
+    vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
+    # With all frames; without it there is no bank.
     simulation: BankSimulation | None = None
 
     def subset(self, columns: NDArray[np.intp]) -> "LabelledSequence":
@@ -59,7 +58,6 @@ class LabelledSequence:
             values=None if self.values is None else self.values[columns],
             repeats=None if self.repeats is None else self.repeats[columns],
             own=None if self.own is None else self.own[columns],
-            vectors=None if self.vectors is None else self.vectors[:, columns],
         )
 
 
@@ -88,14 +86,11 @@ class LabelledData(NamedTuple):
         return [
             (
                 one,
-                self._replace(sequences=[s for s in self.sequences if origin(s.name) != one.name]),
+                LabelledData([s for s in self.sequences if origin(s.name) != one.name], self.sets),
             )
             for one in self.sequences
             if origin(one.name) == one.name
         ]
-
-    def _without(self, name: str) -> "LabelledData":
-        return self._replace(sequences=[s for s in self.sequences if origin(s.name) != name])
 
     def fixed(self) -> int:
         """Trial number of the fixed set: the one that `offline.objective.choose_fixed` chooses."""
@@ -106,9 +101,9 @@ class LabelledData(NamedTuple):
             for s in self.sequences
         ]
         repeats = [s.repeats for s in self.sequences if s.repeats is not None]
-        bounds = np.mean(values, axis=0)
+        bounds = mean_value(np.stack(values, axis=-1))
         if len(repeats) == len(values):
-            bounds = bounds + np.nan_to_num(margin(np.array(repeats)))
+            bounds = bounds + np.nan_to_num(margin(np.stack(repeats, axis=-2)))
         return self.sets.trials[int(np.argmin(bounds))]
 
     def training_data(self) -> tuple[TrainingData, ScaledPCA]:
@@ -128,9 +123,8 @@ class LabelledData(NamedTuple):
 
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
-        columns = self.sets.columns(members)
         return np.concatenate(
-            [s.vectors[:, columns] for s in self.sequences if s.vectors is not None]
+            [np.stack([s.vectors[trial] for trial in members], axis=1) for s in self.sequences]
         )
 
 
@@ -139,7 +133,7 @@ def comparable(
 ) -> tuple[LabelledSequence, LabelledData]:
     """Restrict both to the sets that were run on the sequence left out, but not found there alone.
 
-    Other sets have no error to be looked up there, or are unknown to whoever has not been there.
+    Other sets have no recorded error there, or would be unknown without that sequence.
     """
     run = np.asarray(~np.isnan(sequence.errors).any(axis=0))
     if sequence.own is not None:
@@ -208,12 +202,12 @@ def labelled_data(
     owners = [owner(config.offline, list(run), trial) for trial in sets]
     labelled = []
     for sequence, frames, known in read:
-        vectors = np.full((*sequence.errors.shape, 3), np.nan, np.float32)
-        for trial in eligible.intersection(sets).intersection(run[sequence.name]):
-            of_trial = archive.read(sequence.name, trial)
-            of_frames = error_vectors(frames, of_trial, config.sub_trajectory)
-            vectors[:, sets.column(trial)] = of_frames[known]
-        own = [one is not None and origin(one) == origin(sequence.name) for one in owners]
+        name, length = sequence.name, config.sub_trajectory
+        vectors = {
+            trial: error_vectors(frames, archive.read(name, trial), length)[known]
+            for trial in eligible.intersection(sets).intersection(run[name])
+        }
+        own = [one is not None and origin(one) == origin(name) for one in owners]
         labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
     return LabelledData(labelled, sets)
 

@@ -257,4 +257,4 @@ def _simulate(
         return cap(sequence.errors[:, data.sets.column(data.fixed)]), 0.0
     near = bank_evidence(sequence, bank_data(others, data, members), pca, settings)
     weights = weights_along(near, settings)
-    return bank_errors(sequence, members, weights), float(1.0 - weights[:, 0].mean())
+    return bank_errors(sequence, weights), float(1.0 - weights.weights[:, 0].mean())

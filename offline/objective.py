@@ -117,7 +117,7 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     """Judge a parameter set by its trials on some sequences."""
     metrics = [run.metrics for run in runs]
     values = tuple(
-        float(np.mean([weighted(weights, of_run) for of_run in metrics]))
+        float(mean_value(np.array([weighted(weights, of_run) for of_run in metrics])))
         for weights in config.objective
     )
     constraints = tuple(
@@ -141,21 +141,21 @@ def repeated(weights: Mapping[Metric, float], runs: Sequence[Mapping[str, float]
     return [weighted(repeatable, run) for run in runs]
 
 
+def mean_value(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over the sequences of values of shape (..., n_sequences)."""
+    return np.asarray(np.ascontiguousarray(values).mean(axis=-1))
+
+
 def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
     """From a mean over sequences to the upper end of its one-sided 95 % confidence interval.
 
-    The interval is Student's. Runs of a set vary, the sequences do not.
-
-    Parameters
-    ----------
-    repeats
-        Values of every run, of shape (n_sequences, ..., n_repeats).
+    The interval is Student's. Runs of a set vary, the sequences do not. `repeats` has the shape
+    (..., n_sequences, n_repeats).
     """
-    # Workers import this module too; scipy.stats takes half a second.
     from scipy import stats
 
-    n_sequences, n_repeats = len(repeats), repeats.shape[-1]
-    variance = repeats.var(axis=-1, ddof=1).sum(axis=0)
+    n_sequences, n_repeats = repeats.shape[-2:]
+    variance = repeats.var(axis=-1, ddof=1).sum(axis=-1)
     error = np.sqrt(variance / n_repeats) / n_sequences
     return np.asarray(stats.t.ppf(0.95, n_sequences * (n_repeats - 1)) * error)
 

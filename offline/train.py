@@ -155,7 +155,7 @@ def _training_rows(
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
-    whole: Mapping[str, tuple[float, float]],
+    whole: Mapping[str, Mapping[int, float]],
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
@@ -170,7 +170,7 @@ def _training_rows(
                 "lost, baseline": runs[0].lost,
                 "lost, fixed": runs[fixed].lost,
                 "baseline, whole run": whole[name][0],
-                "fixed, whole run": whole[name][1],
+                "fixed, whole run": whole[name][fixed],
                 "_own best trial": best,
             }
             | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
@@ -200,8 +200,8 @@ def _run_whole(
     archive: Archive,
     workers: Pool[Any],
     progress: Progress,
-) -> dict[str, tuple[float, float]]:
-    """Mean RTE of baseline and fixed set on the training sequences, in one go from end to end."""
+) -> dict[str, dict[int, float]]:
+    """Mean RTE of some sets on the training sequences, in one go from end to end."""
     tasks = [
         Task(name, (n,), (parameters,), whole=True)
         for name in names
@@ -210,10 +210,7 @@ def _run_whole(
     ]
     for done, _ in enumerate(run_tasks(archive, workers, tasks), start=1):
         progress("whole runs", done, len(tasks), "")
-    baseline, fixed = min(sets), max(sets)
-    means = {
-        (name, n): float(np.nanmean(archive.read(name, n, whole=True).errors))
+    return {
+        name: {n: float(np.nanmean(archive.read(name, n, whole=True).errors)) for n in sets}
         for name in names
-        for n in sets
     }
-    return {name: (means[name, baseline], means[name, fixed]) for name in names}

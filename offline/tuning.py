@@ -12,12 +12,12 @@ from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap
 from adaptune.model import BankRule, BankSettings, PairedExpectedRatio, PairedSettings, TrainingData
 from adaptune.model.bank_weights import (
+    MemberWeights,
     NearProducts,
     bank_weights,
     choose_members,
     smooth_weights,
 )
-from adaptune.model.paired import best_candidates
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 MIN_SEQUENCES = 6
@@ -91,19 +91,18 @@ def _paired_logs(sequence: LabelledSequence, others: LabelledData) -> list[float
     near = rule.near(pca.transform(sequence.descriptors[first]))
     capped = cap(sequence.errors)
     fixed = capped[:, data.sets.column(data.fixed)].mean() + TINY
-    columns = data.sets.columns(rule.candidates_)
     logs = []
     for sharpness in SHARPNESS:
-        best, _ = best_candidates(near, rule.fixed_at_, PairedSettings(sharpness=sharpness))
-        errors = capped[np.arange(len(capped)), columns[best][period]]
+        chosen = data.sets.columns(rule.choices(near, PairedSettings(sharpness=sharpness)))
+        errors = capped[np.arange(len(capped)), chosen[period]]
         logs.append(float(np.log((errors.mean() + TINY) / fixed)))
     return logs
 
 
 def choose_bank(data: LabelledData, fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, see `choose_members`."""
-    vectors = [s.vectors for s in data.sequences if s.vectors is not None]
-    return choose_members(vectors, [s.errors for s in data.sequences], data.sets, fixed, size)
+    vectors, errors = zip(*((s.vectors, s.errors) for s in data.sequences), strict=True)
+    return choose_members(vectors, errors, data.sets, fixed, size)
 
 
 def tune_bank(data: LabelledData, members: Sequence[int], fixed: int) -> BankSettings:
@@ -142,8 +141,7 @@ def _bank_logs(
     for of_clip in BANK_SETTINGS:
         near = bank_evidence(sequence, data, pca, of_clip[0])
         for settings in of_clip:
-            weights = weights_along(near, settings)
-            errors = bank_errors(sequence, members, weights)
+            errors = bank_errors(sequence, weights_along(near, settings))
             logs.append(float(np.log((errors.mean() + TINY) / of_fixed)))
     return logs
 
@@ -164,16 +162,14 @@ def bank_evidence(
     return rule.near(pca.transform(sequence.simulation.descriptors[first]))
 
 
-def weights_along(near: NearProducts, settings: BankSettings) -> NDArray[np.float64]:
-    """Smoothed weights along a sequence, of shape (n_periods, n_members)."""
+def weights_along(near: NearProducts, settings: BankSettings) -> MemberWeights:
+    """Smoothed weights along a sequence."""
     weights, _ = bank_weights(near, settings)
-    return smooth_weights(weights, near.evidence.familiarity)
+    return MemberWeights(near.members, smooth_weights(weights, near.evidence.familiarity))
 
 
-def bank_errors(
-    sequence: LabelledSequence, members: Sequence[int], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def bank_errors(sequence: LabelledSequence, weights: MemberWeights) -> NDArray[np.float64]:
     """Capped errors of a simulated bank on the frames that have a sub-trajectory."""
     assert sequence.simulation is not None
-    errors = sequence.simulation.errors(members, weights)
+    errors = sequence.simulation.errors(weights)
     return errors[~np.isnan(errors)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,19 +60,15 @@ def validate(
     switching = study.config.online.switching
     named = switching.sets is not None and set(model.bank) <= set(data.sets)
     bank = model.bank if named else switching.size
-
-    def stage(what: str) -> Callable[[int, int], None]:
-        return lambda done, total: progress(what, done, total)
-
-    validation = leave_one_out(data, progress=stage("sequences left out"), bank=bank)
+    validation = leave_one_out(data, progress=partial(progress, "sequences left out"), bank=bank)
     rows = _rows(validation)
     report.write_rows(study.folder, "validation", rows)
     learning = banks = []
     if curve:
-        learning = learning_curve(data, progress=stage("learning curve"), bank=bank)
+        learning = learning_curve(data, progress=partial(progress, "learning curve"), bank=bank)
         report.write_rows(study.folder, "learning", learning)
     if sizes:
-        banks = bank_curve(data, stage("sizes of banks"))
+        banks = bank_curve(data, partial(progress, "sizes of banks"))
         report.write_rows(study.folder, "banks", banks)
     report.draw_validation(
         study.folder / "validation.png",

@@ -6,7 +6,7 @@ from adaptune import report
 from adaptune.report import Track
 from adaptune.study.study import Study
 from online.modes import ReplaySetup
-from online.run_replays import identity
+from online.run_replays import shared_identity
 from online.statistics import ComparisonRow, Reference, compare_modes, pooled
 from online.stored_replays import ReplaySummary, StoredReplay, StoredReplayError
 
@@ -70,10 +70,11 @@ def _track(replay: StoredReplay, reference: Reference) -> Track:
 def _check_replays(study: Study, setup: ReplaySetup) -> None:
     """Refuse replays that are missing, or of another recording or configuration."""
     for name in study.config.test:
+        now = shared_identity(study, name)
         for mode in setup.modes:
             folder = study.folder / "replays" / name / mode
-            now = identity(study, setup, None, name, mode, "")
-            if differing := now.differences(ReplaySummary.read(folder).about):
+            made = ReplaySummary.read(folder).about.model_dump()
+            if differing := [key for key, value in now.items() if made[key] != value]:
                 raise StoredReplayError(
                     f"{folder}: was replayed with another {', '.join(differing)}; run `adaptune "
                     f"online` with this study"

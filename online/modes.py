@@ -59,17 +59,19 @@ class ReplaySetup:
         """What is compared: baseline, fixed, and each selection rule."""
         return ("baseline", "fixed", *self.rules)
 
-    def identity(self, mode: str) -> dict[str, Any] | None:
-        """What an adaptive mode depends on, as plain data; None for baseline and fixed."""
+    def identity(self, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:
+        """What a mode depends on, as plain data; `digest` is the model's."""
         if mode not in self.rules:
-            return None
+            parameters = self.parameters(mode, model)
+            return {"mode": mode, "parameters": parameters, "model": None, "switching": None}
         used = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
         settings = self.switching.model_dump(mode="json", include=used[self.mechanism])
         if self.mechanism != "live":
             settings["warm_up"] = self.warm_up._asdict()
         if self.mechanism != "bank":
             settings["switch_cost"] = self.switch_cost
-        return {"mechanism": self.mechanism} | settings
+        settings["mechanism"] = self.mechanism
+        return {"mode": mode, "parameters": None, "model": digest, "switching": settings}
 
     def parameters(self, mode: str, model: ErrorModel) -> ParameterSet | None:
         """The parameters of baseline and fixed, which stay; None for adaptive modes."""

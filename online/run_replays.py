@@ -4,6 +4,7 @@ import itertools
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -70,7 +71,11 @@ def run_replays(
     made = 0
     for name in study.config.test:
         folder = study.folder / "replays" / name
-        about = {mode: identity(study, setup, model, name, mode, digest) for mode in setup.modes}
+        shared = shared_identity(study, name)
+        about = {
+            mode: ReplayIdentity(**setup.identity(mode, model, digest), **shared)
+            for mode in setup.modes
+        }
         due = [mode for mode in setup.modes if again or not is_current(folder / mode, about[mode])]
         if not due:
             continue
@@ -124,21 +129,13 @@ def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: in
         )
 
 
-def identity(
-    study: Study, setup: ReplaySetup, model: ErrorModel | None, name: str, mode: str, digest: str
-) -> ReplayIdentity:
-    """All that a replay depends on; without a model, only what all modes share."""
-    parameters = None if model is None else setup.parameters(mode, model)
-    return ReplayIdentity(
-        mode=mode,
-        parameters=parameters,
-        model=None if parameters else digest,
-        switching=None if parameters else setup.identity(mode),
-        period=study.config.online.period,
-        odometry=study.config.odometry.model_dump(mode="json"),
-        health=study.config.health.model_dump(mode="json"),
-        **study.sequences.identity(name),
-    )
+def shared_identity(study: Study, name: str) -> dict[str, Any]:
+    """What the replays of a sequence depend on in all modes."""
+    return {
+        "period": study.config.online.period,
+        "odometry": study.config.odometry.model_dump(mode="json"),
+        "health": study.config.health.model_dump(mode="json"),
+    } | study.sequences.identity(name)
 
 
 def _write_reference(folder: Path, reference: Trajectory | None, odometry: Trajectory) -> None:

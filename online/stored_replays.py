@@ -36,12 +36,6 @@ class ReplayIdentity(BaseModel):
     course: dict[str, Any] | None
     recording: list[int] | None  # sizes of the recording's files
 
-    def differences(self, other: Self) -> list[str]:
-        """What differs in the settings that all modes of a sequence share."""
-        own = ("mode", "parameters", "model", "switching")
-        keys = [key for key in type(self).model_fields if key not in own]
-        return [key for key in keys if getattr(self, key) != getattr(other, key)]
-
 
 class ReplaySummary(BaseModel):
     """The content of ``replay.json``."""

@@ -6,13 +6,22 @@ from adaptune.model.error_model import ErrorModel
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 from adaptune.model.model_file import ModelError
 from adaptune.model.paired import PairedExpectedRatio, PairedSettings
+from adaptune.space import nearest
 
 RULES = ("paired", "paper")
 """Names of the selection rules; the first is the default."""
 
 
 def make_rule(name: str, settings: PairedSettings, switch_cost: float = 0.0) -> Rule:
-    """Make a selection rule for a single odometry; `paper` has neither settings nor switch cost."""
+    """Make a selection rule for a single odometry; `paper` has neither settings nor switch cost.
+
+    Raises
+    ------
+    ModelError
+        If there is no such rule.
+    """
+    if name not in RULES:
+        raise ModelError(f"there is no selection rule {name!r}: {nearest(name, RULES)}")
     return NearestNeighbours() if name == "paper" else PairedExpectedRatio(settings, switch_cost)
 
 

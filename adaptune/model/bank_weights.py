@@ -40,9 +40,17 @@ class BankSettings(BaseModel):
     clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
 
 
+class MemberWeights(NamedTuple):
+    """Weights of a bank's members, period after period."""
+
+    members: tuple[int, ...]  # trial numbers, the fixed set's first
+    weights: NDArray[np.float64]  # (n_periods, n_members)
+
+
 class NearProducts(NamedTuple):
     """Products of errors on the training frames nearest to some scans."""
 
+    members: tuple[int, ...]  # trial numbers
     evidence: Evidence
     # (n_scans, n_sequences, n_members, n_members): mean products of the members' errors, percent
     # squared.
@@ -110,7 +118,7 @@ class BankRule(Rule):
         """
         evidence = self.nearest_.about(features)
         fixed = evidence.means(self.products_[:, 0, 0].astype(np.float64))
-        return NearProducts(evidence, evidence.means(self.products_), fixed)
+        return NearProducts(self.members_, evidence, evidence.means(self.products_), fixed)
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`; the error of each member alone."""
@@ -255,7 +263,7 @@ def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def choose_members(
-    vectors: Sequence[NDArray[np.float32]],
+    vectors: Sequence[Mapping[int, NDArray[np.float32]]],
     errors: Sequence[NDArray[np.floating]],
     sets: ParameterSets,
     fixed: int,
@@ -270,12 +278,13 @@ def choose_members(
     Parameters
     ----------
     vectors
-        Of every sequence, of shape (n_frames, n_sets, 3), see `clip_errors`.
+        For every sequence the error vectors by trial number, each of shape (n_frames, 3), see
+        `clip_errors`. A set without them is not chosen.
     errors
         Of every sequence, percent, of shape (n_frames, n_sets); NaN where a set was not run. A set
         that was not run on every sequence is not chosen.
     sets
-        The columns.
+        The columns of `errors`.
     fixed
         Trial number of the fixed set.
     size
@@ -288,12 +297,11 @@ def choose_members(
     """
     number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
     means = mean_errors(np.concatenate(errors), number)
-    fixed_at = sets.column(fixed)
-    pool = [int(j) for j in np.argsort(means, kind="stable")[:POOL] if np.isfinite(means[j])]
-    pool = [fixed_at, *(j for j in pool if j != fixed_at)]
+    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf]
+    pool = [fixed, *(t for t in best if t != fixed and all(t in known for known in vectors))]
     squares = []
-    for of_sequence in vectors:
-        few, lost = clip_errors(of_sequence[:, pool], 0)
+    for known in vectors:
+        few, lost = clip_errors(np.stack([known[trial] for trial in pool], axis=1), 0)
         rows = few.transpose(0, 2, 1).reshape(-1, len(pool)).astype(np.float64)
         products = (rows.T @ rows + np.diag((lost.astype(np.float64) ** 2).sum(axis=0))) / len(few)
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
@@ -301,7 +309,7 @@ def choose_members(
     while len(chosen) < min(size, len(pool)):
         rest = [j for j in range(len(pool)) if j not in chosen]
         chosen.append(min(rest, key=lambda j: _root_mean_square(squares, [*chosen, j])))
-    return [sets.trials[pool[j]] for j in chosen]
+    return [pool[j] for j in chosen]
 
 
 def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:

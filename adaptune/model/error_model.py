@@ -141,6 +141,11 @@ class ErrorModel:
         members
             Trial numbers of some of the bank's members, to be the only candidates; the first counts
             as the fixed one. All sets are candidates when left out.
+
+        Raises
+        ------
+        ModelError
+            If the bank does not hold one of them.
         """
         data = TrainingData(
             pca.transform(self.descriptors),
@@ -151,6 +156,11 @@ class ErrorModel:
         )
         if members is None:
             return data
+        if unknown := [trial for trial in members if trial not in self.bank]:
+            raise ModelError(
+                f"the model's bank does not hold trial {unknown[0]}, only {self.bank}; name its "
+                f"sets in online.switching.sets and run `adaptune offline` again"
+            )
         vectors = self.vectors[:, [self.bank.index(trial) for trial in members]]
         return replace(data, fixed=members[0], candidates=tuple(members), vectors=vectors)
 

@@ -89,7 +89,7 @@ class PairedExpectedRatio(Rule):
         """See `Rule.fit`."""
         self.data_ = data
         self.candidates_ = self._candidates()
-        self.fixed_at_ = self.candidates_.index(data.fixed)
+        self._fixed_at = self.candidates_.index(data.fixed)
         self.fixed_errors_ = data.fixed_errors
         self.errors_ = self._mixed_errors()
         self.nearest_ = NearestFrames(self.settings.n_frames).fit(data.features, data.sequence)
@@ -135,6 +135,14 @@ class PairedExpectedRatio(Rule):
         fixed = evidence.means(self.fixed_errors_)
         return Near(evidence, evidence.means(self.errors_), fixed)
 
+    def choices(self, near: Near, settings: PairedSettings) -> list[int]:
+        """Trial number of the best candidate for each scan, by other settings than those fitted.
+
+        The settings may differ in `sharpness`, `threshold` and `caution`.
+        """
+        best, _ = _best_candidates(near, self._fixed_at, settings)
+        return [self.candidates_[position] for position in best]
+
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`.
 
@@ -143,7 +151,7 @@ class PairedExpectedRatio(Rule):
         """
         near = self.near(feature[None])
         predicted = np.full(len(self.data_.sets), np.inf)
-        expected, _, weights = expected_ratios(near, self.settings)
+        expected, _, weights = _expected_ratios(near, self.settings)
         columns = self.data_.sets.columns(self.candidates_)
         predicted[columns] = expected[0] * float(weights[0] @ near.fixed[0])
         return predicted
@@ -151,7 +159,7 @@ class PairedExpectedRatio(Rule):
     def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
         """See `Rule.select`."""
         near = self.near(feature[None])
-        (best,), ratios = best_candidates(near, self.fixed_at_, self.settings)
+        (best,), ratios = _best_candidates(near, self._fixed_at, self.settings)
         (expected,), (cautious,), (weights,) = ratios
         familiarity = float(near.evidence.familiarity[0])
         at = self.candidates_.index(current) if current in self.candidates_ else None
@@ -172,7 +180,7 @@ class PairedExpectedRatio(Rule):
         )
 
 
-def expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
+def _expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
     """Ratio of every candidate's error to the fixed set's."""
     ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
     weights = near.evidence.weights(settings.sharpness)
@@ -187,21 +195,11 @@ def expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
     return Ratios(expected, expected + trust * settings.caution * error, weights)
 
 
-def best_candidates(
+def _best_candidates(
     near: Near, fixed_at: int, settings: PairedSettings
 ) -> tuple[NDArray[np.intp], Ratios]:
-    """Position of the best candidate for each scan, of shape (n_scans,), and the ratios.
-
-    Parameters
-    ----------
-    near
-        What is known about the scans.
-    fixed_at
-        Position of the fixed set among the candidates. Its ratios are 1.
-    settings
-        Of the rule.
-    """
-    ratios = expected_ratios(near, settings)
+    """Position of the best candidate for each scan, of shape (n_scans,), and the ratios."""
+    ratios = _expected_ratios(near, settings)
     expected, cautious, _ = ratios
     # Neither mixing nor caution is for the set that all are compared with.
     expected[:, fixed_at] = cautious[:, fixed_at] = 1.0

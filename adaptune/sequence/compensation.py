@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.geometry import Poses
@@ -31,6 +30,8 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     """
     if scan.times is None or not len(scan):
         return scan
+    from scipy.spatial.transform import Rotation
+
     twist = Rotation.from_matrix(T_start_end[:3, :3]).as_rotvec() / duration
     velocity = T_start_end[:3, 3] / duration
     moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
@@ -114,6 +115,8 @@ def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
     part = slice(first - 1, last + 1)
     seconds = (imu.stamps[part] - scan.stamp) * 1e-9
     rates = imu.angular_velocity[part] @ imu.T_sensor_imu[:3, :3].T
+    from scipy.spatial.transform import Rotation
+
     moments = np.linspace(0.0, max(span, 1e-9), _MOMENTS)
     at = np.stack([np.interp(moments, seconds, rates[:, i]) for i in range(3)], axis=1)
     steps = Rotation.from_rotvec((at[1:] + at[:-1]) * 0.5 * np.diff(moments)[:, None])
@@ -123,7 +126,7 @@ def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
     return replace(scan, points=_rotate(scan, moments, Rotation.concatenate(rotations)))
 
 
-def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Rotation) -> NDArray[np.float32]:
+def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Any) -> NDArray[np.float32]:
     """Rotate each point by the rotation at its time.
 
     The rotation of a point is looked up on a grid fine enough that the step between neighbours,

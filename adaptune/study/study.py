@@ -117,6 +117,10 @@ class Study(Generic[C_co]):
         path = self.folder / "switching.json"
         try:
             measured = json.loads(path.read_text(encoding="utf-8"))
+            if "switch_cost" not in measured:
+                raise ConfigurationError(
+                    f"{path}: was written by an older adaptune; run `adaptune switching` again"
+                )
             if measured["of"] != self.switching_identity():
                 return 0.0
             return max(0.0, float(measured["switch_cost"]))

@@ -6,6 +6,7 @@ import pytest
 from adaptune.archive import Frames, Trial
 from adaptune.geometry import invert, steps
 from adaptune.metrics import sub_trajectory_rte
+from adaptune.model.bank_weights import MemberWeights
 from adaptune.odometry import InProcess, Odometry, WarmUp
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Registration
@@ -62,7 +63,8 @@ def simulated(trials, weights, lost_track=3.0):
         lost_track,
         lambda members: motions[:, list(members)],
     )
-    return simulation, simulation.errors(range(len(trials)), np.tile(weights, (6, 1)))
+    members = tuple(range(len(trials)))
+    return simulation, simulation.errors(MemberWeights(members, np.tile(weights, (6, 1))))
 
 
 def test_errors_are_vectors_as_long_as_they_say():
@@ -159,5 +161,7 @@ def test_it_is_what_a_bank_does():
             poses.append(box.register(prepared).T_odom_sensor)
     expected = sub_trajectory_rte(f.T_ref_sensor, np.array(poses), LENGTH)
     alone = replace(simulation, lost_track=1e9)
-    np.testing.assert_allclose(alone.errors(range(3), weights), np.minimum(expected, 30.0))
+    np.testing.assert_allclose(
+        alone.errors(MemberWeights((0, 1, 2), weights)), np.minimum(expected, 30.0)
+    )
     np.testing.assert_allclose(invert(poses[0]), np.eye(4))

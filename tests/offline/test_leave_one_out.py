@@ -293,7 +293,7 @@ def with_motions(of, rng, n_steps=300):
         period[known],
         described[known],
         np.array(errors, np.float32).T[known],
-        vectors=np.array(vectors, np.float32).transpose(1, 0, 2)[known],
+        vectors={t: v[known].astype(np.float32) for t, v in zip(TRIALS, vectors, strict=True)},
         simulation=simulation,
     )
 
@@ -323,8 +323,8 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
     sequences = [with_motions(f"s{i}", rng) for i in range(7)]
     seen = []
 
-    def errors(self, _, weights):
-        seen.append(weights)
+    def errors(self, weights):
+        seen.append(weights.weights)
         return np.full(len(self.stamps), 0.1)
 
     def bank_weights(near, _):
@@ -351,10 +351,10 @@ def test_a_bank_that_does_not_pay_keeps_the_fixed_set():
         replace(
             s,
             errors=np.repeat(s.errors[:, :1], 5, axis=1),
-            vectors=np.repeat(s.vectors[:, :1], 5, axis=1),
+            vectors=dict.fromkeys(TRIALS, s.vectors[0]),
             simulation=replace(
                 s.simulation,
-                motions=lambda m, of=s.simulation.motions: of([0] * len(m)),
+                motions=lambda m, of=s.simulation.motions: of((0,) * len(m)),
             ),
         )
         for s in sequences

@@ -137,7 +137,9 @@ def test_errors_are_clipped():
 
 def test_a_bank_is_of_sets_whose_errors_cancel():
     data = places(np.random.default_rng(5))
-    vectors = [data.vectors[data.sequence == s] for s in range(6)]
+    vectors = [
+        dict(enumerate(np.moveaxis(data.vectors[data.sequence == s], 1, 0))) for s in range(6)
+    ]
     errors = [data.errors[data.sequence == s] for s in range(6)]
     sets = data.sets
     assert sorted(choose_members(vectors, errors, sets, 1, 2)) == [1, 2]

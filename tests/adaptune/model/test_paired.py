@@ -12,7 +12,6 @@ from tables import table
 
 from adaptune.model import RULES, PairedExpectedRatio, PairedSettings, TrainingData, make_rule
 from adaptune.model.base import complementary
-from adaptune.model.paired import best_candidates
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -121,8 +120,8 @@ def test_scans_are_told_apart_however_many_come_at_once():
     data = random_data(3, 60, 5)
     rule = PairedExpectedRatio(PairedSettings(n_frames=7)).fit(data)
     features = np.random.default_rng(4).normal(size=(6, 3))
-    best, _ = best_candidates(rule.near(features), rule.fixed_at_, rule.settings)
-    assert [rule.candidates_[b] for b in best] == [rule.select(x).trial for x in features]
+    choices = rule.choices(rule.near(features), rule.settings)
+    assert choices == [rule.select(x).trial for x in features]
 
 
 def test_sequences_that_differ_are_less_believed():
