@@ -71,8 +71,8 @@ def test_reads_a_study(study_file, tmp_path):
     assert study.config.sequences["one"].bag == str(study_file.parent / "one.bag")
     assert study.odometry.space.names == ("max_correspondence_distance", "keyframe_interval")
     assert study.odometry.space.parameters["keyframe_interval"].low == 0.5
-    assert study.odometry().settings.downsampling == 0.5
-    assert study.odometry({"keyframe_interval": 2.0}).parameters == {
+    assert study.odometry().odometry.settings.downsampling == 0.5
+    assert study.odometry({"keyframe_interval": 2.0}).odometry.parameters == {
         "max_correspondence_distance": 2.0,
         "keyframe_interval": 2.0,
     }
