@@ -229,4 +229,4 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         "bank, weights of each second": simulated(smoothing=1),
         "bank, weights of 20 seconds": simulated(smoothing=20),
     }
-    return found | constantly(sequence, data.sets.columns(members), members)
+    return found | constantly(sequence, members)
