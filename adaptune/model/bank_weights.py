@@ -105,6 +105,7 @@ class BankRule(Rule):
             vectors, lost = clip_errors(data.vectors[frames], 0, self.settings.clip)
             self.products_[frames] = np.einsum("ijx,ikx->ijk", vectors, vectors)
             self.products_[frames] += lost[:, :, None] ** 2 * np.eye(len(members))
+        self.fixed_squares_ = self.products_[:, 0, 0].astype(np.float64)
         self.nearest_ = NearestFrames(self.settings.n_frames).fit(data.features, data.sequence)
         return self
 
@@ -117,8 +118,8 @@ class BankRule(Rule):
             Of shape (n_scans, n_features).
         """
         evidence = self.nearest_.about(features)
-        fixed = evidence.means(self.products_[:, 0, 0].astype(np.float64))
-        return NearProducts(self.members_, evidence, evidence.means(self.products_), fixed)
+        products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
+        return NearProducts(self.members_, evidence, products, fixed)
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`; the error of each member alone."""

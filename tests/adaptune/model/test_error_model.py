@@ -12,7 +12,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from adaptune.model import RULES, BankSettings, ErrorModel, ModelError, make_rule
-from adaptune.model.model_file import FORMAT, digest
+from adaptune.model.model_file import FORMAT, checksum
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 
@@ -125,7 +125,7 @@ def rewrite(path, arrays=None, text=None, **header):
         parts = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     parts |= arrays or {}
     said["header"] |= header
-    said["digest"] = digest(said["header"], parts)
+    said["checksum"] = checksum(said["header"], parts)
     parts = {name: np.ascontiguousarray(part) for name, part in parts.items()}
     save_file(parts, path, {"adaptune": json.dumps(said)})
 
@@ -431,7 +431,7 @@ def test_whatever_happens_to_the_bytes_a_sentence_is_all_that_comes_of_it(tmp_pa
 )
 @given(st.data())
 def test_any_header_is_understood_or_refused(tmp_path, data):
-    """The digest keeps damage away from the header; here somebody computes it again."""
+    """The checksum keeps damage away from the header; here somebody computes it again."""
     path = saved(tmp_path)
     json_values = st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
