@@ -3,6 +3,7 @@
 import itertools
 import logging
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,9 @@ def run_replays(
         sequence = study.sequences.open(name)
         for mode in due:
             started = setup.start(mode, model, name)
-            result = _replay(study.config, sequence, f"{name}, {mode}", started, progress)
+            result = _replay(
+                study.config, sequence, name, started, partial(progress, f"{name}, {mode}")
+            )
             if mode == due[0]:
                 _write_reference(folder, sequence.reference(), result.trajectory)
             write_replay(folder / mode, result, about[mode])
@@ -94,7 +97,11 @@ def run_replays(
 
 
 def _replay(
-    config: StudyConfig, sequence: Sequence, what: str, mode: Mode, progress: Progress
+    config: StudyConfig,
+    sequence: Sequence,
+    name: str,
+    mode: Mode,
+    progress: Callable[[int, int], None],
 ) -> Replay:
     done, n = itertools.count(1), sequence.n_messages
     try:
@@ -104,13 +111,13 @@ def _replay(
             config.health,
             mode.selector,
             config.online.period,
-            lambda: progress(what, next(done), n),
+            lambda: progress(next(done), n),
         )
     except DescriptorError as error:
-        raise ReplayError(f"sequences.{what.partition(',')[0]}: {error}") from error
+        raise ReplayError(f"sequences.{name}: {error}") from error
     finally:
         mode.odometry.close()
-    progress(what, n, n)
+    progress(n, n)
     return result
 
 
