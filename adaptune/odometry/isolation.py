@@ -16,7 +16,7 @@ from functools import cache
 from typing import Annotated, Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, Field, ValidationInfo
 
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
@@ -32,6 +32,7 @@ from adaptune.odometry.base import (
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
+from adaptune.strict import StrictModel
 
 MOST_FAULTS = 10
 """An instance with so many faults does not start again: the rest of its sequence is lost."""
@@ -57,7 +58,7 @@ Arguments = Annotated[tuple[Annotated[str, AfterValidator(_in_study)], ...], Fie
 """A program and its arguments; ``{study}`` in them is the folder of the study's file."""
 
 
-class Limits(BaseModel):
+class Limits(StrictModel):
     """Limits of an odometry in a process of its own.
 
     Attributes
@@ -68,10 +69,8 @@ class Limits(BaseModel):
         Gigabytes, in addition to what the process begins with.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    seconds: float = Field(10.0, gt=0)
-    memory: float = Field(4.0, gt=0)
+    seconds: float = Field(10.0, gt=0, le=1e6)
+    memory: float = Field(4.0, gt=0, le=1e6)
 
 
 class Isolated(OdometryInstance):

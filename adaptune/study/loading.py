@@ -15,7 +15,7 @@ from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
-from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated
+from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated, validated_rest
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 
 C = TypeVar("C", bound=StudyConfig)
@@ -122,11 +122,15 @@ def _check(
     mistakes: list[Mistake] = []
     if isinstance(odometry := data.get("odometry"), dict):
         _check_odometry(odometry, mistakes, folder)
-    sound = not mistakes
-    config = validated(config_type, data, (), mistakes, {"folder": folder})
+    context = {"folder": folder}
+    config = validated(config_type, data, (), mistakes, context)
+    sound = all(mistake.key[:1] != ("odometry",) for mistake in mistakes)
+    if config is None:
+        needed = {"odometry": {"name": ""}, "training": [""]}
+        config = validated_rest(config_type, data, needed, mistakes, context)
     if config is not None:
         try:
-            described = describe_odometry(config.odometry)
+            described = describe_odometry(config.odometry) if sound else None
         except (OdometryError, ValidationError):
             described = None
         if described is not None:

@@ -7,6 +7,7 @@ from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.mistakes import Mistake
 from offline.samplers.grid import check_grid
 from offline.samplers.settings import (
+    SETTINGS,
     AnnealingSettings,
     RandomSettings,
     SamplerError,
@@ -19,28 +20,30 @@ _ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func":
 
 
 def check_sampler(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace, budgeted: bool
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
 ) -> Iterable[Mistake]:
-    """Find mistakes in a sampler's settings.
+    """Find mistakes in a sampler's settings, where `space` is None without the parameters.
 
     Yields
     ------
     Mistake
         Its key begins below the settings.
     """
-    if name == "annealing":
+    if name not in SETTINGS:
+        yield from _check_optuna(name, settings, space)
+    elif space is None:
+        return
+    elif name == "annealing":
         for parameter, step in AnnealingSettings.model_validate(settings).steps.items():
             yield from _check_step(parameter, step, space)
     elif name in ("grid", "random"):
         axes = RandomSettings.model_validate(settings).grid
         if axes is not None:
             yield from check_grid(axes, space, bounded=budgeted or name == "random")
-    elif name != "sobol":
-        yield from _check_optuna(name, settings, space)
 
 
 def _check_optuna(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
 ) -> Iterable[Mistake]:
     if taken := next((key for key in _ELSEWHERE if key in settings), None):
         yield Mistake((taken,), f"is set by offline.{_ELSEWHERE[taken]}")
@@ -50,7 +53,8 @@ def _check_optuna(
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
         yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
-    if name == "cmaes" and all(isinstance(p, Categorical) for p in space.parameters.values()):
+    parameters = () if space is None else space.parameters.values()
+    if name == "cmaes" and parameters and all(isinstance(p, Categorical) for p in parameters):
         yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
 
 

@@ -7,10 +7,11 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from adaptune.errors import AdaptuneError
 from adaptune.space import Value, nearest
+from adaptune.strict import StrictModel
 
 OPTUNA = {
     "cmaes": "optuna.samplers:CmaEsSampler",
@@ -31,49 +32,45 @@ class SamplerError(AdaptuneError):
     """A sampler that cannot be used."""
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Step(_Settings):
+class Step(StrictModel):
     """How far a step of annealing moves a parameter.
 
     ``docs/reference-offline.md`` describes the settings and their defaults.
     """
 
-    mu: float | None = Field(None, allow_inf_nan=False)
-    sigma: float | None = Field(None, ge=0, allow_inf_nan=False)
-    delta_max: int | None = Field(None, ge=0)
+    mu: float | None = None
+    sigma: float | None = Field(None, ge=0)
+    delta_max: int | None = Field(None, ge=0, le=2**53)
     change: float | None = Field(None, ge=0, le=1)
 
 
-class AnnealingSettings(_Settings):
+class AnnealingSettings(StrictModel):
     """Settings of simulated annealing, with the names they have in RUSTLE.
 
     ``docs/reference-offline.md`` describes them.
     """
 
-    initial_temperature: float = Field(0.1, gt=0, allow_inf_nan=False)
+    initial_temperature: float = Field(0.1, gt=0)
     alpha: float = Field(0.9, gt=0, le=1)
-    energy_scale: float | None = Field(None, gt=0, allow_inf_nan=False)
-    reanneal_fixed: int | None = Field(None, ge=1)
-    reanneal_accepted: int | None = Field(None, ge=1)
-    reanneal_best: int | None = Field(None, ge=1)
-    stall_accepted: int | None = Field(None, ge=1)
-    stall_best: int | None = Field(None, ge=1)
-    chains: int = Field(2, ge=1)
-    steps: dict[str, Step] = {}
+    energy_scale: float | None = Field(None, gt=0)
+    reanneal_fixed: int | None = Field(None, ge=1, le=10**9)
+    reanneal_accepted: int | None = Field(None, ge=1, le=10**9)
+    reanneal_best: int | None = Field(None, ge=1, le=10**9)
+    stall_accepted: int | None = Field(None, ge=1, le=10**9)
+    stall_best: int | None = Field(None, ge=1, le=10**9)
+    chains: int = Field(2, ge=1, le=1000)
+    steps: dict[str, Step] = Field(default_factory=dict)
 
 
-class Span(_Settings):
+class Span(StrictModel):
     """`count` values from `low` to `high`, evenly in ratio where the parameter's scale is log."""
 
-    low: float = Field(allow_inf_nan=False)
-    high: float = Field(allow_inf_nan=False)
-    count: int = Field(ge=1)
+    low: float
+    high: float
+    count: int = Field(ge=1, le=10**6)
 
 
-class GridSettings(_Settings):
+class GridSettings(StrictModel):
     """Settings of `grid`."""
 
     # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
@@ -81,7 +78,7 @@ class GridSettings(_Settings):
     grid: dict[str, Span | tuple[Value, ...]]
 
 
-class RandomSettings(_Settings):
+class RandomSettings(StrictModel):
     """Settings of `random`: with a grid, it draws the grid's points without repetition."""
 
     grid: dict[str, Span | tuple[Value, ...]] | None = None
@@ -149,6 +146,6 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
     "random": RandomSettings,
-    "sobol": type("SobolSettings", (_Settings,), {"__doc__": "`sobol` has no settings."}),
+    "sobol": type("SobolSettings", (StrictModel,), {"__doc__": "`sobol` has no settings."}),
 }
 """Settings of adaptune's own samplers."""

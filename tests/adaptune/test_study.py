@@ -98,7 +98,7 @@ def test_reads_a_study(study_file, tmp_path):
             "odometry.parameters.keyframe_interval.low=0",
             ["keyframe_interval", "log scale needs low (0) above 0"],
         ),
-        ("sub_trajectory=none", ["sub_trajectory", '"none"']),
+        ("sub_trajectory=none", ["sub_trajectory: give a number, not 'none'"]),
         ("sub_trajectories=1", ["sub_trajectories: unknown key", "'sub_trajectory'"]),
         ("offline.sampler=tpee", ["offline.sampler", "'tpe'"]),
         ("offline.sampler=math:sin", ["offline.sampler", "not a class derived from optuna"]),
@@ -179,7 +179,11 @@ GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
     ("offline", "line", "words"),
     [
         (ANNEALING + "steps:\n  {keyframe: {mu: 1}}}}", 15, "did you mean 'keyframe_interval'?"),
-        (ANNEALING + "steps: {keyframe_interval:\n  {sigma: -1}}}}", 15, "sigma: Input should be"),
+        (
+            ANNEALING + "steps: {keyframe_interval:\n  {sigma: -1}}}}",
+            15,
+            "sigma: give a number of at least 0, not -1",
+        ),
         (
             ANNEALING + "steps: {\n keyframe_interval: {mu: 0, sigma: 0}}}}",
             15,
