@@ -115,7 +115,8 @@ def simulate(
     from adaptune.simulation.recording import record
 
     if not loaded.config.courses:
-        raise AdaptuneError(f"{study}: courses: there is none to simulate")
+        help_ = "add one, as in courses: {demo: {scenes: [cave]}}"
+        raise AdaptuneError(f"{study}: courses: there is none to simulate; {help_}")
     loaded.open()
     with progress() as show:
         for name, course in loaded.config.courses.items():

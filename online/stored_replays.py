@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
+from adaptune.plain_words import in_one_line
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from online.replay import Replay
 
@@ -207,5 +208,5 @@ def _numbers(values: Sequence[str]) -> list[Any]:
 
 
 def _damaged(path: Path, error: Exception) -> StoredReplayError:
-    what = " ".join(str(error).split())
-    return StoredReplayError(f"{path}: is damaged ({what}); run `adaptune online --again`")
+    what = f"is damaged ({in_one_line(error)})"
+    return StoredReplayError(f"{path}: {what}; run `adaptune online --again`")

@@ -23,6 +23,7 @@ from adaptune.model.model_file import (
 )
 from adaptune.model.paired import PairedSettings
 from adaptune.parameter_sets import ParameterSets
+from adaptune.plain_words import in_one_line
 from adaptune.sequence.names import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
@@ -304,9 +305,9 @@ class ErrorModel:
         except FileNotFoundError as error:
             raise ModelError(f"{path}: there is no such model; run `adaptune offline`") from error
         except (OSError, SpaceError, *DAMAGED) as error:
-            lines = " ".join(str(error).split())
+            what = in_one_line(error)
             raise ModelError(
-                f"{path}: is not an error model, or damaged ({lines}); run `adaptune offline` again"
+                f"{path}: is not an error model, or damaged ({what}); run `adaptune offline` again"
             ) from error
         return model
 

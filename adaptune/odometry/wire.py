@@ -45,6 +45,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.odometry import BaseSettings, Description, Odometry, OdometryError, Registration
 from adaptune.odometry.registry import odometry_class
+from adaptune.plain_words import in_one_line
 from adaptune.sequence.imu import Imu, ImuNoise
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
@@ -187,7 +188,8 @@ def announced(answer: Message) -> Description:
         space = ParameterSpace.load(header["space"])
         return Description(space, bool(header["live"]), bool(header.get("needs_imu")))
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
-        raise OdometryError(f"its answer to hello does not describe it: {error}") from error
+        what = in_one_line(error, header.get("space"))
+        raise OdometryError(f"its answer to hello does not describe it: {what}") from error
 
 
 def serve(
@@ -246,7 +248,7 @@ def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Serve
     try:
         settings = cls.settings_type.model_validate(hello["settings"])
     except ValidationError as error:
-        raise OdometryError(f"settings: {error}") from error
+        raise OdometryError(f"settings: {in_one_line(error, hello['settings'])}") from error
     about = {"live": cls.live, "needs_imu": cls.needs_imu, "space": cls.space.dump()}
     return make(name, hello["parameters"], settings), {"odometry": name, **about}
 

@@ -44,12 +44,18 @@ def expand(text: str) -> str:
 def resolve(path: str, info: ValidationInfo) -> str:
     """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
     folder = (info.context or {}).get("folder", Path())
+    if not path.strip():
+        raise ValueError("give a path, not an empty text")
     try:
-        return str((Path(folder) / expand_user(expand(path))).resolve())
+        whole = (Path(folder) / expand_user(expand(path))).resolve()
+        whole.exists()
     except AdaptuneError as error:
         raise ValueError(str(error)) from error
     except RuntimeError as error:
         raise ValueError(f"{path}: links lead in a circle; remove them") from error
+    except OSError as error:
+        raise ValueError(f"cannot be reached ({error.strerror}); give another path") from error
+    return str(whole)
 
 
 def _resolve_bags(given: Any, info: ValidationInfo) -> Any:

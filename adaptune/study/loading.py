@@ -11,12 +11,16 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import Description, Odometry, OdometryError
 from adaptune.odometry.command import Command
 from adaptune.odometry.registry import odometry_class
+from adaptune.plain_words import Key
+from adaptune.sequence.cache import cap
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
-from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated, validated_rest
+from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
+
+_MOST_BYTES = 10**6
 
 C = TypeVar("C", bound=StudyConfig)
 
@@ -54,6 +58,7 @@ def read_study(
     ConfigurationError
         It lists all mistakes, each with its line, its key and what to do.
     """
+    cap()  # a wrong variable is no mistake of the study
     document = _read(path)
     data: Any = document.data
     overridden = [_override(data, text) for text in overrides]
@@ -67,6 +72,8 @@ def read_study(
 
 def _read(path: Path) -> yaml.Document:
     try:
+        if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
+            raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
         document = yaml.Document(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigurationError(f"{path}: there is no such file") from error
@@ -138,7 +145,7 @@ def _check(
             mistakes += _check_switching(config, described)
         space = tuned_space(config.odometry, described) if sound and described else None
         mistakes += config.mistakes(space)
-    sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
+    sequences, courses = data.get("sequences", {}), data.get("courses", {})
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
         return None, mistakes
     mistakes += [
@@ -220,7 +227,7 @@ def _check_parameters(
             mistakes.append(Mistake(key, f"{name} has no parameter {parameter!r}: {help_}"))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
-            if whole.get("type") not in _KINDS:
+            if str(whole.get("type")) not in _KINDS:
                 mistakes.append(Mistake(key, f"give its type, one of {', '.join(_KINDS)}"))
             else:
                 validated(_KINDS[whole["type"]], whole, key, mistakes)

@@ -1,7 +1,5 @@
 """Mistakes in a study's YAML, each with the path of its key."""
 
-import json
-import re
 import types
 import typing
 from collections.abc import Iterable, Sequence
@@ -10,16 +8,11 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from adaptune.errors import AdaptuneError
+from adaptune.plain_words import UNKNOWN, Key, plain_words
 from adaptune.space import nearest
-
-Key = tuple[str | int, ...]
-"""Keys and indices that lead to a value."""
 
 RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
 """Keys of earlier versions, and their present names."""
-
-_LONGEST = 60
-"""Characters of a value that a message quotes."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -50,18 +43,9 @@ def validated(
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
-        found: dict[Key, list[Any]] = {}
-        named = []
-        for detail in error.errors(include_url=False):
-            path = _path(data, detail)
-            found.setdefault(path, []).append(detail)
-            if detail["loc"][-1:] == ("[key]",):
-                named.append(path)
-        for path, details in found.items():
-            # Of several types that are allowed, the one that the value comes nearest to counts.
-            deeper = any(len(other) > len(path) and other[: len(path)] == path for other in found)
-            if path in named or not deeper:
-                mistakes.append(Mistake(key + path, _message(model, path, key, details)))
+        for path, message in plain_words(error, data).items():
+            said = _unknown(model, path, key) if message == UNKNOWN else message
+            mistakes.append(Mistake(key + path, said))
         return None
 
 
@@ -98,91 +82,10 @@ def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:
     return rest
 
 
-def _path(data: Any, detail: Any) -> Key:
-    """Keys that lead to a mistake; between them, pydantic names the types that are allowed."""
-    path: list[str | int] = []
-    for part in detail["loc"]:
-        indexed = isinstance(data, list | tuple) and isinstance(part, int) and part < len(data)
-        if indexed or (isinstance(data, dict) and part in data):
-            data = data[part]
-            path.append(part)
-    return (*path, detail["loc"][-1]) if detail["type"] == "missing" else tuple(path)
-
-
-_NUMBER, _WHOLE, _LIST, _MAPPING = "a number", "a whole number", "a list", "keys with values"
-_WANTED = {
-    **dict.fromkeys(("float_type", "float_parsing"), _NUMBER),
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), _WHOLE),
-    "finite_number": "a finite number",
-    "string_type": "text",
-    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
-    **dict.fromkeys(("tuple_type", "list_type", "set_type", "frozen_set_type"), _LIST),
-    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type", "mapping_type"), _MAPPING),
-    "none_required": "nothing",
-    "greater_than": "a number above {gt}",
-    "greater_than_equal": "a number of at least {ge}",
-    "less_than": "a number below {lt}",
-    "less_than_equal": "a number of at most {le}",
-    "too_short": "at least {min_length}",
-    "too_long": "at most {max_length}",
-    "string_too_short": "at least {min_length} characters",
-    "string_too_long": "at most {max_length} characters",
-    "literal_error": "{expected}",
-}
-"""What to give, by pydantic's type of a mistake."""
-
-
-def _message(model: type[BaseModel], path: Key, key: Key, details: Sequence[Any]) -> str:
-    """What is wrong with a value, by each of the types that are allowed for it."""
-    kinds = [detail["type"] for detail in details]
-    if "extra_forbidden" in kinds:
-        if new := RENAMED.get(".".join(map(str, key + path))):
-            return f"is now called {new}"
-        return f"unknown key; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
-    if "missing" in kinds:
-        return "this key is missing"
-    for detail in details:
-        if detail["type"] not in _WANTED:
-            return _plain(str(detail["msg"]))
-    wanted = [_wanted(detail) for detail in details]
-    if _NUMBER in wanted and _WHOLE in wanted:
-        wanted.remove(_WHOLE)
-    return f"give {' or '.join(dict.fromkeys(wanted))}, not {_given(details[0])}"
-
-
-def _wanted(detail: Any) -> str:
-    figures = {
-        name: f"{value:,}" if isinstance(value, int) else f"{value:g}"
-        for name, value in detail.get("ctx", {}).items()
-        if isinstance(value, int | float)
-    }
-    if detail["type"] == "literal_error":
-        return str(detail["ctx"]["expected"]).replace("True", "true").replace("False", "false")
-    if detail["type"] == "too_short" and figures["min_length"] == "1":
-        return "at least one"
-    return _WANTED[detail["type"]].format(**figures)
-
-
-def _given(detail: Any) -> str:
-    """A value in few words, as YAML has it."""
-    value = detail["input"]
-    if detail["type"] in ("too_short", "too_long"):
-        return f"{len(value):,}" if len(value) else "none"
-    if value is None:
-        return "nothing"
-    if isinstance(value, dict):
-        return _MAPPING
-    if isinstance(value, list | tuple):
-        return _LIST
-    text = repr(value) if isinstance(value, str) else json.dumps(value, default=str)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
-
-
-def _plain(message: str) -> str:
-    """What a class of the user, or a rule of ours, says of a value, without pydantic's words."""
-    message = re.sub(r"^(Value error|Assertion failed), ", "", message)
-    message = re.sub(r"\b[Ii]nput should be\b", "give", message)
-    return re.sub(r" (after|during) validation", "", message).replace("Input should", "it should")
+def _unknown(model: type[BaseModel], path: Key, key: Key) -> str:
+    if new := RENAMED.get(".".join(map(str, key + path))):
+        return f"is now called {new}"
+    return f"{UNKNOWN}; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
 
 
 def _keys(annotation: Any, path: Sequence[str | int]) -> list[str]:

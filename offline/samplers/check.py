@@ -17,6 +17,8 @@ from offline.samplers.settings import (
 
 _ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
+_MOST = 100_000
+"""Candidates, or members of a population: more of them take hours, or all memory."""
 
 
 def check_sampler(
@@ -48,6 +50,10 @@ def _check_optuna(
     if taken := next((key for key in _ELSEWHERE if key in settings), None):
         yield Mistake((taken,), f"is set by offline.{_ELSEWHERE[taken]}")
         return
+    for key, value in settings.items():
+        if isinstance(value, int) and abs(value) > _MOST:
+            yield Mistake((key,), f"give a number of at most {_MOST:,}, not {value}")
+            return
     try:
         optuna_sampler(name, settings, 0)
     except SamplerError as error:
