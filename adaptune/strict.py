@@ -28,6 +28,8 @@ def _number(kind: str, given: Any, check: Callable[[Any], Any]) -> Any:
     """Refuse what is no number, and what no unit makes sensible."""
     if isinstance(given, bool | str | bytes):
         raise PydanticKnownError("int_type" if kind == "int" else "float_type")
+    if kind == "int" and isinstance(given, float) and given.is_integer():
+        given = int(given)
     if isinstance(given, int):
         given = max(-_LARGEST, min(given, _LARGEST))
     value = check(given)
