@@ -10,7 +10,7 @@ import typer
 
 from adaptune import tools
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import Commands, console, errors, progress, say
+from adaptune.terminal import Commands, console, errors, progress, say, say_next
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
@@ -72,6 +72,15 @@ def _load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStud
     return load_study(path, overrides, folder)
 
 
+def _say_next(
+    why: str, command: str, study: Path, override: list[str], folder: Path | None, first: str = ""
+) -> None:
+    """Name the next command with the options of this one."""
+    of_folder = [] if folder is None else ["--folder", folder]
+    options = [word for text in override for word in ("-o", text)]
+    say_next(why, command, study, *of_folder, *options, first=first)
+
+
 def _version(show: bool) -> None:
     if show:
         import adaptune
@@ -87,13 +96,15 @@ def _main(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
+    from rich.highlighter import NullHighlighter
     from rich.logging import RichHandler
 
+    plain: Any = {"markup": False, "highlighter": NullHighlighter(), "keywords": []}
     logging.basicConfig(
         level=logging.DEBUG if verbose else logging.INFO,
         format="%(message)s",
         datefmt="[%X]",
-        handlers=[RichHandler(console=errors, show_path=False, show_level=False, markup=False)],
+        handlers=[RichHandler(console=errors, show_path=False, show_level=False, **plain)],
     )
     for chatty in ("matplotlib", "numba", "asyncio"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
@@ -118,16 +129,17 @@ def simulate(
         raise AdaptuneError(f"{study}: courses: there is none to simulate")
     loaded.open()
     with progress() as show:
-        for name, course in loaded.config.courses.items():
-            path = loaded.sequences.recording(name)
-            if path.exists() and not overwrite:
-                continue
+        courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
+        due = [n for n in courses if overwrite or not loaded.sequences.recording(n).exists()]
+        for name in due:
 
             def step(done: int, total: int, name: str = name) -> None:
                 show(name, done, total)
 
-            record(course, path, overwrite=overwrite, progress=step)
-    say(f"Recordings are in {loaded.sequences.recording('*').parent}/")
+            path = loaded.sequences.recording(name)
+            record(courses[name], path, overwrite=overwrite, progress=step)
+    say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
+    _say_next("run trials, fit the error model", "offline", study, override, folder)
 
 
 @app.command()
@@ -154,7 +166,6 @@ def offline(
     from adaptune import report
     from offline.train import train
 
-    say(f"Seed {loaded.config.offline.seed}.")
     with progress() as show:
         training = train(loaded, show, cluster)
     model = training.model
@@ -167,8 +178,16 @@ def offline(
             "does not restart.",
         )
     )
-    say(f"Baseline: {_short(loaded.odometry.space.baseline)}")
-    say(f"Fixed: {_short(model.sets[model.fixed])}")
+    own, fixed = (
+        sum(row[f"{mode}, whole run"] for row in training.rows) / len(training.rows)
+        for mode in ("baseline", "fixed")
+    )
+    say(
+        f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % in whole runs in training "
+        f"({_sequences(len(training.rows))})."
+    )
+    say(f"Parameters of the fixed set: {_short(model.sets[model.fixed])}")
+    say(f"Parameters of the baseline: {_short(loaded.odometry.space.baseline)}")
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
@@ -180,6 +199,10 @@ def offline(
             "(this needs six sequences or more): `paired` will always take the fixed set."
         )
     say(f"Error model: {loaded.model_path}")
+    if len(loaded.training) > 1:
+        _say_next("would adapting pay elsewhere?", "validate", study, override, folder)
+    else:
+        _say_next_online(loaded, study, override, folder)
 
 
 @app.command()
@@ -224,9 +247,13 @@ def trials(
     else:
         title = f"{len(chosen)} of {len(finished)} trials, RTE [%]"
         console.print(report.table(title, chosen))
+        if judged := [row for row in finished if row["mean"] is not None]:
+            best = min(judged, key=lambda row: row["mean"])
+            say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
+        _say_next("run the trials that are left, fit", "offline", study, override, folder)
     if export is not None:
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
-        errors.print(f"{n} trajectories: {export}/", highlight=False)
+        errors.print(f"{n} trajectories: {export}/")
 
 
 @app.command()
@@ -275,6 +302,7 @@ def validate(
     for mode in validation.modes:
         say(validation.verdict(mode))
     say(f"Tables and picture: {loaded.folder / 'validation'}.*")
+    _say_next_online(loaded, study, override, folder)
 
 
 @app.command()
@@ -306,7 +334,9 @@ def online(
             made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
-    say(f"{made} replays made; all replays are in {loaded.folder / 'replays'}/")
+    test = _sequences(len(loaded.config.test))
+    say(f"{made} replays made, of {test} in every mode: {loaded.folder / 'replays'}/")
+    _say_next("table and pictures of the modes", "compare", study, override, folder)
 
 
 @app.command()
@@ -334,10 +364,13 @@ def switching(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
             rows,
-            f"This study uses {loaded.mechanism}, with a switch cost of "
-            f"{loaded.switch_cost():.1%}; kept in {loaded.folder / 'switching.json'}.",
         )
     )
+    say(
+        f"This study uses {loaded.mechanism}, with a switch cost of {loaded.switch_cost():.1%}; "
+        f"kept in {loaded.folder / 'switching.json'}."
+    )
+    _say_next_online(loaded, study, override, folder)
 
 
 @app.command()
@@ -354,6 +387,7 @@ def compare(
     """
     loaded = _load(study, override, folder)
     from adaptune import report
+    from offline.tuning import MIN_SEQUENCES
     from online.comparison import compare as compare_replays
 
     loaded.check()
@@ -367,6 +401,27 @@ def compare(
         )
     )
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    last = {row.mode: row.rte for row in rows if row.sequence == rows[-1].sequence}
+    if None not in last.values():
+        found = ", ".join(f"{mode} {rte:.3f} %" for mode, rte in last.items())
+        say(f"Mean RTE of {rows[-1].sequence}: {found}.")
+    if (n := len(loaded.config.training)) < MIN_SEQUENCES:
+        first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
+        _say_next("find out whether to adapt", "offline", study, override, folder, first)
+    else:
+        why = "what it has learned; docs/adapting-live.md brings it to the robot"
+        say_next(why, "model", "show", loaded.model_path)
+
+
+def _sequences(n: int) -> str:
+    return f"{n} sequence{'' if n == 1 else 's'}"
+
+
+def _say_next_online(
+    loaded: "OfflineStudy", study: Path, override: list[str], folder: Path | None
+) -> None:
+    first = "" if loaded.config.test else f"name sequences for the `test` of {study}; then "
+    _say_next("replay the test sequences in every mode", "online", study, override, folder, first)
 
 
 def _short(parameters: dict[str, Any]) -> str:
