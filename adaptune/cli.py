@@ -10,7 +10,7 @@ import typer
 
 from adaptune import tools
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import Commands, console, errors, progress, say, say_next
+from adaptune.terminal import Commands, begin_work, console, errors, progress, say, say_next
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
@@ -48,6 +48,17 @@ models.command()(tools.show)
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study's YAML.", show_default=False)
 ]
+
+
+def _complete_override(incomplete: str) -> list[str]:
+    """Keys and values for `-o`, when the shell asks."""
+    from adaptune.study.keys import complete
+    from offline.config import OfflineStudyConfig
+    from offline.samplers.settings import NAMES
+
+    return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
+
+
 Override = Annotated[
     list[str],
     typer.Option(
@@ -56,6 +67,7 @@ Override = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the YAML, as in `-o offline.trials=128`. May be repeated.",
         show_default=False,
+        autocompletion=_complete_override,
     ),
 ]
 Folder = Annotated[
@@ -165,6 +177,7 @@ def offline(
     loaded = _load(study, override, folder)
     from adaptune import report
     from offline.train import train
+    from offline.tuning import MIN_SEQUENCES
 
     with progress() as show:
         training = train(loaded, show, cluster)
@@ -194,10 +207,9 @@ def offline(
     if loaded.mechanism == "bank" and model.bank_adapts:
         say(f"Bank: trials {', '.join(map(str, model.bank))}")
     elif not model.paired.adapt:
-        say(
-            "Leaving out one training sequence after the other did not show that adapting pays "
-            "(this needs six sequences or more): `paired` will always take the fixed set."
-        )
+        few = len(loaded.config.training) < MIN_SEQUENCES
+        why = f"Fewer than {MIN_SEQUENCES} training sequences do" if few else "Training did"
+        say(f"{why} not show that adapting pays: `paired` will always take the fixed set.")
     say(f"Error model: {loaded.model_path}")
     if len(loaded.training) > 1:
         _say_next("would adapting pay elsewhere?", "validate", study, override, folder)
@@ -252,6 +264,7 @@ def trials(
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
         _say_next("run the trials that are left, fit", "offline", study, override, folder)
     if export is not None:
+        begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
         errors.print(f"{n} trajectories: {export}/")
 
@@ -391,6 +404,7 @@ def compare(
     from online.comparison import compare as compare_replays
 
     loaded.check()
+    begin_work()
     rows = compare_replays(loaded)
     console.print(
         report.table(
@@ -433,7 +447,7 @@ def _short(parameters: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the command line."""
-    app()
+    app(prog_name="adaptune")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import logging
 import os
 import shlex
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -61,8 +62,17 @@ def _program() -> str:
     return str(called) if typed else "adaptune"
 
 
+def begin_work() -> None:
+    """From here on, let Ctrl-C raise an exception, so that what is begun is put in order."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 LOG_EVERY = 5.0
 """Seconds between two lines about progress in a log."""
+
+MOST_FINISHED = 8
+"""Bars that stay on the screen when they are full."""
 
 Show = Callable[..., None]
 """Called with what is done, how much of it is done, how much there is, and a remark.
@@ -74,6 +84,7 @@ How much is done may be a fraction: half a run, say.
 @contextmanager
 def progress() -> Iterator[Show]:
     """Show a bar for each thing that is done; without a terminal, write a line now and then."""
+    begin_work()
     if not errors.is_terminal:
         yield _logger()
         return
@@ -100,6 +111,9 @@ def progress() -> Iterator[Show]:
 
         def show(what: str, done: float, total: int, remark: str = "") -> None:
             if what not in tasks:
+                over = [task.id for task in bars.tasks if task.finished]
+                for finished in over[:-MOST_FINISHED]:
+                    bars.update(finished, visible=False)
                 tasks[what] = bars.add_task(what, total=total, completed=done, remark="")
             bars.update(tasks[what], completed=done, total=max(total, done), remark=remark)
 

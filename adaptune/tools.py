@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import console, say, say_next
+from adaptune.terminal import begin_work, console, say, say_next
 
 if TYPE_CHECKING:
     from adaptune.inspect import Inspection
@@ -27,6 +27,7 @@ def inspect(
     from adaptune.inspect import inspect as inspect_file
     from adaptune.rendering import render_inspection, write_inspection_png
 
+    begin_work()
     found = inspect_file(file)
     console.print(render_inspection(found))
     if png is not None:
@@ -100,6 +101,7 @@ def serve(
     """
     from adaptune.odometry import serving
 
+    begin_work()
     if listen is not None:
         if odometry is None:
             raise AdaptuneError("--listen serves one odometry: give its name")
