@@ -10,7 +10,7 @@ import typer
 
 from adaptune import tools
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import Commands, console, errors, progress, say
+from adaptune.terminal import Commands, begin_work, console, errors, progress, say, say_next
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
@@ -48,6 +48,17 @@ models.command()(tools.show)
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study's YAML.", show_default=False)
 ]
+
+
+def _complete_override(incomplete: str) -> list[str]:
+    """Keys and values for `-o`, when the shell asks."""
+    from adaptune.study.keys import complete
+    from offline.config import OfflineStudyConfig
+    from offline.samplers.settings import NAMES
+
+    return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
+
+
 Override = Annotated[
     list[str],
     typer.Option(
@@ -56,6 +67,7 @@ Override = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the YAML, as in `-o offline.trials=128`. May be repeated.",
         show_default=False,
+        autocompletion=_complete_override,
     ),
 ]
 Folder = Annotated[
@@ -70,6 +82,15 @@ def _load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStud
     from offline.offline_study import load_study
 
     return load_study(path, overrides, folder)
+
+
+def _say_next(
+    why: str, command: str, study: Path, override: list[str], folder: Path | None, first: str = ""
+) -> None:
+    """Name the next command with the options of this one."""
+    of_folder = [] if folder is None else ["--folder", folder]
+    options = [word for text in override for word in ("-o", text)]
+    say_next(why, command, study, *of_folder, *options, first=first)
 
 
 def _version(show: bool) -> None:
@@ -87,13 +108,15 @@ def _main(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
+    from rich.highlighter import NullHighlighter
     from rich.logging import RichHandler
 
+    plain: Any = {"markup": False, "highlighter": NullHighlighter(), "keywords": []}
     logging.basicConfig(
         level=logging.DEBUG if verbose else logging.INFO,
         format="%(message)s",
         datefmt="[%X]",
-        handlers=[RichHandler(console=errors, show_path=False, show_level=False, markup=False)],
+        handlers=[RichHandler(console=errors, show_path=False, show_level=False, **plain)],
     )
     for chatty in ("matplotlib", "numba", "asyncio"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
@@ -119,16 +142,17 @@ def simulate(
         raise AdaptuneError(f"{study}: courses: there is none to simulate; {help_}")
     loaded.open()
     with progress() as show:
-        for name, course in loaded.config.courses.items():
-            path = loaded.sequences.recording(name)
-            if path.exists() and not overwrite:
-                continue
+        courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
+        due = [n for n in courses if overwrite or not loaded.sequences.recording(n).exists()]
+        for name in due:
 
             def step(done: int, total: int, name: str = name) -> None:
                 show(name, done, total)
 
-            record(course, path, overwrite=overwrite, progress=step)
-    say(f"Recordings are in {loaded.sequences.recording('*').parent}/")
+            path = loaded.sequences.recording(name)
+            record(courses[name], path, overwrite=overwrite, progress=step)
+    say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
+    _say_next("run trials, fit the error model", "offline", study, override, folder)
 
 
 @app.command()
@@ -154,8 +178,8 @@ def offline(
     loaded = _load(study, override, folder)
     from adaptune import report
     from offline.train import train
+    from offline.tuning import MIN_SEQUENCES
 
-    say(f"Seed {loaded.config.offline.seed}.")
     with progress() as show:
         training = train(loaded, show, cluster)
     model = training.model
@@ -168,19 +192,30 @@ def offline(
             "does not restart.",
         )
     )
-    say(f"Baseline: {_short(loaded.odometry.space.baseline)}")
-    say(f"Fixed: {_short(model.sets[model.fixed])}")
+    own, fixed = (
+        sum(row[f"{mode}, whole run"] for row in training.rows) / len(training.rows)
+        for mode in ("baseline", "fixed")
+    )
+    say(
+        f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % in whole runs in training "
+        f"({_sequences(len(training.rows))})."
+    )
+    say(f"Parameters of the fixed set: {_short(model.sets[model.fixed])}")
+    say(f"Parameters of the baseline: {_short(loaded.odometry.space.baseline)}")
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
     if loaded.mechanism == "bank" and model.bank_adapts:
         say(f"Bank: trials {', '.join(map(str, model.bank))}")
     elif not model.paired.adapt:
-        say(
-            "Leaving out one training sequence after the other did not show that adapting pays "
-            "(this needs six sequences or more): `paired` will always take the fixed set."
-        )
+        few = len(loaded.config.training) < MIN_SEQUENCES
+        why = f"Fewer than {MIN_SEQUENCES} training sequences do" if few else "Training did"
+        say(f"{why} not show that adapting pays: `paired` will always take the fixed set.")
     say(f"Error model: {loaded.model_path}")
+    if len(loaded.training) > 1:
+        _say_next("would adapting pay elsewhere?", "validate", study, override, folder)
+    else:
+        _say_next_online(loaded, study, override, folder)
 
 
 @app.command()
@@ -225,9 +260,14 @@ def trials(
     else:
         title = f"{len(chosen)} of {len(finished)} trials, RTE [%]"
         console.print(report.table(title, chosen))
+        if judged := [row for row in finished if row["mean"] is not None]:
+            best = min(judged, key=lambda row: row["mean"])
+            say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
+        _say_next("run the trials that are left, fit", "offline", study, override, folder)
     if export is not None:
+        begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
-        errors.print(f"{n} trajectories: {export}/", highlight=False)
+        errors.print(f"{n} trajectories: {export}/")
 
 
 @app.command()
@@ -276,6 +316,7 @@ def validate(
     for mode in validation.modes:
         say(validation.verdict(mode))
     say(f"Tables and picture: {loaded.folder / 'validation'}.*")
+    _say_next_online(loaded, study, override, folder)
 
 
 @app.command()
@@ -307,7 +348,9 @@ def online(
             made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
-    say(f"{made} replays made; all replays are in {loaded.folder / 'replays'}/")
+    test = _sequences(len(loaded.config.test))
+    say(f"{made} replays made, of {test} in every mode: {loaded.folder / 'replays'}/")
+    _say_next("table and pictures of the modes", "compare", study, override, folder)
 
 
 @app.command()
@@ -335,10 +378,13 @@ def switching(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
             rows,
-            f"This study uses {loaded.mechanism}, with a switch cost of "
-            f"{loaded.switch_cost():.1%}; kept in {loaded.folder / 'switching.json'}.",
         )
     )
+    say(
+        f"This study uses {loaded.mechanism}, with a switch cost of {loaded.switch_cost():.1%}; "
+        f"kept in {loaded.folder / 'switching.json'}."
+    )
+    _say_next_online(loaded, study, override, folder)
 
 
 @app.command()
@@ -355,9 +401,11 @@ def compare(
     """
     loaded = _load(study, override, folder)
     from adaptune import report
+    from offline.tuning import MIN_SEQUENCES
     from online.comparison import compare as compare_replays
 
     loaded.check()
+    begin_work()
     rows = compare_replays(loaded)
     console.print(
         report.table(
@@ -368,6 +416,27 @@ def compare(
         )
     )
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    last = {row.mode: row.rte for row in rows if row.sequence == rows[-1].sequence}
+    if None not in last.values():
+        found = ", ".join(f"{mode} {rte:.3f} %" for mode, rte in last.items())
+        say(f"Mean RTE of {rows[-1].sequence}: {found}.")
+    if (n := len(loaded.config.training)) < MIN_SEQUENCES:
+        first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
+        _say_next("find out whether to adapt", "offline", study, override, folder, first)
+    else:
+        why = "what it has learned; docs/adapting-live.md brings it to the robot"
+        say_next(why, "model", "show", loaded.model_path)
+
+
+def _sequences(n: int) -> str:
+    return f"{n} sequence{'' if n == 1 else 's'}"
+
+
+def _say_next_online(
+    loaded: "OfflineStudy", study: Path, override: list[str], folder: Path | None
+) -> None:
+    first = "" if loaded.config.test else f"name sequences for the `test` of {study}; then "
+    _say_next("replay the test sequences in every mode", "online", study, override, folder, first)
 
 
 def _short(parameters: dict[str, Any]) -> str:
@@ -379,7 +448,7 @@ def _short(parameters: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the command line."""
-    app()
+    app(prog_name="adaptune")
 
 
 if __name__ == "__main__":

@@ -2,10 +2,14 @@
 
 import logging
 import os
+import shlex
+import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -17,9 +21,11 @@ from adaptune.errors import AdaptuneError
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+# Text of files is printed as it is: no markup, no emoji.
+_literal: Any = {"markup": False, "emoji": False, "highlight": False}
 # A table in a pipe is not wrapped, unless COLUMNS gives a width.
-console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200)
-errors = Console(stderr=True)
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200, **_literal)
+errors = Console(stderr=True, **_literal)
 
 
 class Commands(TyperGroup):
@@ -32,7 +38,7 @@ class Commands(TyperGroup):
         except (AdaptuneError, OSError) as error:
             if isinstance(error, BrokenPipeError):
                 raise  # nobody reads the output any more
-            errors.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+            errors.print(f"error: {error}", style="red", soft_wrap=True)
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             errors.print("interrupted; run the same command again to resume", style="yellow")
@@ -40,20 +46,45 @@ class Commands(TyperGroup):
 
 
 def say(text: str) -> None:
-    """Print plain text."""
-    console.print(text, highlight=False)
+    """Print plain text, on one line however narrow the terminal is."""
+    console.print(text, soft_wrap=True)
+
+
+def say_next(why: str, *words: object, first: str = "") -> None:
+    """Print the command to run next, ready to copy, what it is for, and what to do first."""
+    say(f"Next: {first}{shlex.join([_program(), *map(str, words)])}    # {why}")
+
+
+def _program() -> str:
+    """The command line as the user can call it."""
+    called = Path(sys.argv[0])
+    typed = called.name == "adaptune" and shutil.which("adaptune") is None
+    return str(called) if typed else "adaptune"
+
+
+def begin_work() -> None:
+    """From here on, let Ctrl-C raise an exception, so that what is begun is put in order."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 LOG_EVERY = 5.0
-"""Seconds between two lines of the log."""
+"""Seconds between two lines about progress in a log."""
+
+MOST_FINISHED = 8
+"""Bars that stay on the screen when they are full."""
 
 Show = Callable[..., None]
-"""Called with what is done, how much of it is done, how much there is, and a remark."""
+"""Called with what is done, how much of it is done, how much there is, and a remark.
+
+How much is done may be a fraction: half a run, say.
+"""
 
 
 @contextmanager
 def progress() -> Iterator[Show]:
     """Show a bar for each thing that is done; without a terminal, write a line now and then."""
+    begin_work()
     if not errors.is_terminal:
         yield _logger()
         return
@@ -67,21 +98,24 @@ def progress() -> Iterator[Show]:
     )
 
     bars = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[remark]}"),
+        TextColumn("{task.fields[remark]}", markup=False),
         console=errors,
     )
     tasks: dict[str, TaskID] = {}
     with bars:
 
-        def show(what: str, done: int, total: int, remark: str = "") -> None:
+        def show(what: str, done: float, total: int, remark: str = "") -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total, remark="")
-            bars.update(tasks[what], completed=done, total=total, remark=remark)
+                over = [task.id for task in bars.tasks if task.finished]
+                for finished in over[:-MOST_FINISHED]:
+                    bars.update(finished, visible=False)
+                tasks[what] = bars.add_task(what, total=total, completed=done, remark="")
+            bars.update(tasks[what], completed=done, total=max(total, done), remark=remark)
 
         yield show
 
@@ -89,11 +123,16 @@ def progress() -> Iterator[Show]:
 def _logger() -> Show:
     log = logging.getLogger("adaptune")
     last = time.monotonic()
+    begun: dict[str, tuple[float, float]] = {}
 
-    def show(what: str, done: int, total: int, remark: str = "") -> None:
+    def show(what: str, done: float, total: int, remark: str = "") -> None:
         nonlocal last
-        if done >= total or time.monotonic() - last > LOG_EVERY:
-            last = time.monotonic()
-            log.info("%s: %d of %d%s", what, done, total, remark and f", {remark}")
+        now = time.monotonic()
+        start, before = begun.setdefault(what, (now, done))
+        if now - last > LOG_EVERY:
+            last = now
+            left = (now - start) * (total - done) / (done - before) if total > done > before else 0
+            words = [f"{what}: {int(done)} of {total}", left and f"about {left:.0f} s left", remark]
+            log.info("%s", ", ".join(word for word in words if word))
 
     return show

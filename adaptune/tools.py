@@ -4,12 +4,15 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import console, say
+from adaptune.terminal import begin_work, console, say, say_next
+
+if TYPE_CHECKING:
+    from adaptune.inspect import Inspection
 
 
 def inspect(
@@ -24,11 +27,36 @@ def inspect(
     from adaptune.inspect import inspect as inspect_file
     from adaptune.rendering import render_inspection, write_inspection_png
 
+    begin_work()
     found = inspect_file(file)
     console.print(render_inspection(found))
     if png is not None:
         write_inspection_png(found, png)
         say(f"First scan: {png}")
+    _begin_study(found)
+
+
+LENGTHS = (25.0, 10.0, 5.0, 2.0, 1.0)
+"""Metres of a sub-trajectory: the first of which a path holds ten."""
+
+
+def _begin_study(found: "Inspection") -> None:
+    """Print the rest of a study of this recording alone, and the command that begins it."""
+    from adaptune import yaml
+    from adaptune.metrics import travelled
+
+    named = (yaml.Document(found.entry).data or {}).get("sequences")
+    if found.reference is None or found.missing.get("offline") or not named:
+        return
+    path = travelled(found.reference.T_world_sensor)[-1]
+    length = next((length for length in LENGTHS if length <= path / 10.0), LENGTHS[-1])
+    (name,) = named
+    say(
+        f"training: [{name}: 0-60%]\ntest: [{name}: 60-100%]\nsub_trajectory: {length}\n"
+        "odometry: {name: gicp}    # or another one, see docs/your-odometry.md\n"
+    )
+    first = f"put the lines from `sequences:` on in {name}.yaml; then "
+    say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
 
 
 class CacheAction(StrEnum):
@@ -50,9 +78,10 @@ def cache(
     from adaptune.sequence.cache import clear_cache
 
     if action is CacheAction.CLEAR:
-        say(f"Freed {clear_cache() / 1e9:.2f} GB.")
+        say(f"Freed {clear_cache() / 1e9:.2f} GB. Bags are decoded again when they are read.")
     else:
         console.print(render_cache())
+        say_next("free all of it", "cache", "clear")
 
 
 def serve(
@@ -72,6 +101,7 @@ def serve(
     """
     from adaptune.odometry import serving
 
+    begin_work()
     if listen is not None:
         if odometry is None:
             raise AdaptuneError("--listen serves one odometry: give its name")
@@ -90,4 +120,5 @@ def show(
     from adaptune.model import ErrorModel
     from adaptune.model.show import render
 
-    console.print(render(ErrorModel.load(file), file), highlight=False)
+    console.print(render(ErrorModel.load(file), file))
+    say_next("replay the test sequences of STUDY with it", "online", "STUDY", "--model", file)

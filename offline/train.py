@@ -15,7 +15,7 @@ from adaptune.model import ErrorModel
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import ParameterSet
 from offline.budget import BUDGETS
-from offline.campaign import Progress, run_batches, run_tasks
+from offline.campaign import Progress, run_batches, watch_tasks
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
 from offline.fit import fit, tuned
@@ -208,8 +208,7 @@ def _run_whole(
         for n, parameters in sets.items()
         if not archive.trial_path(name, n, whole=True).exists()
     ]
-    for done, _ in enumerate(run_tasks(archive, workers, tasks), start=1):
-        progress("whole runs", done, len(tasks), "")
+    watch_tasks(archive, workers, tasks, "whole runs", progress)
     return {
         name: {n: float(np.nanmean(archive.read(name, n, whole=True).errors)) for n in sets}
         for name in names

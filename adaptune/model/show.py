@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.markup import escape
 
 from adaptune import report
 from adaptune.metrics import cap
@@ -38,11 +37,11 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         *_pairs("Settings", model.odometry.get("settings", {})),
     ]
     return Group(
-        escape("\n".join(lines)),
+        "\n".join(lines),
         report.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         report.table("Parameters", _parameters(model)),
         report.table(f"The best sets of {n_sets}", _sets(model), "Mean error over all sequences."),
-        escape("\n".join(_bank(model) + _pairs("From", model.provenance) + _validation(model))),
+        "\n".join(_bank(model) + _pairs("From", model.provenance) + _validation(model)),
     )
 
 
@@ -120,5 +119,4 @@ def _sets(model: ErrorModel) -> list[dict[str, Any]]:
 
 
 def _short(value: Value) -> str:
-    # Brackets would be taken for markup.
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -20,6 +20,7 @@ from adaptune.files import expand_user
 from adaptune.geometry import Poses
 from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.imu import USUAL
+from adaptune.sequence.part import Part
 from adaptune.sequence.timing import Unit
 from adaptune.strict import StrictModel
 
@@ -218,6 +219,7 @@ class SequenceConfig(_Part):
     # Seconds a scan takes; used if neither points nor files have times.
     period: float = Field(0.1, gt=0, le=60)
     stride: int = Field(1, ge=1, le=10_000)  # use every stride-th scan
+    part: Part | None = None  # of the time from `start` to `stop`
     # Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them

@@ -90,8 +90,9 @@ class RecordedSequence:
 
     @property
     def n_messages(self) -> int:
-        """Scans in the recording, over the stride."""
-        return -(-self.source.n_messages // self.section.stride)
+        """About how many scans of the recording it uses."""
+        begin, end = self.source.span() or (0, 0)
+        return self.section.count(self.source.n_messages, (end - begin) * 1e-9)
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans one after the other.

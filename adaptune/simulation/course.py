@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from adaptune.errors import AdaptuneError
+from adaptune.sequence.part import Part
 from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import SENSORS
@@ -58,6 +59,9 @@ class Course(StrictModel):
     weather: Annotated[str, _known("weather", WEATHERS)] = "clear"
     # Whether a recording's headers mark the start or the end of each scan.
     stamp: Literal["start", "end"] = "start"
+    # The course whose recording it is a part of; a study's `training` and `test` name such parts.
+    of: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] | None = None
+    part: Part | None = None
 
     @model_validator(mode="after")
     def _rate_follows_motion(self) -> Self:

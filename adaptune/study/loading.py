@@ -1,6 +1,6 @@
 """Reading a study: its YAML, the overrides, and all mistakes with their lines."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +18,7 @@ from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
+from adaptune.study.roles import settle_roles
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 
 _MOST_BYTES = 10**6
@@ -93,7 +94,9 @@ def _override(data: dict[str, Any], text: str) -> Key:
         raise ConfigurationError(f"-o {text}: give a key and a value, as in -o offline.trials=32")
     *parents, last = path = tuple(dotted.split("."))
     for part in parents:
-        data = data.setdefault(part, {})
+        if data.get(part) is None:
+            data[part] = {}
+        data = data[part]
         if not isinstance(data, dict):
             raise ConfigurationError(f"-o {text}: {part} has no keys below it")
     try:
@@ -129,6 +132,8 @@ def _check(
     mistakes: list[Mistake] = []
     if isinstance(odometry := data.get("odometry"), dict):
         _check_odometry(odometry, mistakes, folder)
+    origins, in_roles = settle_roles(data)
+    mistakes += in_roles
     context = {"folder": folder}
     config = validated(config_type, data, (), mistakes, context)
     sound = all(mistake.key[:1] != ("odometry",) for mistake in mistakes)
@@ -154,10 +159,17 @@ def _check(
         if name in courses
     ]
     for name, entry in sequences.items():
-        mistakes += _check_recording(name, entry, folder)
-    for role in ("training", "test"):
-        mistakes += _check_role(role, data, {*sequences, *courses})
-    return config, mistakes
+        if name not in origins:
+            mistakes += _check_recording(name, entry, folder)
+    return config, [_at_origin(mistake, origins) for mistake in mistakes]
+
+
+def _at_origin(mistake: Mistake, origins: Mapping[str, str]) -> Mistake:
+    """The mistake of a part of a sequence as that of the sequence."""
+    kind, *names = mistake.key or ("",)
+    if kind in ("sequences", "courses") and names and names[0] in origins:
+        return mistake._replace(key=(kind, origins[str(names[0])], *names[1:]))
+    return mistake
 
 
 def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
@@ -168,22 +180,6 @@ def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
             check_sequence(config)
         except AdaptuneError as error:
             yield Mistake(("sequences", name), str(error))
-
-
-def _check_role(role: str, data: Mapping[str, Any], known: Collection[Any]) -> Iterable[Mistake]:
-    names, training = data.get(role), data.get("training")
-    if not isinstance(names, list):
-        return
-    for i, name in enumerate(names):
-        if not isinstance(name, str):
-            continue  # the models find it
-        if name not in known:
-            message = f"there is no sequence {name!r}: {nearest(name, map(str, known))}"
-            yield Mistake((role, i), message)
-        elif name in names[:i]:
-            yield Mistake((role, i), f"{name!r} is named twice")
-        elif role == "test" and isinstance(training, list) and name in training:
-            yield Mistake((role, i), f"{name!r} is a training sequence, and proves nothing here")
 
 
 def _check_odometry(data: dict[str, Any], mistakes: list[Mistake], folder: Path) -> None:

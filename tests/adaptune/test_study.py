@@ -320,3 +320,9 @@ def test_folder_goes_on_only_with_the_same_study(study_file, tmp_path):
         other.open()
     # A test sequence may change: only replays depend on it, and they know what they are made of.
     load_study(study_file, ["sequences.three.stop=3"], folder).open()
+
+
+def test_an_empty_section_can_be_overridden(study_file):
+    file = study_file.with_name("empty.yaml")
+    file.write_text(study_file.read_text() + "health:\n")
+    assert load_study(file, ["health.max_speed=7"]).config.health.max_speed == 7
