@@ -37,6 +37,10 @@ class HostError(AdaptuneError):
     """User code that cannot be imported, or that does not answer."""
 
 
+class RefusedError(HostError):
+    """What user code, or what runs it, refuses in words of its own."""
+
+
 def verdict(code: int) -> str:
     """How a process ended, by its exit code, or minus the signal's number."""
     if code >= 0:
@@ -173,6 +177,11 @@ def server(service: Service, name: str) -> Server:
         )
         there.close()
         wrong = _wait_for_import(process, here)
+        try:
+            wrong = _wait_for_import(process, here)
+        except RefusedError:
+            process.wait()
+            raise
         if wrong is not None:
             here.close()
             raise HostError(f"{name}: {quoting(wrong, output)}")
@@ -180,14 +189,15 @@ def server(service: Service, name: str) -> Server:
 
 
 def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -> str | None:
-    """Wait until a server has imported user code; what went wrong, if anything."""
+    """Wait until a server has imported user code; how it went wrong, if it did."""
     control.settimeout(IMPORT_SECONDS)
     what = f"it cannot be imported: that took longer than {IMPORT_SECONDS:g} s"
     with contextlib.suppress(TimeoutError):
         if answer := control.recv(1 << 16):
             control.settimeout(None)
-            refused = json.loads(answer)
-            return None if refused is None else str(refused)
+            if refused := json.loads(answer):
+                raise RefusedError(refused)
+            return None
         with contextlib.suppress(subprocess.TimeoutExpired):
             what = f"it cannot be imported: {verdict(process.wait(1.0))}"
     with contextlib.suppress(ProcessLookupError):
@@ -227,6 +237,8 @@ class Hosted:
         ------
         HostError
             It names the user code, and says why there is no answer.
+        RefusedError
+            What the other process refuses.
         """
         if self._stream is None:
             self._stream = connect(*self._to)
@@ -238,6 +250,8 @@ class Hosted:
             answer = receive(self._stream)
             if answer is not None and answer.header.get("type") == "done":
                 return answer
+            if answer is not None and answer.header.get("type") == "refused":
+                raise RefusedError(str(answer.header["message"]))
             what = what if answer is None else str(answer.header.get("message"))
         self.close()
         raise HostError(f"{self._to[1]}: {what}")

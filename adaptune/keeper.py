@@ -94,7 +94,9 @@ def _descendants(ancestor: int) -> list[int]:
     children: dict[int, list[int]] = {}
     with contextlib.suppress(OSError):
         for name in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208 (pathlib takes longer)
-            parent = int((_read(f"/proc/{name}/stat").rpartition(b")")[2].split() or [0, 0])[1])
+            parent = int(
+                (_read(f"/proc/{name}/stat").rpartition(b")")[2].split() or [b"0", b"0"])[1]
+            )
             children.setdefault(parent, []).append(int(name))
     found = list(children.get(ancestor, ()))
     for process in found:
@@ -104,7 +106,7 @@ def _descendants(ancestor: int) -> list[int]:
 
 def _resident(process: int) -> float:
     """Megabytes that a process holds now."""
-    pages = int((_read(f"/proc/{process}/statm").split() or [0, 0])[1])
+    pages = int((_read(f"/proc/{process}/statm").split() or [b"0", b"0"])[1])
     return 1e-6 * pages * resource.getpagesize()
 
 
@@ -137,7 +139,7 @@ def _become(memory: float, command: list[str]) -> NoReturn:
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # Python ignores it
         bound = int(memory * 1e9)
         resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
-        os.execvp(command[0], command)  # noqa: S606
+        os.execvp(command[0], command)
     except OSError as error:
         what = "not found" if isinstance(error, FileNotFoundError) else error.strerror
         os.write(2, f"{command[0]}: {what}\n".encode())

@@ -10,8 +10,8 @@ from adaptune.sequence.config import ViewConfig, expand
 from adaptune.space import ParameterSpace, nearest
 from adaptune.study.config import StudyConfig, StudySection
 from adaptune.study.mistakes import Mistake, validated
-from offline.samplers.check import check_sampler
-from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError, optuna_class
+from offline.samplers.check import check_class, check_sampler
+from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
@@ -121,7 +121,7 @@ class OfflineConfig(StudySection):
                 return
         else:
             try:
-                optuna_class(self.sampler)
+                check_class(self.sampler)
             except SamplerError as error:
                 yield Mistake(("sampler",), str(error))
                 return

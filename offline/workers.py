@@ -13,6 +13,7 @@ from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
+from adaptune.hosting import verdict
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
@@ -34,7 +35,8 @@ class Task(NamedTuple):
     frames: bool = False  # return the frames, which all trials on the sequence share, too
 
     def __str__(self) -> str:
-        return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"
+        trials = f"trials {', '.join(map(str, self.numbers))}" if self.numbers else "its scans"
+        return f"{self.sequence}, {trials}"
 
 
 class TaskResult(NamedTuple):
@@ -247,7 +249,7 @@ class Workers:
             except (EOFError, OSError):
                 connection.close()
                 process.join()
-                outcomes.append((w, Death(f"exit code {process.exitcode}")))
+                outcomes.append((w, Death(verdict(process.exitcode or 0))))
         return outcomes
 
     def _spawn(self, w: int) -> _Worker:

@@ -39,6 +39,7 @@ class ReplaySetup:
     warm_up: WarmUp
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     switch_cost: float  # what a switch must promise, as a share of the fixed set's error
+    descriptors: tuple[str, ...]  # those that the study names
 
     @classmethod
     def of(cls, study: Study) -> Self:
@@ -52,6 +53,7 @@ class ReplaySetup:
             study.warm_up,
             config.lost_track,
             study.switch_cost(),
+            config.descriptor.names,
         )
 
     @property
@@ -100,9 +102,9 @@ class ReplaySetup:
         if self.mechanism == "bank" and (mode != "paired" or model.bank_adapts):
             sets = self.members(model)
             bank = Bank(self.odometry, sets, self.warm_up, self.lost_track)
-            return Mode(bank, Selector(model, mode, list(sets)))
+            return Mode(bank, Selector(model, mode, list(sets), descriptors=self.descriptors))
         fixed = model.sets[model.fixed]
-        selector = Selector(model, mode, (), self.switch_cost)
+        selector = Selector(model, mode, (), self.switch_cost, self.descriptors)
         # A bank that was not shown to pay would only cost.
         if self.mechanism != "hand_over" and self.odometry.description.live:
             return Mode(self.odometry(fixed), selector)

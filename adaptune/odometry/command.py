@@ -169,6 +169,9 @@ class Command(OdometryInstance):
             "a program that runs whole recordings cannot change its parameters: give it one set"
         )
 
+    def close(self) -> None:
+        pass  # the program has ended
+
     def _own(self, stamp: NDArray[np.int64]) -> Poses:
         assert self._T_own_sensor is not None
         return self._T_own_sensor.get(int(stamp), np.full((4, 4), np.nan))

@@ -90,7 +90,8 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
 
 def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declaration:
     """Do `declare` in this process."""
-    cls, mistakes = odometry_class(name), list[Mistake]()
+    cls: Any = odometry_class(name)
+    mistakes: list[Mistake] = []
     context = None if folder is None else {"folder": folder}
     found: Any = validated(cls.settings_type, settings, (), mistakes, context)
     is_class = issubclass(cls, Odometry)

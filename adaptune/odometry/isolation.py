@@ -6,7 +6,6 @@ milliseconds, and global state of the odometry ends with its process.
 
 import contextlib
 import logging
-import os
 from collections.abc import Sequence
 from typing import Annotated, Any, BinaryIO
 

@@ -38,9 +38,7 @@ def serve(reader: wire.Readable, writer: BinaryIO, name: str | None = None) -> N
     wire.serve(reader, writer, name, _make)
 
 
-def _make(
-    name: str, parameters: ParameterSet, settings: Any
-) -> tuple[wire.Served, Description]:
+def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[wire.Served, Description]:
     declared = declare(wire.check_served(name), settings)
     if declared.clean and not is_user_class(name):
         return wire.make_here(name, parameters, settings)

@@ -13,8 +13,8 @@ from typing_extensions import TypeVar
 
 from adaptune.cores import available
 from adaptune.odometry.base import Description, WarmUp
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.declaration import declare
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.sequence.names import OF_VIEW
 from adaptune.space import ParameterSpace
 from adaptune.study.config import OdometryConfig, StudyConfig
