@@ -145,6 +145,9 @@ class Bounds(NamedTuple):
     full: str = "out of memory"
 
 
+UNBOUNDED = Bounds()
+
+
 class Server(NamedTuple):
     """A process that has imported user code, and the socket that asks it to fork."""
 
@@ -176,7 +179,6 @@ def server(service: Service, name: str) -> Server:
             start_new_session=True,
         )
         there.close()
-        wrong = _wait_for_import(process, here)
         try:
             wrong = _wait_for_import(process, here)
         except RefusedError:
@@ -226,7 +228,7 @@ class Hosted:
         See `connect`.
     """
 
-    def __init__(self, service: Service, name: str, do: str, bounds: Bounds = Bounds()):
+    def __init__(self, service: Service, name: str, do: str, bounds: Bounds = UNBOUNDED):
         self._to = service, name, do, bounds
         self._stream: BinaryIO | None = None
 

@@ -106,8 +106,8 @@ def _descendants(ancestor: int) -> list[int]:
 
 def _resident(process: int) -> float:
     """Megabytes that a process holds now."""
-    pages = int((_read(f"/proc/{process}/statm").split() or [b"0", b"0"])[1])
-    return 1e-6 * pages * resource.getpagesize()
+    fields = _read(f"/proc/{process}/statm").split()
+    return 1e-6 * int(fields[1]) * resource.getpagesize() if fields else 0.0
 
 
 def _read(path: str) -> bytes:

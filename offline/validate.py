@@ -99,8 +99,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 def _checked_model(study: OfflineStudy) -> ErrorModel:
     path = study.model_path
     model = ErrorModel.load(path)
-    names = study.config.descriptor.names
-    model.check_study(study.odometry.identity, study.odometry.space, names, path)
+    model.check_study(study.odometry.identity, study.odometry.space, path)
     if (study.training, study.window) != (model.sequences, model.window):
         raise ModelError(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "

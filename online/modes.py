@@ -1,6 +1,7 @@
 """The modes of a replay: baseline, fixed, and adaptive by each selection rule."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -60,6 +61,12 @@ class ReplaySetup:
     def modes(self) -> tuple[str, ...]:
         """What is compared: baseline, fixed, and each selection rule."""
         return ("baseline", "fixed", *self.rules)
+
+    def check(self, model: ErrorModel, path: Path) -> None:
+        """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
+        model.check_descriptors(self.descriptors, path)
+        if self.mechanism == "bank":
+            self.members(model)
 
     def identity(self, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:
         """What a mode depends on, as plain data; `digest` is the model's."""

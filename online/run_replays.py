@@ -61,11 +61,9 @@ def run_replays(
         If there is no test sequence, or the model is of another odometry or other parameters.
     """
     model = ErrorModel.load(model_path)
-    names = study.config.descriptor.names
-    model.check_study(study.odometry.identity, study.odometry.space, names, model_path)
+    model.check_study(study.odometry.identity, study.odometry.space, model_path)
     setup = ReplaySetup.of(study)
-    if setup.mechanism == "bank":
-        setup.members(model)  # refuses another bank before anything runs
+    setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     study.open()

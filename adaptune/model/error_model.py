@@ -210,14 +210,8 @@ class ErrorModel:
             return named if named in self.sets else None
         return self.sets.find(named)
 
-    def check_study(
-        self,
-        odometry: dict[str, Any],
-        space: ParameterSpace,
-        descriptors: Collection[str],
-        path: Path,
-    ) -> None:
-        """Refuse a model of another odometry, of other parameters, or with descriptors of others.
+    def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
+        """Refuse a model of another odometry or of other parameters.
 
         Parameters
         ----------
@@ -225,8 +219,6 @@ class ErrorModel:
             Its name and settings.
         space
             The parameters.
-        descriptors
-            See `check_descriptors`.
         path
             Where the model is from.
 
@@ -244,9 +236,10 @@ class ErrorModel:
                 f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
                 f"offline` for this study"
             )
-        self.check_descriptors(descriptors, str(path))
 
-    def check_descriptors(self, descriptors: Collection[str], where: str = "the model") -> None:
+    def check_descriptors(
+        self, descriptors: Collection[str], where: Path | str = "the model"
+    ) -> None:
         """Refuse a model that would run code which was not asked for.
 
         Parameters

@@ -98,7 +98,7 @@ def versions(name: str) -> dict[str, str]:
     else:
         names |= set(metadata.packages_distributions().get(top, ()))
     found = {}
-    for name in sorted(names):
+    for package in sorted(names):
         with suppress(metadata.PackageNotFoundError):  # written by the user, or built in
-            found[name] = metadata.version(name)
+            found[package] = metadata.version(package)
     return found
