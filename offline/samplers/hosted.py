@@ -6,7 +6,7 @@ from typing import Any, BinaryIO
 
 from adaptune import hosting
 from adaptune.odometry.wire import Message, Readable
-from adaptune.space import ParameterSet, ParameterSpace, SpaceError
+from adaptune.space import ParameterSet, ParameterSpace
 from offline.objective import SamplerResult
 from offline.samplers.base import Sampler
 from offline.samplers.settings import SERVICE, SamplerError, optuna_class, optuna_sampler
@@ -26,18 +26,12 @@ class HostedSampler(Sampler):
         }
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        name = self.config.sampler
         try:
             answer = self._process.ask(self._about | {"history": history})
         except hosting.HostError as error:
             trials = f"trials {numbers.start} to {numbers.stop - 1}"
             raise SamplerError(f"offline.sampler, at {trials}: {error}") from error
         sets: list[ParameterSet] = answer.header["sets"]
-        for parameters in sets:
-            try:
-                self.space.check(parameters)
-            except SpaceError as error:
-                raise SamplerError(f"{name}: proposed {parameters}: {error}") from error
         return sets
 
 

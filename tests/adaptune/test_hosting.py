@@ -142,7 +142,7 @@ def test_mistakes_in_the_settings_of_a_user_s_class(mine, study_file):
         ("odometry.parameters={scal: {low: 1}}", "no parameter 'scal': did you mean 'scale'"),
     ):
         with pytest.raises(ConfigurationError, match=words):
-            load_study(study_file, [*base, given] if "stepp" not in given else [*base, given])
+            load_study(study_file, [*base, given])
 
 
 def wait_until_gone(processes, seconds=10.0):

@@ -1,5 +1,7 @@
 """Modules of users that go wrong when they are imported, and what is said then."""
 
+from pathlib import Path
+
 IMPORTS = {
     "exit": ("import sys\nprint('no licence')\nsys.exit(0)", "ended with code 0: no licence"),
     "end": ("import os\nos._exit(3)", "ended with code 3"),
@@ -13,7 +15,7 @@ IMPORTS = {
 def gone(process):
     """Whether a process has ended, or waits for nothing but its parent's notice."""
     try:
-        with open(f"/proc/{process}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] == "Z"
+        stat = Path(f"/proc/{process}/stat").read_text()
+        return stat.rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True

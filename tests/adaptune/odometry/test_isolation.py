@@ -13,10 +13,10 @@ import turns
 from setups import setup_of
 
 from adaptune.archive import Archive
+from adaptune.hosting import server
 from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
-from adaptune.hosting import server
 from adaptune.odometry.isolation import SERVICE, Isolated, Limits
 from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.selection import Selection
