@@ -11,8 +11,8 @@ from adaptune.space import ParameterSpace, nearest
 from adaptune.strict import StrictModel
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import Mistake, validated
-from offline.samplers.check import check_sampler
-from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError, optuna_class
+from offline.samplers.check import check_class, check_sampler
+from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
@@ -126,7 +126,7 @@ class OfflineConfig(StrictModel):
                 return
         else:
             try:
-                optuna_class(self.sampler)
+                check_class(self.sampler)
             except SamplerError as error:
                 yield Mistake(("sampler",), str(error))
                 return

@@ -1,5 +1,6 @@
 """The offline stage: run the trials, choose the fixed set, fit the error model."""
 
+import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -102,7 +103,8 @@ def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    odometry = dataclasses.replace(study.odometry, user_code=True)
+    setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = config.memory * 1e9
     return Cluster(setup, study.training, memory, cluster) if cluster else Workers(setup, n, memory)
 

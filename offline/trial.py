@@ -322,7 +322,8 @@ def _trial(
             run.restarted[piece],
         )[: own.stop - own.start]
         restarted[own], registered[own] = run.restarted[own], run.registered[own]
-        seconds[own] = run.seconds[own]
+        apart = run.odometry.usage.seconds
+        seconds[own] = run.seconds[own] if apart is None else apart
         lost_steps |= run.lost_steps
         cpu += run.odometry.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
         if after is not None:

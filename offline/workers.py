@@ -15,6 +15,7 @@ from typing import Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
+from adaptune.hosting import verdict
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
@@ -38,7 +39,8 @@ class Task(NamedTuple):
     frames: bool = False  # return the frames, which all trials on the sequence share, too
 
     def __str__(self) -> str:
-        return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"
+        trials = f"trials {', '.join(map(str, self.numbers))}" if self.numbers else "its scans"
+        return f"{self.sequence}, {trials}"
 
 
 class TaskResult(NamedTuple):
@@ -279,7 +281,7 @@ class Workers:
             except (EOFError, OSError):
                 connection.close()
                 process.join()
-                outcomes.append((w, Death(f"exit code {process.exitcode}")))
+                outcomes.append((w, Death(verdict(process.exitcode or 0))))
             if not isinstance(outcomes[-1][1], TaskProgress):
                 self._busy.remove(w)
         return outcomes

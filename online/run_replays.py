@@ -63,8 +63,7 @@ def run_replays(
     model = ErrorModel.load(model_path)
     model.check_study(study.odometry.identity, study.odometry.space, model_path)
     setup = ReplaySetup.of(study)
-    if setup.mechanism == "bank":
-        setup.members(model)  # refuses another bank before anything runs
+    setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     study.open()

@@ -1,7 +1,7 @@
 """The error model: what passes from training to the robot."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from adaptune.archive import compact
+from adaptune.descriptor.base import DESCRIPTORS
 from adaptune.descriptor.pca import ScaledPCA
 from adaptune.model.bank_weights import BankSettings
 from adaptune.model.base import TrainingData
@@ -236,6 +237,30 @@ class ErrorModel:
                 f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
                 f"offline` for this study"
             )
+
+    def check_descriptors(
+        self, descriptors: Collection[str], where: Path | str = "the model"
+    ) -> None:
+        """Refuse a model that would run code which was not asked for.
+
+        Parameters
+        ----------
+        descriptors
+            The names of the descriptors that may be used besides adaptune's own.
+        where
+            Where the model is from.
+
+        Raises
+        ------
+        ModelError
+        """
+        for name in self.blocks:
+            if name not in DESCRIPTORS and name not in descriptors:
+                raise ModelError(
+                    f"{where}: uses the descriptor {name!r}, which is code of its author's; if you "
+                    f"trust it, name it in descriptor.names, too, or fit a model of your own "
+                    f"(`adaptune offline`)"
+                )
 
     def is_foreign(self, elevation: float) -> bool:
         """Whether scans whose lowest points lie there come from no sensor of the training's.

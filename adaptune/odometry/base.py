@@ -64,11 +64,12 @@ class Usage(NamedTuple):
 
     cpu: float  # seconds of CPU time
     memory: float | None  # peak megabytes of its own processes; None if it shares this process
+    seconds: float | None = None  # a scan, if it runs apart from its calls; None if within them
 
     @classmethod
     def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
         """CPU time of all together, and the sum or the maximum of their memory."""
-        cpu, peaks = zip(*usages, strict=True)
+        cpu, peaks, _ = zip(*usages, strict=True)
         known = [peak for peak in peaks if peak is not None]
         return cls(sum(cpu), memory(known) if known else None)
 

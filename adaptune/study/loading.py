@@ -4,13 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
-
 from adaptune import yaml
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Description, Odometry, OdometryError
+from adaptune.odometry.base import Description, OdometryError
 from adaptune.odometry.command import Command
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.declaration import declare
+from adaptune.odometry.registry import is_user_class, where
 from adaptune.plain_words import Key
 from adaptune.sequence.cache import cap
 from adaptune.sequence.config import SequenceConfig
@@ -143,7 +142,7 @@ def _check(
     if config is not None:
         try:
             described = describe_odometry(config.odometry) if sound else None
-        except (OdometryError, ValidationError):
+        except OdometryError:
             described = None
         if described is not None:
             mistakes += _check_imu(config, described)
@@ -187,27 +186,27 @@ def _check_odometry(data: dict[str, Any], mistakes: list[Mistake], folder: Path)
     name = data.get("name")
     if not isinstance(name, str):
         return
+    settings, key = data.get("settings") or {}, ("odometry", "settings")
+    if not isinstance(settings, dict):
+        return
     try:
-        odometry = odometry_class(name)
+        where(name)
     except OdometryError as error:
         mistakes.append(Mistake(("odometry", "name"), str(error)))
         return
-    key = ("odometry", "settings")
-    settings = data.get("settings") or {}
-    if not isinstance(settings, dict):
-        return
-    found: Any = validated(odometry.settings_type, settings, key, mistakes, {"folder": folder})
-    if found is not None:
-        data["settings"] = found.model_dump(mode="json", exclude_unset=True)
-    elif not issubclass(odometry, Odometry):
-        return
     try:
-        space = odometry.describe(found).space
-        _check_parameters(name, space, data.get("parameters"), mistakes)
-        if issubclass(odometry, Command) and isinstance(tuned := data.get("parameters"), dict):
-            odometry.check(found, dict.fromkeys(tuned, 0))
+        declared = declare(name, settings, folder)
+        mistakes += (mistake.below(key) for mistake in declared.mistakes)
+        if declared.settings is not None:
+            data["settings"] = declared.settings.model_dump(mode="json", exclude_unset=True)
+        if (described := declared.description) is None:
+            return
+        _check_parameters(name, described.space, data.get("parameters"), mistakes)
+        if name == "command" and isinstance(tuned := data.get("parameters"), dict):
+            Command.check(declared.settings, dict.fromkeys(tuned, 0))
     except OdometryError as error:
-        mistakes.append(Mistake(key, str(error)))
+        at = ("odometry", "name") if is_user_class(name) else key
+        mistakes.append(Mistake(at, str(error)))
 
 
 def _check_parameters(

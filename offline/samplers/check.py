@@ -3,15 +3,19 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from adaptune import hosting
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.mistakes import Mistake
 from offline.samplers.grid import check_grid
 from offline.samplers.settings import (
+    SERVICE,
     SETTINGS,
     AnnealingSettings,
     RandomSettings,
     SamplerError,
     Step,
+    is_user_sampler,
+    optuna_class,
     optuna_sampler,
 )
 
@@ -19,6 +23,22 @@ _ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func":
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
 _MOST = 100_000
 """Candidates, or members of a population: more of them take hours, or all memory."""
+
+
+def check_class(name: str) -> None:
+    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere.
+
+    Raises
+    ------
+    SamplerError
+    """
+    if not is_user_sampler(name):
+        optuna_class(name)
+        return
+    try:
+        hosting.server(SERVICE, name)
+    except hosting.HostError as error:
+        raise SamplerError(str(error)) from error
 
 
 def check_sampler(
@@ -55,7 +75,8 @@ def _check_optuna(
             yield Mistake((key,), f"give a number of at most {_MOST:,}, not {value}")
             return
     try:
-        optuna_sampler(name, settings, 0)
+        make = _make_elsewhere if is_user_sampler(name) else optuna_sampler
+        make(name, settings, 0)
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
         yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
@@ -88,3 +109,21 @@ def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
         return ("change",)
     linear = isinstance(parameter, Integer) and not parameter.log
     return ("delta_max",) if linear else ("mu", "sigma")
+
+
+def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
+    """Try whether a sampler of the user takes its settings.
+
+    Raises
+    ------
+    SamplerError
+    """
+    seconds = hosting.IMPORT_SECONDS
+    bounds = hosting.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
+    process = hosting.Hosted(SERVICE, name, "make", bounds)
+    try:
+        process.ask({"settings": dict(settings), "seed": seed})
+    except hosting.HostError as error:
+        raise SamplerError(str(error)) from error
+    finally:
+        process.close()

@@ -3,12 +3,12 @@
 import inspect
 import warnings
 from collections.abc import Mapping
-from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 from pydantic import BaseModel, Field
 
+from adaptune import hosting, plugins
 from adaptune.errors import AdaptuneError
 from adaptune.space import Value, nearest
 from adaptune.strict import StrictModel
@@ -26,6 +26,13 @@ SINGLE = ("annealing", "cmaes")
 """Samplers that minimise one objective only."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
+SERVICE = hosting.Service("offline.samplers.hosted")
+"""What a server does with a sampler of the user."""
+
+
+def is_user_sampler(name: str) -> bool:
+    """Whether a sampler is a class that is neither adaptune's nor Optuna's."""
+    return ":" in name and name.partition(":")[0].partition(".")[0] != "optuna"
 
 
 class SamplerError(AdaptuneError):
@@ -96,24 +103,18 @@ def optuna_class(name: str) -> type[Any]:
         raise SamplerError(
             f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
         )
-    path = OPTUNA.get(name, name)
-    if ":" not in path:
+    if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
             f"package.module:Class)"
         )
     from optuna.samplers import BaseSampler
 
-    module, _, attribute = path.partition(":")
     try:
-        found = getattr(import_module(module), attribute)
-    except (ImportError, ValueError) as error:
-        raise SamplerError(
-            f"{name}: cannot import {module} ({error}); install it, or name its folder in "
-            f"PYTHONPATH"
-        ) from error
-    except AttributeError as error:
-        raise SamplerError(f"{name}: {module} has no {attribute or 'class'}") from error
+        path = plugins.path_of(name, "sampler", OPTUNA, "", "Class")
+        found = plugins.load(name, path, "class")
+    except plugins.PluginError as error:
+        raise SamplerError(str(error)) from error
     if not (isinstance(found, type) and issubclass(found, BaseSampler)):
         raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
     return found

@@ -1,3 +1,4 @@
+import dataclasses
 import importlib.util
 import json
 import re
@@ -12,6 +13,7 @@ import yaml
 from needs import lacking
 from setups import setup_of
 
+from adaptune.errors import AdaptuneError
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
@@ -167,6 +169,27 @@ def test_a_program_that_stamps_the_end_of_a_scan(make):
     assert not trial.faults
     assert not trial.restarted.any()
     assert np.nanmax(trial.errors) < 5.0
+
+
+def test_what_it_takes_is_measured_and_can_be_limited(make):
+    kept = "{cpu: {max: 100000}, ms_per_scan: {max: 1000}}"
+    once = "offline.trials=1"
+    study = make("work", "offline.objective=[rte, memory]", f"offline.limits={kept}", once)
+    trial, _ = run(study)
+    # It computes for half a second in a child, beside a child of 200 MB, over 40 scans of 3.9 s.
+    assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0
+    assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
+    assert 200.0 <= trial.usage["memory"] < 1000.0
+    assert len(train(study).means) > 0
+    late = make("hang", "isolation.seconds=0.02")
+    trial, _ = run(late)
+    assert trial.faults
+    assert 1e3 * np.median(trial.seconds) >= 20.0
+    assert trial.usage["memory"] > 5.0
+    limited = make("work", "offline.limits={ms_per_scan: {max: 1}}", once)
+    limited = dataclasses.replace(limited, folder=limited.folder.with_name("limited"))
+    with pytest.raises(AdaptuneError, match="ms_per_scan"):
+        train(limited)
 
 
 def test_another_frame(make):
