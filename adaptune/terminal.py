@@ -114,7 +114,7 @@ def progress() -> Iterator[Show]:
                 over = [task.id for task in bars.tasks if task.finished]
                 for finished in over[:-MOST_FINISHED]:
                     bars.update(finished, visible=False)
-                tasks[what] = bars.add_task(what, total=total, completed=done, remark="")
+                tasks[what] = bars.add_task(what, total=total, remark="")
             bars.update(tasks[what], completed=done, total=max(total, done), remark=remark)
 
         yield show

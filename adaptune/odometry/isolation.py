@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, BinaryIO
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import AfterValidator, BaseModel, Field, ValidationInfo
 
 from adaptune import hosting
 from adaptune.geometry import Poses

@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from adaptune.plain_words import Key
 from adaptune.sequence.part import Fractions, part_name, read_part
 from adaptune.space import nearest
-from adaptune.study.mistakes import Key, Mistake
+from adaptune.study.mistakes import Mistake
 
 ROLES = ("training", "test")
 _WHOLE = (0.0, 1.0)
