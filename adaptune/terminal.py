@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 # Text of files is printed as it is: no markup, no emoji.
 _literal: Any = {"markup": False, "emoji": False, "highlight": False}
-# A table in a pipe is not wrapped, unless COLUMNS gives a width.
-console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200, **_literal)
-errors = Console(stderr=True, **_literal)
+# In a pipe, tables and logs are not wrapped, unless COLUMNS gives a width.
+_wide = None if "COLUMNS" in os.environ else 200
+console = Console(width=None if sys.stdout.isatty() else _wide, **_literal)
+errors = Console(stderr=True, width=None if sys.stderr.isatty() else _wide, **_literal)
 
 
 class Commands(TyperGroup):
@@ -114,7 +115,7 @@ def progress() -> Iterator[Show]:
                 over = [task.id for task in bars.tasks if task.finished]
                 for finished in over[:-MOST_FINISHED]:
                     bars.update(finished, visible=False)
-                tasks[what] = bars.add_task(what, total=total, completed=done, remark="")
+                tasks[what] = bars.add_task(what, total=total, completed=int(done), remark="")
             bars.update(tasks[what], completed=done, total=max(total, done), remark=remark)
 
         yield show
@@ -128,11 +129,21 @@ def _logger() -> Show:
     def show(what: str, done: float, total: int, remark: str = "") -> None:
         nonlocal last
         now = time.monotonic()
-        start, before = begun.setdefault(what, (now, done))
+        if done == begun.get(what, (now, done))[1]:
+            begun[what] = now, done
+        start, before = begun[what]
         if now - last > LOG_EVERY:
             last = now
-            left = (now - start) * (total - done) / (done - before) if total > done > before else 0
-            words = [f"{what}: {int(done)} of {total}", left and f"about {left:.0f} s left", remark]
+            rate = (done - before) / max(now - start, 1e-9)
+            left = _time_left((total - done) / rate) if rate and done < total else ""
+            words = (f"{what}: {int(done)} of {total}", left, remark)
             log.info("%s", ", ".join(word for word in words if word))
 
     return show
+
+
+def _time_left(seconds: float) -> str:
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds > 2.0 * length:
+            return f"about {seconds / length:.0f} {unit} left"
+    return f"about {seconds:.0f} s left"
