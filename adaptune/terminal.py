@@ -2,14 +2,11 @@
 
 import logging
 import os
-import shlex
-import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -49,18 +46,6 @@ class Commands(TyperGroup):
 def say(text: str) -> None:
     """Print plain text, on one line however narrow the terminal is."""
     console.print(text, soft_wrap=True)
-
-
-def say_next(why: str, *words: object, first: str = "") -> None:
-    """Print the command to run next, ready to copy, what it is for, and what to do first."""
-    say(f"Next: {first}{shlex.join([_program(), *map(str, words)])}    # {why}")
-
-
-def _program() -> str:
-    """The command line as the user can call it."""
-    called = Path(sys.argv[0])
-    typed = called.name == "adaptune" and shutil.which("adaptune") is None
-    return str(called) if typed else "adaptune"
 
 
 def begin_work() -> None:
