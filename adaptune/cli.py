@@ -10,7 +10,8 @@ import typer
 
 from adaptune import tools
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import Commands, begin_work, console, errors, progress, say, say_next
+from adaptune.next_command import say_next, say_next_of_study, say_next_online
+from adaptune.terminal import Commands, begin_work, console, errors, progress, say
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
@@ -84,15 +85,6 @@ def _load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStud
     return load_study(path, overrides, folder)
 
 
-def _say_next(
-    why: str, command: str, study: Path, override: list[str], folder: Path | None, first: str = ""
-) -> None:
-    """Name the next command with the options of this one."""
-    of_folder = [] if folder is None else ["--folder", folder]
-    options = [word for text in override for word in ("-o", text)]
-    say_next(why, command, study, *of_folder, *options, first=first)
-
-
 def _version(show: bool) -> None:
     if show:
         import adaptune
@@ -152,7 +144,7 @@ def simulate(
             path = loaded.sequences.recording(name)
             record(courses[name], path, overwrite=overwrite, progress=step)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
-    _say_next("run trials, fit the error model", "offline", study, override, folder)
+    say_next_of_study("run trials, fit the error model", "offline", study, override, folder)
 
 
 @app.command()
@@ -213,9 +205,9 @@ def offline(
         say(f"{why} not show that adapting pays: `paired` will always take the fixed set.")
     say(f"Error model: {loaded.model_path}")
     if len(loaded.training) > 1:
-        _say_next("would adapting pay elsewhere?", "validate", study, override, folder)
+        say_next_of_study("would adapting pay elsewhere?", "validate", study, override, folder)
     else:
-        _say_next_online(loaded, study, override, folder)
+        say_next_online(loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -263,7 +255,7 @@ def trials(
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
-        _say_next("run the trials that are left, fit", "offline", study, override, folder)
+        say_next_of_study("run the trials that are left, fit", "offline", study, override, folder)
     if export is not None:
         begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
@@ -316,7 +308,7 @@ def validate(
     for mode in validation.modes:
         say(validation.verdict(mode))
     say(f"Tables and picture: {loaded.folder / 'validation'}.*")
-    _say_next_online(loaded, study, override, folder)
+    say_next_online(loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -350,7 +342,7 @@ def online(
         unpin()
     test = _sequences(len(loaded.config.test))
     say(f"{made} replays made, of {test} in every mode: {loaded.folder / 'replays'}/")
-    _say_next("table and pictures of the modes", "compare", study, override, folder)
+    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
 
 
 @app.command()
@@ -384,7 +376,7 @@ def switching(
         f"This study uses {loaded.mechanism}, with a switch cost of {loaded.switch_cost():.1%}; "
         f"kept in {loaded.folder / 'switching.json'}."
     )
-    _say_next_online(loaded, study, override, folder)
+    say_next_online(loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -422,7 +414,7 @@ def compare(
         say(f"Mean RTE of {rows[-1].sequence}: {found}.")
     if (n := len(loaded.config.training)) < MIN_SEQUENCES:
         first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
-        _say_next("find out whether to adapt", "offline", study, override, folder, first)
+        say_next_of_study("find out whether to adapt", "offline", study, override, folder, first)
     else:
         why = "what it has learned; docs/adapting-live.md brings it to the robot"
         say_next(why, "model", "show", loaded.model_path)
@@ -430,13 +422,6 @@ def compare(
 
 def _sequences(n: int) -> str:
     return f"{n} sequence{'' if n == 1 else 's'}"
-
-
-def _say_next_online(
-    loaded: "OfflineStudy", study: Path, override: list[str], folder: Path | None
-) -> None:
-    first = "" if loaded.config.test else f"name sequences for the `test` of {study}; then "
-    _say_next("replay the test sequences in every mode", "online", study, override, folder, first)
 
 
 def _short(parameters: dict[str, Any]) -> str:

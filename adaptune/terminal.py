@@ -2,14 +2,11 @@
 
 import logging
 import os
-import shlex
-import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -23,9 +20,10 @@ if TYPE_CHECKING:
 
 # Text of files is printed as it is: no markup, no emoji.
 _literal: Any = {"markup": False, "emoji": False, "highlight": False}
-# A table in a pipe is not wrapped, unless COLUMNS gives a width.
-console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200, **_literal)
-errors = Console(stderr=True, **_literal)
+# In a pipe, tables and logs are not wrapped, unless COLUMNS gives a width.
+_wide = None if "COLUMNS" in os.environ else 200
+console = Console(width=None if sys.stdout.isatty() else _wide, **_literal)
+errors = Console(stderr=True, width=None if sys.stderr.isatty() else _wide, **_literal)
 
 
 class Commands(TyperGroup):
@@ -48,18 +46,6 @@ class Commands(TyperGroup):
 def say(text: str) -> None:
     """Print plain text, on one line however narrow the terminal is."""
     console.print(text, soft_wrap=True)
-
-
-def say_next(why: str, *words: object, first: str = "") -> None:
-    """Print the command to run next, ready to copy, what it is for, and what to do first."""
-    say(f"Next: {first}{shlex.join([_program(), *map(str, words)])}    # {why}")
-
-
-def _program() -> str:
-    """The command line as the user can call it."""
-    called = Path(sys.argv[0])
-    typed = called.name == "adaptune" and shutil.which("adaptune") is None
-    return str(called) if typed else "adaptune"
 
 
 def begin_work() -> None:
@@ -128,11 +114,21 @@ def _logger() -> Show:
     def show(what: str, done: float, total: int, remark: str = "") -> None:
         nonlocal last
         now = time.monotonic()
-        start, before = begun.setdefault(what, (now, done))
+        if done == begun.get(what, (now, done))[1]:
+            begun[what] = now, done
+        start, before = begun[what]
         if now - last > LOG_EVERY:
             last = now
-            left = (now - start) * (total - done) / (done - before) if total > done > before else 0
-            words = [f"{what}: {int(done)} of {total}", left and f"about {left:.0f} s left", remark]
+            rate = (done - before) / max(now - start, 1e-9)
+            left = _time_left((total - done) / rate) if rate and done < total else ""
+            words = (f"{what}: {int(done)} of {total}", left, remark)
             log.info("%s", ", ".join(word for word in words if word))
 
     return show
+
+
+def _time_left(seconds: float) -> str:
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds > 2.0 * length:
+            return f"about {seconds / length:.0f} {unit} left"
+    return f"about {seconds:.0f} s left"

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import begin_work, console, say, say_next
+from adaptune.next_command import say_next
+from adaptune.terminal import begin_work, console, say
 
 if TYPE_CHECKING:
     from adaptune.inspect import Inspection
@@ -46,7 +47,13 @@ def _begin_study(found: "Inspection") -> None:
     from adaptune.metrics import travelled
 
     named = (yaml.Document(found.entry).data or {}).get("sequences")
-    if found.reference is None or found.missing.get("offline") or not named:
+    if not named:
+        return
+    if found.reference is None or found.missing.get("offline"):
+        say(
+            "Next: mend what is lacking, see docs/your-bag.md; a recording without a reference can "
+            "only be a `test` sequence"
+        )
         return
     path = travelled(found.reference.T_world_sensor)[-1]
     length = next((length for length in LENGTHS if length <= path / 10.0), LENGTHS[-1])

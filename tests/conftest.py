@@ -45,6 +45,8 @@ SLOW = [
     "offline/test_storage.py",
     "adaptune/odometry/test_isolation.py",
     "adaptune/odometry/test_process.py",
+    "offline/test_progress.py",
+    "adaptune/test_interrupt.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 

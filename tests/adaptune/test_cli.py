@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 
+import drives
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -52,6 +54,14 @@ def test_one_bag_is_enough_and_every_command_names_the_next(study_file, tmp_path
     assert "one_60-100" in done.stdout
     assert "name 6 training sequences or more, the study has 1; then" in done.stdout
     assert (tmp_path / "my study[v2]/comparison/one_60-100.png").exists()
+
+
+def test_inspect_says_what_to_do_without_a_reference(tmp_path):
+    for i, (_, points, _) in enumerate(drives.scans(n_scans=3)):
+        np.save(tmp_path / f"{i}.npy", points)
+    done = CliRunner().invoke(app, ["inspect", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "can only be a `test` sequence" in done.stdout.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

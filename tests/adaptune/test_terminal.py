@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from adaptune import report, terminal
 from adaptune.cli import app
 from adaptune.model import ErrorModel
+from adaptune.next_command import say_next
 
 ODD = "my[v2] [/b] :x: [red]"
 
@@ -77,5 +78,5 @@ def test_a_log_has_a_line_of_progress_now_and_then(caplog, monkeypatch):
 def test_the_next_command_can_be_copied(capsys, monkeypatch, called, found, typed):
     monkeypatch.setattr(sys, "argv", [called])
     monkeypatch.setattr("shutil.which", lambda _: found)
-    terminal.say_next("why", "offline", "my study.yaml")
+    say_next("why", "offline", "my study.yaml")
     assert capsys.readouterr().out == f"Next: {typed} offline 'my study.yaml'    # why\n"
