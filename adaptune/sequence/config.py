@@ -76,7 +76,7 @@ _Numbers = tuple[float, ...]
 
 
 def _check_transform(given: Any) -> Any:
-    rows = given if isinstance(given, list | tuple) else ()
+    rows: Any = given if isinstance(given, list | tuple) else ()
     nested = any(isinstance(row, list | tuple) for row in rows)
     for row in rows if nested else (rows,):
         for number in row if isinstance(row, list | tuple) else (row,):
