@@ -105,7 +105,8 @@ class PreparedSequence:
                 self.nbytes += prepared_bytes(prepared)
         if not enough:
             raise AdaptuneError(
-                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points"
+                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points; check "
+                f"`points` and what the sensor recorded"
             )
         at = np.array(stamps, np.int64)
         T_ref_sensor = reference_poses(name, scans, at, settings)

@@ -149,7 +149,7 @@ class BagSource:
         if self.topics[name] in TRANSFORMS:
             found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
-            raise SequenceError(f"{self.name}: no pose on {name}")
+            raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
         trajectory, unusable = usable(found)
         unfit = f"poses on {name} that are not finite or have no rotation"
         if trajectory is None:
@@ -168,7 +168,7 @@ class BagSource:
             stamps.append(message_stamp(message))
             values.append((w.x, w.y, w.z, a.x, a.y, a.z))
         if not stamps:
-            raise SequenceError(f"{self.name}: no measurement on {name}")
+            raise SequenceError(f"{self.name}: no measurement on {name}; name another topic")
         unique, index = np.unique(np.array(stamps, np.int64), return_index=True)
         measured = np.array(values)[index]
         if not np.isfinite(measured).all():

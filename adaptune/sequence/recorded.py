@@ -121,7 +121,9 @@ class RecordedSequence:
             last = scan.stamp
             yield scan
         if last is None:
-            raise SequenceError(f"{self.name}: no scan {self.section}")
+            raise SequenceError(
+                f"{self.name}: no scan {self.section}; change start, stop or stride"
+            )
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first. A bag is decoded to the cache before."""

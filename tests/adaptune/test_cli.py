@@ -128,7 +128,7 @@ def test_the_whole_way(study_file, tmp_path):
     [
         (["offline", "none.yaml"], "none.yaml: there is no such file"),
         (["offline", "STUDY", "-o", "offline.sampler=best"], "offline.sampler"),
-        (["simulate", "STUDY"], "there is none to simulate"),
+        (["simulate", "STUDY"], "there is none to simulate; add one"),
         (["online", "STUDY"], "model.safetensors: there is no such model"),
         (["compare", "STUDY"], "run `adaptune online`"),
         (["online", "STUDY", "--model", "STUDY"], "is not an error model, or damaged"),

@@ -323,12 +323,15 @@ def test_the_whole_way(make):
         ("odometry.settings.template=", "voxel}, and there is no template"),
         ("odometry.settings.command=[slam3000, x]", "there is no program 'slam3000'"),
         ("odometry.settings.command=[sh, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
-        ("odometry.settings.format=tumm", "odometry.settings.format: Input should be"),
+        (
+            "odometry.settings.format=tumm",
+            "odometry.settings.format: give 'tum', 'kitti' or 'evalio', not 'tumm'",
+        ),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
         ("online.rules=[paired]", "online.rules: a command runs whole recordings"),
         ("online.switching.mechanism=live", "a command runs whole recordings and cannot change"),
         ("online.switching.mechanism=bank", "a command runs whole recordings and cannot change"),
-        ("odometry.settings.command=sh", 'settings.command: give a list, not "sh"'),
+        ("odometry.settings.command=sh", "settings.command: give a list, not 'sh'"),
     ],
 )
 def test_mistakes_in_the_study(make, override, words):

@@ -258,7 +258,7 @@ def test_a_conversation_with_the_command_line():
         (HELLO | {"version": 1}, "speaks version 2 of the protocol, not 1"),
         (HELLO | {"odometry": None}, "the hello names no odometry"),
         (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
-        (HELLO | {"settings": {"fualt": "hang"}}, "fualt"),
+        (HELLO | {"settings": {"fualt": "hang"}}, "settings: fualt: unknown key"),
         ({"type": "hello", "version": 2}, "hello lacks parameters, settings"),
         ({"type": "begin"}, "no message of type 'begin'"),
         ({"type": "start", "stamp": 0}, "start lacks points, pose"),
@@ -270,6 +270,7 @@ def test_what_a_server_refuses(first, message):
     (answer,) = exchange((first, {}))
     assert answer.header["type"] == "refused"
     assert message in answer.header["message"]
+    assert "https://" not in answer.header["message"]
 
 
 @pytest.mark.parametrize(
