@@ -13,8 +13,8 @@ from adaptune.files import replacing
 # Okabe and Ito's colours, which the colour-blind tell apart. Lines that coincide lie on each other
 # from wide to narrow and are dark and light in turn, so that each is seen, in grey, too.
 LINES: dict[str, dict[str, Any]] = {
-    "baseline": {"color": "#bbbbbb", "lw": 5.0},
-    "fixed": {"color": "#0072b2", "lw": 3.0},
+    "baseline": {"color": "#bbbbbb", "lw": 5.4},
+    "fixed": {"color": "#0072b2", "lw": 3.4},
     "paired": {"color": "#e69f00", "lw": 1.4},
     "paper": {"color": "#000000", "lw": 0.9, "ls": (0, (4, 4))},
 }
@@ -32,7 +32,7 @@ POINTS: dict[str, dict[str, Any]] = {
 OTHERS = ("#56b4e9", "#f0e442", "#009e73", "#cc79a7", "#d55e00", "#999999")
 """Colours of what is not a mode, from one thing to the next."""
 
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "axes.grid": True,
     "grid.alpha": 0.3,
     "axes.spines.top": False,
@@ -77,6 +77,7 @@ def picture(files: Iterable[Path], width: float, height: float) -> Iterator[Any]
                 # Without a date, the same picture has the same bytes.
                 metadata = {"Date": None} if file.suffix == ".svg" else None
                 figure.savefig(temporary, metadata=metadata)
+            figure.set_layout_engine("none")  # which takes most of the time; it is laid out
 
 
 def as_png_and_svg(path: Path) -> tuple[Path, Path]:

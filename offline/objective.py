@@ -30,8 +30,13 @@ from adaptune.space import ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 
 UNITS: dict[Metric, str] = {
-    **{"rte": "%", "kitti": "%", "rpe": "m", "ape": "m"},
-    **{"ms_per_scan": "ms", "cpu": "% of a core", "memory": "MB"},
+    "rte": "%",
+    "kitti": "%",
+    "rpe": "m",
+    "ape": "m",
+    "ms_per_scan": "ms",
+    "cpu": "% of a core",
+    "memory": "MB",
 }
 BOUND = 1e6
 """The largest value of a metric, also where it cannot be computed: sums stay finite."""

@@ -1,6 +1,6 @@
 """Pictures of the offline stage: Pareto fronts, and the sequences left out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,7 +74,7 @@ class LeftOutResults(NamedTuple):
 def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
     """Draw results on the sequences left out; `path` is that of the PNG."""
     default = "bank" if "bank" in found.ratios else "paired"
-    panels = [_draw_sequences]
+    panels: list[Callable[[Any, LeftOutResults, str], None]] = [_draw_sequences]
     if not np.isnan(found.familiarity).all():
         panels.append(_draw_familiarity)
     panels.append(_draw_sizes)
@@ -121,9 +121,8 @@ def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     sizes = np.arange(1, len(found.portfolio) + 1)
-    axes.plot(
-        sizes, found.portfolio, "s--", color="#999999", label="best of so many sets, if known"
-    )
+    known = "best of so many sets, if known"
+    axes.plot(sizes, found.portfolio, "s--", color="#999999", label=known)
     fewer, number = f"{default}, trained on so many", ["sets"]
     for rows, column, counted, look, label in (
         (found.banks, "instances", "members", POINTS["bank"], "bank of so many members"),

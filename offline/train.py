@@ -186,7 +186,7 @@ def _write_pareto(
     fixed: int,
     trials: Mapping[int, Mapping[str, Any]],
 ) -> None:
-    """Write and draw the sets that keep the limits and that no other set beats in every objective."""
+    """Write and draw the sets within the limits that no other set beats in every objective."""
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
     values = np.array([verdicts[n].values for n in feasible])
     front = sorted((feasible[i] for i in pareto_front(values)), key=lambda n: verdicts[n].values)

@@ -86,7 +86,7 @@ def draw_replays(
         above = left.subplots()
         _draw_above(above, tracks, reference)
         shape: Any = {"sharex": True, "squeeze": False, "height_ratios": heights}
-        over_time = right.subplots(len(panels), 1, **shape)[:, 0] if panels else ()
+        over_time: Any = right.subplots(len(panels), 1, **shape)[:, 0] if panels else ()
         for axes, (_, draw) in zip(over_time, panels, strict=True):
             draw(axes)
             axes.yaxis.set_tick_params(labelsize="small")
@@ -104,9 +104,9 @@ def _draw_above(
         mean = f", mean RTE {known.mean():.3g} %" if len(known) else ""
         axes.plot(*track.xy.T, label=f"{mode}{mean}", **LINES[mode])
     if reference is not None:
-        at = np.linspace(0, len(reference) - 1, 40).astype(int)
+        some = reference[np.linspace(0, len(reference) - 1, 40).astype(int)]
         ring: Any = {"color": "#009e73", "mfc": "white", "ms": 4, "ls": ""}
-        axes.plot(*reference[at].T, "o", label="reference", **ring)
+        axes.plot(*some.T, "o", label="reference", **ring)
     axes.plot(0.0, 0.0, "P", color="black", mec="white", ms=9, label="start")
     label = "restarted by the health check"
     for mode, track in tracks.items():

@@ -126,7 +126,8 @@ class ComparisonRow:
 
     def standard_columns(self) -> dict[str, Any]:
         """The row of a table of the errors that other tools give."""
-        ape, rpe, percent, degrees, lengths = self._standard().values()
+        ape, rpe, percent, degrees, listed = self._standard().values()
+        lengths = (listed or "").split()
         return {
             "sequence": self.sequence,
             "mode": self.mode,
@@ -134,7 +135,7 @@ class ComparisonRow:
             "RPE [m]": rpe,
             "KITTI [%]": percent,
             "[deg/100 m]": None if degrees is None else 100.0 * degrees,
-            "over [m]": lengths or None,
+            "over [m]": "-".join(dict.fromkeys([*lengths[:1], *lengths[-1:]])) or None,
         }
 
 

@@ -39,7 +39,7 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
             f"on {n_frames} frames of {len(model.sequences)} sequences, {size:.1f} MB\n"
             f"Errors over {model.length:g} m. Scans are described by {blocks}{window}."
         ),
-        *_named("The odometry's settings", model.odometry.get("settings", {})),
+        *_named("Settings", model.odometry.get("settings", {})),
         report.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         report.table("Parameters", _parameters(model)),
         report.table(f"The best sets of {n_sets}", _best(model), "Mean error over all sequences."),
