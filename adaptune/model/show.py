@@ -13,7 +13,7 @@ from adaptune import report
 from adaptune.metrics import cap
 from adaptune.model.base import mean_errors
 from adaptune.model.error_model import ErrorModel
-from adaptune.space import Value, describe
+from adaptune.space import Categorical, Parameter, describe
 
 N_BEST = 5
 """Sets to show, besides the fixed one."""
@@ -89,7 +89,7 @@ def _words(value: Any) -> str:
         nested = any(isinstance(item, Mapping | list | tuple) for item in value)
         return ("; " if nested else ", ").join(map(_words, value))
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        return str(value).lower()  # as in YAML
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -139,12 +139,18 @@ def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
     return [
         {
             "parameter": name,
-            "range": describe(parameter) + (" log" if getattr(parameter, "log", False) else ""),
-            "baseline": _short(parameter.baseline),
-            "fixed": _short(fixed[name]),
+            "range": _range(parameter),
+            "baseline": _words(parameter.baseline),
+            "fixed": _words(fixed[name]),
         }
         for name, parameter in model.sets.space.parameters.items()
     ]
+
+
+def _range(parameter: Parameter) -> str:
+    if isinstance(parameter, Categorical):
+        return _words(parameter.choices)
+    return describe(parameter) + (" log" if parameter.log else "")
 
 
 def _best(model: ErrorModel) -> list[dict[str, Any]]:
@@ -158,10 +164,6 @@ def _sets(model: ErrorModel, trials: Sequence[int]) -> list[dict[str, Any]]:
     return [
         {"set": f"{n}, fixed" if n == model.fixed else str(n)}
         | {"mean [%]": float(means[model.sets.column(n)])}
-        | {name: _short(value) for name, value in model.sets[n].items()}
+        | {name: _words(value) for name, value in model.sets[n].items()}
         for n in trials
     ]
-
-
-def _short(value: Value) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -58,6 +58,7 @@ def test_a_model_is_explained(model, tmp_path):
         "cave 2 3 4.000 1.000 1 0.000",
         "street 2 3 2.000 2.000 0 0.000",
         "distance [1, 10] log 4 4",
+        "kernel none, [huber] none none",
         "0, fixed 3.000 4 none",
         "1 3.000 2 [huber]",
         "seed 7",
@@ -112,7 +113,7 @@ def test_nested_data_are_shown_in_words(model, tmp_path):
     assert "limits.rte.max 3" in text
     text = shown(program, tmp_path)
     assert "command slam, --fast" in text
-    assert "extrinsic.translation 0, 0.5, 1 gpu yes" in text
+    assert "extrinsic.translation 0, 0.5, 1 gpu true" in text
 
 
 def test_text_of_a_file_is_shown_literally(model, tmp_path):
