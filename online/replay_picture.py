@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.drawing import LINES, OTHERS, as_png_and_svg, log_scale, picture
+from adaptune.drawing import LINES, OTHERS, as_png_and_svg, log_scale, picture, plain
 
 _HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---")
 _MARKS = 60
@@ -151,9 +151,10 @@ def _draw_errors(axes: Any, tracks: Mapping[str, Track], length: float) -> None:
 
 def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool) -> None:
     """What was applied of a parameter; a bank applies that of each of its members."""
+    named = any(isinstance(v, str) for track in tracks.values() for v in track.choices[name])
     for mode, track in tracks.items():
         if not track.weights:
-            values = list(track.choices[name])
+            values = [plain(v) if named and v != str(v) else v for v in track.choices[name]]
             axes.step(track.span, [*values, values[-1]], where="post", **LINES[mode])
     if log:
         log_scale(axes)

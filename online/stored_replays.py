@@ -107,7 +107,8 @@ class StoredReplay:
         stamps, choices, weights = _choices(folder / "selections.csv")
         if not len(stamps):
             stamps = trajectory.stamps[:1]
-            choices = {name: [value] for name, value in (summary.about.parameters or {}).items()}
+            kept = summary.about.parameters or {}
+            choices = {name: _numbers([str(value)]) for name, value in kept.items()}
         return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices, weights)
 
 

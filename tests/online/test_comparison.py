@@ -17,7 +17,7 @@ from offline.offline_study import load_study
 from online.comparison import compare
 from online.modes import ModeError, ReplaySetup
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
-from online.stored_replays import StoredReplayError
+from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
 
@@ -79,6 +79,15 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
         for row in rows:
             chosen = model.sets[int(row["trial"])]
             assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
+
+
+def test_values_that_stay_read_as_those_that_change(own):
+    path = own.folder / "replays/three/fixed/replay.json"
+    about = json.loads(path.read_text())
+    about["about"]["parameters"] = {"mode": True, "size": 3, "kernel": "none"}
+    path.write_text(json.dumps(about))
+    choices = StoredReplay.read(path.parent).choices
+    assert choices == {"mode": ["True"], "size": [3.0], "kernel": ["none"]}
 
 
 def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):

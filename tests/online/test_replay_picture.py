@@ -70,6 +70,17 @@ def test_a_bank_has_its_weights_drawn_and_no_parameters(tmp_path):
     assert not {"alone", "70", "77"} & set(said)  # of the heaviest member only
 
 
+def test_names_and_numbers_share_an_axis(tmp_path):
+    values = ([17.0, 17.0], ["auto", "auto"], ["True", "auto"])
+    tracks = {
+        mode: track(choices={"kernel": of_mode, "max_distance": [2.0, 2.0]})
+        for mode, of_mode in zip(MODES, values, strict=False)
+    }
+    said = drawn(tmp_path, tracks)[1]
+    assert [said.count(text) for text in ("auto", "17", "True")] == [1, 1, 1]
+    assert "2" in said
+
+
 def numbers(said):
     return [float(t.replace("\N{MINUS SIGN}", "-")) for t in said if t[-1].isdigit()]
 
