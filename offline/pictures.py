@@ -123,6 +123,7 @@ def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
     sizes = np.arange(1, len(found.portfolio) + 1)
     known = "best of so many sets, if known"
     axes.plot(sizes, found.portfolio, "s--", color="#999999", label=known)
+    most = max(1.0, float(found.portfolio.max()))
     fewer, number = f"{default}, trained on so many", ["sets"]
     for rows, column, counted, look, label in (
         (found.banks, "instances", "members", POINTS["bank"], "bank of so many members"),
@@ -132,8 +133,11 @@ def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
             number.append(counted)
             middle = np.array([row["geometric"] for row in rows])
             error = np.abs([[row[key] for row in rows] for key in ("low", "high")] - middle)
+            most = max(most, float(middle.max()))
             x = [row[column] for row in rows]
             axes.errorbar(x, middle, error, capsize=3, label=label, **look)
+    # The interval of two sequences may reach to the sky.
+    axes.set_ylim(top=min(axes.get_ylim()[1], 2.0 * most))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f"number of {', or '.join(number)} [-]")
     axes.set_title("with more to choose from" + (" (95 % intervals)" if len(number) > 1 else ""))

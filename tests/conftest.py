@@ -45,6 +45,8 @@ SLOW = [
     "offline/test_storage.py",
     "adaptune/odometry/test_isolation.py",
     "adaptune/odometry/test_process.py",
+    "online/test_replay_picture.py",
+    "offline/test_pictures.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 
