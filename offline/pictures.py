@@ -137,7 +137,8 @@ def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
             x = [row[column] for row in rows]
             axes.errorbar(x, middle, error, capsize=3, label=label, **look)
     # The interval of two sequences may reach to the sky.
-    axes.set_ylim(top=min(axes.get_ylim()[1], 2.0 * most))
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(low, 0.0), min(high, 2.0 * most))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f"number of {', or '.join(number)} [-]")
     axes.set_title("with more to choose from" + (" (95 % intervals)" if len(number) > 1 else ""))

@@ -83,7 +83,7 @@ def test_curves_are_explained_where_they_are_drawn(tmp_path):
 def test_wide_intervals_do_not_shrink_the_rest(tmp_path):
     wide = [row | {"low": 1e-6, "high": 1e6} for row in rows("sequences", (1, 2))]
     draw_validation(tmp_path / "v.png", "study", results(["fixed", "paired"], learning=wide))
-    assert max(float(t) for t in texts(tmp_path / "v.png") if t.replace(".", "").isdigit()) < 10
+    assert max(float(t) for t in texts(tmp_path / "v.png") if t.replace(".", "").isdigit()) < 100
 
 
 @pytest.mark.parametrize("n", [2, 40])
