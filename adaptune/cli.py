@@ -407,6 +407,16 @@ def compare(
             "`all`: mean RTE, and geometric mean of the ratios.",
         )
     )
+    if any(row.standard for row in rows):
+        console.print(
+            report.table(
+                "Errors as evo and KITTI's benchmark define them",
+                [row.standard_columns() for row in rows],
+                "APE after alignment, RPE from scan to scan: root mean squares. KITTI: mean over "
+                "the lengths in the last column; needs 100 m. `all`: mean APE and RPE; KITTI over "
+                "the sub-trajectories of all sequences.",
+            )
+        )
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
     last = {row.mode: row.rte for row in rows if row.sequence == rows[-1].sequence}
     if None not in last.values():

@@ -23,6 +23,7 @@ from offline.fit import fit, tuned
 from offline.labelled import labelled_data
 from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
 from offline.offline_study import OfflineStudy
+from offline.pictures import draw_front
 from offline.search import Finished
 from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Pool, Task, Workers
@@ -91,7 +92,7 @@ def train(
     table = _trial_rows(config, verdicts, finished)
     report.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
-        _write_pareto(study.folder, config.objective, verdicts, table)
+        _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     rows = _training_rows(config, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
     return Training(model, means, fixed, rows)
@@ -184,16 +185,21 @@ def _write_pareto(
     folder: Path,
     objective: Sequence[Mapping[Metric, float]],
     verdicts: Mapping[int, Verdict],
+    fixed: int,
     trials: Mapping[int, Mapping[str, Any]],
 ) -> None:
-    """Write the sets that keep the limits and that no other set beats in every objective."""
+    """Write and draw the sets within the limits that no other set beats in every objective."""
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
     values = np.array([verdicts[n].values for n in feasible])
-    front = [feasible[i] for i in pareto_front(values)]
+    front = sorted((feasible[i] for i in pareto_front(values)), key=lambda n: verdicts[n].values)
     report.write_rows(folder, "pareto", [trials[n] for n in front])
-    names = [label(weights) for weights in objective]
-    on_front = np.array([verdicts[n].values for n in front])
-    report.draw_front(folder / "pareto.png", names, values, on_front)
+    draw_front(
+        folder / "pareto.png",
+        [label(weights, units=True) for weights in objective],
+        values,
+        np.array([verdicts[n].values for n in front]),
+        {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
+    )
 
 
 def _run_whole(

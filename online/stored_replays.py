@@ -87,7 +87,9 @@ class StoredReplay:
     # (m,): nanoseconds, of the scans that selections were made from; the first one of a mode that
     # keeps its parameters.
     choice_stamps: NDArray[np.int64]
-    choices: dict[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
+    # For every parameter its values, of shape (m,); in a bank those of the heaviest member.
+    choices: dict[str, Sequence[Any]]
+    weights: dict[int, Sequence[float]]  # in a bank, by trial, of shape (m,); empty without one
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -103,11 +105,12 @@ class StoredReplay:
         restarted = _columns(folder / "frames.csv").get("restarted", [])
         if len(restarted) != len(trajectory):
             raise _damaged(folder / "frames.csv", ValueError("not a row for every scan"))
-        stamps, choices = _choices(folder / "selections.csv")
+        stamps, choices, weights = _choices(folder / "selections.csv")
         if not len(stamps):
             stamps = trajectory.stamps[:1]
-            choices = {name: [value] for name, value in (summary.about.parameters or {}).items()}
-        return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices)
+            kept = summary.about.parameters or {}
+            choices = {name: _numbers([str(value)]) for name, value in kept.items()}
+        return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices, weights)
 
 
 def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
@@ -181,14 +184,25 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
         writer.writerows(rows)
 
 
-def _choices(path: Path) -> tuple[NDArray[np.int64], dict[str, Sequence[Any]]]:
+def _choices(
+    path: Path,
+) -> tuple[NDArray[np.int64], dict[str, Sequence[Any]], dict[int, Sequence[float]]]:
     columns = _columns(path)
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
+        weights = _weights(columns.get("weights", []))
     except (TypeError, ValueError) as error:
         raise _damaged(path, error) from error
     parameters = {name: v for name, v in columns.items() if name not in _SELECTION}
-    return stamps, {name: _numbers(values) for name, values in parameters.items()}
+    return stamps, {name: _numbers(values) for name, values in parameters.items()}, weights
+
+
+def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:
+    """Read the column of weights."""
+    rows = [dict(pair.split(":") for pair in text.split()) for text in texts]
+    if any(row.keys() != rows[0].keys() for row in rows):
+        raise ValueError("weights of other trials from row to row")
+    return {int(trial): [float(row[trial]) for row in rows] for trial in (rows[0] if rows else {})}
 
 
 def _columns(path: Path) -> dict[str, list[str]]:

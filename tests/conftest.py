@@ -47,6 +47,8 @@ SLOW = [
     "adaptune/odometry/test_process.py",
     "offline/test_progress.py",
     "adaptune/test_interrupt.py",
+    "online/test_replay_picture.py",
+    "offline/test_pictures.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 
