@@ -43,8 +43,11 @@ SLOW = [
     "adaptune/model/test_knn.py",
     "online/test_switch_cost.py",
     "offline/test_storage.py",
+    "adaptune/test_hosting.py",
+    "offline/samplers/test_hosted.py",
     "adaptune/odometry/test_isolation.py",
     "adaptune/odometry/test_process.py",
+    "adaptune/odometry/test_guarded.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 
