@@ -251,14 +251,15 @@ def test_an_odometry_that_kills_its_group_costs_one_fault(mine, tmp_path):
 
 BUSY = """
 import os, time
-children = []
+running, run = os.pipe()
 for _ in range(2):
     if os.fork() == 0:
         held = bytearray(100_000_000)
         while time.process_time() < 0.3: pass
-        time.sleep(0.3)
+        time.sleep(0.6)
         os._exit(0)
-time.sleep(0.9)  # and waits for none of them
+os.close(run)
+os.read(running, 1)  # until both have ended; it takes no notice of how
 """
 
 
