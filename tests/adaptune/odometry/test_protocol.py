@@ -92,7 +92,7 @@ def test_usage_grows_and_faults_are_none(kind):
         odometry.register(one)
     after = odometry.usage
     assert isinstance(after, Usage)
-    assert 0.0 < before.cpu
+    assert before.cpu > 0.0
     # A program has run before its first pose is known.
     assert before.cpu == after.cpu if kind == "command" else before.cpu < after.cpu
     assert (after.memory is None) == (kind not in (*ELSEWHERE, "command"))
