@@ -170,6 +170,9 @@ def test_what_a_program_has_started_ends_with_it(tmp_path):
     assert program.wait(10.0).code == 7
     wait_until_gone(processes)
     program.close()
+    of_its_group = hosting.Program(["sh", "-c", "kill -9 0"], 4.0)
+    assert of_its_group.wait(10.0).code == -signal.SIGKILL
+    of_its_group.close()
     for end in (hosting.Program.close, hosting.Program.end):
         program, processes = begin(tmp_path, "wait")
         assert program.wait(0.05) is None
