@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
@@ -165,11 +166,12 @@ def server(service: Service, name: str) -> Server:
         If it cannot be imported, with the last lines that it wrote.
     """
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
-    path = os.pathsep.join(filter(None, sys.path))
+    path = os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)
     arguments = [str(there.fileno()), str(IMPORT_SECONDS), service.module, name]
     with there, tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "adaptune.forkserver", *arguments],
+            # Modules are found where this process finds them, and nowhere else.
+            [sys.executable, "-P", "-m", "adaptune.forkserver", *arguments],
             pass_fds=[there.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=output,

@@ -11,10 +11,13 @@ import resource
 import select
 import signal
 import sys
+import time
 from typing import NamedTuple, NoReturn
 
 _BETWEEN_SAMPLES = 200
 """Milliseconds."""
+_UNTIL_DEAD = 0.001
+"""Seconds between looks for processes that have not ended yet."""
 _SUBREAPER = 36
 """Linux's PR_SET_CHILD_SUBREAPER."""
 _HANG_UP = select.POLLHUP | getattr(select, "POLLRDHUP", 0)
@@ -76,11 +79,11 @@ def _end_rest(group: int) -> None:
     """End a process group, and all descendants that have left it."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(group, signal.SIGKILL)
-    _kill(_descendants(os.getpid()))
     with contextlib.suppress(ChildProcessError):
         while True:
-            os.waitpid(-1, 0)
             _kill(_descendants(os.getpid()))
+            if os.waitpid(-1, os.WNOHANG) == (0, 0):
+                time.sleep(_UNTIL_DEAD)
 
 
 def _kill(processes: list[int]) -> None:
@@ -91,17 +94,12 @@ def _kill(processes: list[int]) -> None:
 
 def _descendants(ancestor: int) -> list[int]:
     """Descendants of a process; none where there is no /proc."""
-    children: dict[int, list[int]] = {}
-    with contextlib.suppress(OSError):
-        for name in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208 (pathlib takes longer)
-            parent = int(
-                (_read(f"/proc/{name}/stat").rpartition(b")")[2].split() or [b"0", b"0"])[1]
-            )
-            children.setdefault(parent, []).append(int(name))
-    found = list(children.get(ancestor, ()))
+    found = [ancestor]
     for process in found:
-        found += children.get(process, ())
-    return found
+        with contextlib.suppress(OSError):
+            for task in os.listdir(f"/proc/{process}/task"):  # noqa: PTH208 (pathlib takes longer)
+                found += map(int, _read(f"/proc/{process}/task/{task}/children").split())
+    return found[1:]
 
 
 def _resident(process: int) -> float:

@@ -43,12 +43,15 @@ SLOW = [
     "adaptune/model/test_knn.py",
     "online/test_switch_cost.py",
     "offline/test_storage.py",
+    "adaptune/test_hosting.py",
+    "offline/samplers/test_hosted.py",
     "adaptune/odometry/test_isolation.py",
     "adaptune/odometry/test_process.py",
     "offline/test_progress.py",
     "adaptune/test_interrupt.py",
     "online/test_replay_picture.py",
     "offline/test_pictures.py",
+    "adaptune/odometry/test_guarded.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 

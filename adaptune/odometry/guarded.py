@@ -1,8 +1,11 @@
 """A class of the user in this process: where it goes wrong, this is a fault and nothing else."""
 
+import signal
+import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,6 +33,10 @@ class _Unprepared:
         self.fault = fault
 
 
+class _LateError(BaseException):
+    """A call has taken too long; not an exception that user code would handle."""
+
+
 class _FaultError(Exception):
     """What a class of the user has raised."""
 
@@ -43,10 +50,14 @@ class Guarded(Faulting):
         The odometry.
     settings
         Its checked settings.
+    seconds
+        Time for one scan. It holds for Python code in the main thread; other code is trusted.
     """
 
-    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel):
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):
         super().__init__(name, parameters)
+        self._class: Any = odometry_class(name)
+        self._seconds = seconds
         self._settings = settings.model_dump(mode="json")
         self._odometry: Odometry | None = None
         self._cpu = 0.0
@@ -58,7 +69,7 @@ class Guarded(Faulting):
 
     def prepare(self, scan: Scan) -> Any:
         try:
-            return _guarded(lambda: self._made().prepare(scan))
+            return self._guarded(lambda: self._made().prepare(scan))
         except _FaultError as fault:
             return _Unprepared(str(fault))
 
@@ -72,7 +83,7 @@ class Guarded(Faulting):
         try:
             motion = None if T_previous_current is None else T_previous_current.copy()
             started = _checked(prepared)
-            _guarded(lambda: self._made().start(started, T_odom_sensor.copy(), motion))
+            self._guarded(lambda: self._made().start(started, T_odom_sensor.copy(), motion))
             self._running = True
         except _FaultError as fault:
             self.note_fault(str(fault))
@@ -93,8 +104,8 @@ class Guarded(Faulting):
         return registration
 
     def _registered(self, prepared: Any) -> Registration:
-        found = _guarded(lambda: unpacked(self._made().register(prepared)))
-        T_odom_sensor = _guarded(lambda: np.array(found.T_odom_sensor, np.float64))
+        found = self._guarded(lambda: unpacked(self._made().register(prepared)))
+        T_odom_sensor = self._guarded(lambda: np.array(found.T_odom_sensor, np.float64))
         if wrong := pose_fault(T_odom_sensor):
             raise _FaultError(f"it gave a pose {wrong}")
         return Registration(T_odom_sensor, bool(found.registered))
@@ -102,7 +113,7 @@ class Guarded(Faulting):
     def apply(self, selection: Selection) -> None:
         self.parameters |= selection.parameters
         try:
-            _guarded(lambda: self._made().configure(selection.parameters))
+            self._guarded(lambda: self._made().configure(selection.parameters))
         except _FaultError as fault:
             self.note_fault(str(fault))
 
@@ -111,11 +122,25 @@ class Guarded(Faulting):
 
     def _made(self) -> Odometry:
         if self._odometry is None:
-            cls: Any = odometry_class(self.name)
-            settings = cls.settings_type.model_validate(self._settings)
-            self._odometry = cls(self.parameters, settings)
+            settings = self._class.settings_type.model_validate(self._settings)
+            self._odometry = self._class(self.parameters, settings)
         assert self._odometry is not None
         return self._odometry
+
+    def _guarded(self, call: Callable[[], T]) -> T:
+        """What a call of user code returns; a `_FaultError` with the place where it raised."""
+        try:
+            with _limited(self._seconds):
+                return call()
+        except AdaptuneError:
+            raise
+        except _LateError as error:
+            what = f"a scan took longer than isolation.seconds = {self._seconds:g}"
+            raise _FaultError(what) from error
+        except (Exception, SystemExit) as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            what = "".join(traceback.format_exception_only(error)).strip()
+            raise _FaultError(f"{what} ({last.filename}, line {last.lineno})") from error
 
 
 def _checked(prepared: Any) -> Any:
@@ -124,13 +149,20 @@ def _checked(prepared: Any) -> Any:
     return prepared
 
 
-def _guarded(call: Callable[[], T]) -> T:
-    """What a call of user code returns; a `_FaultError` with the place where it raised."""
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise a `_LateError` in the block after so long, where there is a way."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(_: int, __: object) -> None:
+        raise _LateError
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
-        return call()
-    except AdaptuneError:
-        raise
-    except (Exception, SystemExit) as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        what = "".join(traceback.format_exception_only(error)).strip()
-        raise _FaultError(f"{what} ({last.filename}, line {last.lineno})") from error
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

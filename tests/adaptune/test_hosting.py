@@ -170,6 +170,9 @@ def test_what_a_program_has_started_ends_with_it(tmp_path):
     assert program.wait(10.0).code == 7
     wait_until_gone(processes)
     program.close()
+    of_its_group = hosting.Program(["sh", "-c", "kill -9 0"], 4.0)
+    assert of_its_group.wait(10.0).code == -signal.SIGKILL
+    of_its_group.close()
     for end in (hosting.Program.close, hosting.Program.end):
         program, processes = begin(tmp_path, "wait")
         assert program.wait(0.05) is None
@@ -251,14 +254,15 @@ def test_an_odometry_that_kills_its_group_costs_one_fault(mine, tmp_path):
 
 BUSY = """
 import os, time
-children = []
+running, run = os.pipe()
 for _ in range(2):
     if os.fork() == 0:
         held = bytearray(100_000_000)
         while time.process_time() < 0.3: pass
-        time.sleep(0.3)
+        time.sleep(0.6)
         os._exit(0)
-time.sleep(0.9)  # and waits for none of them
+os.close(run)
+os.read(running, 1)  # until both have ended; it takes no notice of how
 """
 
 

@@ -22,7 +22,7 @@ FAULTS = (
     "mirrored",
     "shape",
 )
-ELSEWHERE = ("init", "prepare", "start", "nothing")
+ELSEWHERE = ("init", "prepare", "start", "nothing", "hangs in init")
 """Faults that do not happen at the scan, and a registration that returns nothing."""
 n_instances = 0
 
@@ -44,6 +44,8 @@ class Faulty(Odometry):
         super().__init__(*args)
         n_instances += 1
         self.raise_in("init")
+        if self.settings.fault == "hangs in init":
+            time.sleep(60)
 
     def raise_in(self, where):
         if self.settings.fault == where:

