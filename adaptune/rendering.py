@@ -27,12 +27,30 @@ def render_inspection(inspection: Inspection) -> RenderableType:
         parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
     if inspection.reference is not None:
         parts.append(Text(f"reference: {_reference_text(inspection.reference)}"))
-    parts += [Text(f"! {problem}", style="yellow") for problem in inspection.problems]
-    for stage, lacking in inspection.missing.items():
-        state = f"lacks {' and '.join(lacking)}" if lacking else "has all it needs"
-        parts.append(Text(f"{stage}: {state}", style="red" if lacking else "green"))
+    parts.append(Text(_read_text(inspection)))
+    for fault in inspection.faults:
+        parts.append(Text(f"! {fault.text}", style="red" if fault.lacks else "yellow"))
+    parts += [_stage_text(inspection, stage) for stage in inspection.missing]
     parts.append(Text("\n" + inspection.entry))
     return Group(*parts)
+
+
+def _read_text(inspection: Inspection) -> str:
+    (read, clouds), total = inspection.n_read, inspection.n_messages
+    if inspection.complete:
+        return f"read: all {total:,}"
+    among = f" ({clouds:,} clouds)" if 0 < clouds < read else ""
+    what = "rates, gaps and problems are estimates; `--deep` reads all"
+    return f"read: a sample of {read:,} of {total:,} messages{among}: {what}"
+
+
+def _stage_text(inspection: Inspection, stage: str) -> Text:
+    if lacking := inspection.missing[stage]:
+        return Text(f"{stage}: lacks {' and '.join(lacking)}", style="red")
+    if inspection.doubts(stage):
+        return Text(f"{stage}: can run, but see the lines with ! above", style="yellow")
+    limit = "" if inspection.complete else ", as far as the sample shows"
+    return Text(f"{stage}: has all it needs{limit}", style="green")
 
 
 def _topic_table(inspection: Inspection) -> Table:

@@ -9,22 +9,27 @@ from typing import Annotated
 import typer
 
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import console, say
+from adaptune.terminal import console, progress, say
 
 
 def inspect(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A bag, or its folder.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="FILE", help="A bag, a folder, or a file of poses.", show_default=False
+        ),
     ],
     png: Annotated[
-        Path | None, typer.Option(help="Draw the first scan to this PNG.", dir_okay=False)
+        Path | None, typer.Option(help="Draw the first scan to this PNG or SVG.", dir_okay=False)
     ] = None,
+    deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study."""
     from adaptune.inspect import inspect as inspect_file
     from adaptune.rendering import render_inspection, write_inspection_png
 
-    found = inspect_file(file)
+    with progress() as show:
+        found = inspect_file(file, deep, show if deep else None)
     console.print(render_inspection(found))
     if png is not None:
         write_inspection_png(found, png)
