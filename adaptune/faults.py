@@ -102,7 +102,7 @@ def of_count(name: str, of: str, stamps: Parts, count: int) -> Iterator[Fault]:
     steps = steps[steps > 0]
     usual = np.median(steps) if len(steps) else np.inf
     # Only what comes regularly has a number to expect.
-    if len(steps) < 10 or np.mean(np.abs(steps - usual) < 0.2 * usual) < 0.9:
+    if len(steps) < 5 or np.mean(np.abs(steps - usual) < 0.2 * usual) < 0.9:
         return
     times = [stamp for part in stamps for stamp in part]
     expected = 1 + round((max(times) - min(times)) * 1e-9 / float(usual))
@@ -111,8 +111,10 @@ def of_count(name: str, of: str, stamps: Parts, count: int) -> Iterator[Fault]:
         yield Fault(f"{name}: {what}: gaps that the sample does not show, `--deep` finds them", of)
 
 
-def of_clouds(name: str, valid: Sequence[int]) -> Iterator[Fault]:
-    """Faults of clouds with so many valid points each."""
+def of_clouds(name: str, count: int, valid: Sequence[int]) -> Iterator[Fault]:
+    """Faults of a topic with so many clouds; those that were read have `valid` points each."""
+    if count == 1:
+        yield Fault(f"{name}: holds a single cloud: no motion", "points", "more than one cloud")
     n, few = len(valid), sum(1 for points in valid if points < LEAST_POINTS)
     if not few:
         return

@@ -135,7 +135,8 @@ def _inspect_bag(path: Path, found: Survey) -> Inspection:
     for topic in found.topics.values():
         of = next((key for key, name in used.items() if name == topic.name), "")
         problems += _topic_faults(topic, of, found.complete)
-    problems += faults.of_clouds(found.points or "", found.valid)
+    if found.points is not None:
+        problems += faults.of_clouds(found.points, found.topics[found.points].count, found.valid)
     layout, summary = (), None
     if found.first is not None:
         layout, count = _layout(found.first[1])
@@ -181,7 +182,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Show) -> Inspection:
         show("reading", done, number)
     problems = [
         *_topic_faults(reading, "points", complete=True),
-        *faults.of_clouds(str(path), valid),
+        *faults.of_clouds(str(path), len(frames), valid),
     ]
     try:
         reference = sequence.source.poses(None, None)

@@ -26,10 +26,10 @@ def render_inspection(inspection: Inspection) -> RenderableType:
     if inspection.scan is not None:
         parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
     if inspection.reference is not None:
-        parts.append(Text(f"reference: {_reference_text(inspection.reference)}"))
+        text = _reference_text(inspection.reference, inspection.complete)
+        parts.append(Text(f"reference: {text}"))
     parts.append(Text(_read_text(inspection)))
-    for fault in inspection.faults:
-        parts.append(Text(f"! {fault.text}", style="red" if fault.lacks else "yellow"))
+    parts += [Text(f"! {f.text}", "red" if f.lacks else "yellow") for f in inspection.faults]
     parts += [_stage_text(inspection, stage) for stage in inspection.missing]
     parts.append(Text("\n" + inspection.entry))
     return Group(*parts)
@@ -38,7 +38,7 @@ def render_inspection(inspection: Inspection) -> RenderableType:
 def _read_text(inspection: Inspection) -> str:
     (read, clouds), total = inspection.n_read, inspection.n_messages
     if inspection.complete:
-        return f"read: all {total:,}"
+        return f"read: all {total:,} messages"
     among = f" ({clouds:,} clouds)" if 0 < clouds < read else ""
     what = "rates, gaps and problems are estimates; `--deep` reads all"
     return f"read: a sample of {read:,} of {total:,} messages{among}: {what}"
@@ -98,10 +98,13 @@ def _scan_text(scan: ScanSummary) -> str:
     return ", ".join(words)
 
 
-def _reference_text(reference: Trajectory) -> str:
+def _reference_text(reference: Trajectory, complete: bool) -> str:
     length = np.linalg.norm(np.diff(reference.T_world_sensor[:, :3, 3], axis=0), axis=1).sum()
     seconds = (reference.stamps[-1] - reference.stamps[0]) * 1e-9
-    return f"{len(reference):,} poses, {length:.1f} m in {seconds:.1f} s"
+    words = "poses, " if complete else "poses in the sample, at least "
+    # Poses without stamps are numbered by nanoseconds.
+    lasted = f" in {seconds:.1f} s" if seconds > 1e-3 else ""
+    return f"{len(reference):,} {words}{length:.1f} m{lasted}"
 
 
 def write_inspection_png(inspection: Inspection, path: Path) -> None:

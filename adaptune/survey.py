@@ -1,13 +1,15 @@
 """Read what a bag holds: a sample of its messages, or all of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
 
 from adaptune import geometry
 from adaptune.faults import FARTHEST, Fault
@@ -29,11 +31,11 @@ Span = tuple[int | None, int | None]
 """Nanoseconds on the recorder's clock from which, and up to which, to read."""
 
 # A recording that takes no longer than this is read completely, and a sample takes about as long.
-_SECONDS = 1.0
+SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
 _SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
-# Parts of a sample, and the clouds in each; clouds where only the beginning can be read quickly.
-_FEWEST, _MOST, _CLOUDS, _FIRST_CLOUDS = 5, 20, 2.5, 50
+# Parts of a sample, and messages of a topic in each.
+_FEWEST, _MOST, _EACH = 5, 20, 2.5
 
 
 @dataclass
@@ -62,23 +64,13 @@ class Survey:
     points: str | None  # the topics that adaptune would use
     reference: str | None
     imu: str | None
-    parts: tuple[Span, ...] = ((None, None),)
+    complete: bool = True  # whether all messages were read
+    slack: float = 0.0  # seconds between two parts of the sample
     first: tuple[Scan, Any] | None = None  # the first scan, and its message
     valid: list[int] = field(default_factory=list)  # points of each cloud that are valid
     poses: list[Pose] = field(default_factory=list)
+    path: bytes = b""  # the last message, where each repeats all poses before
     faults: list[Fault] = field(default_factory=list)
-
-    @property
-    def complete(self) -> bool:
-        """Whether all messages were read."""
-        return self.parts == ((None, None),)
-
-    @property
-    def slack(self) -> float:
-        """Seconds between two parts of the sample; infinite if it is only the beginning."""
-        starts = [start for start, _ in self.parts if start is not None]
-        longest = max(np.diff(starts), default=np.inf)
-        return 0.0 if self.complete else float(longest) * 1e-9
 
     def trajectory(self) -> Trajectory | None:
         """The reference, as far as it was read; its faults are kept."""
@@ -103,9 +95,8 @@ def survey(path: Path, deep: bool, show: Show) -> Survey:
     source = _source(bag_paths([str(path)]))
     with source.open(by_index=True) as reader:
         found = _empty(reader)
-        found.parts = () if deep else _parts(reader, source.paths, found)
-        found.parts = found.parts or ((None, None),)
-        _read(_source(source.paths, found), reader, found, show)
+        number = 0 if deep else _number(reader, source.paths, found)
+        _read(_source(source.paths, found), reader, found, number, show)
     return found
 
 
@@ -135,25 +126,38 @@ def _empty(reader: AnyReader) -> Survey:
     return Survey(topics, most(POINTS_TYPES), most(poses), most(IMU_TYPES))
 
 
-def _parts(reader: AnyReader, paths: Items[Path], found: Survey) -> tuple[Span, ...]:
-    """Parts of a recording that is too long to be read completely; none if it is not."""
+def _number(reader: AnyReader, paths: Items[Path], found: Survey) -> int:
+    """Parts of a sample; 0 if the recording is short enough to be read completely."""
     size = sum(p.stat().st_size for path in paths for p in [path, *path.glob("*")] if p.is_file())
     try:
         slow = any(isinstance(r, IndexReader) and r.is_slow() for r in reader.readers)
     except Exception:  # damage, which reading reports
         slow = False
     speed, total = _SLOW if slow else _FAST, sum(t.count for t in found.topics.values())
-    begin, length = reader.start_time, reader.end_time - reader.start_time
-    if size / speed + total * _DECODE <= _SECONDS or length <= 0:
-        return ()
-    cloud = min(1 / max(found.topics[found.points].count if found.points else total, 1), 0.005)
-    if not _indexed(reader):
-        return ((begin, begin + round(_FIRST_CLOUDS * cloud * length)),)
-    width = _CLOUDS * cloud
+    length = reader.end_time - reader.start_time
+    if size / speed + total * _DECODE <= SECONDS or length <= 0:
+        return 0
     # Whole chunks are unpacked for each part.
-    number = int(np.clip(_SECONDS * speed / (size * width + min(size, 5e5)), _FEWEST, _MOST))
+    cost = size * min(_EACH / max(_usual(found), 1), 1.0) + min(size, 5e5)
+    return int(np.clip(SECONDS * speed / cost, _FEWEST, _MOST))
+
+
+def _usual(found: Survey) -> int:
+    """Number of clouds; where there are none, of messages."""
+    total = sum(topic.count for topic in found.topics.values())
+    return total if found.points is None else found.topics[found.points].count
+
+
+def _spans(reader: AnyReader, number: int, count: int) -> list[Span]:
+    """Parts of the recording in which a topic of so many messages has some each."""
+    begin, length = reader.start_time, reader.end_time - reader.start_time
+    if not number or number * _EACH >= count:
+        return [(None, None)]
+    if not _indexed(reader):
+        return [(begin, begin + round(length * number * _EACH / count))]
+    width = _EACH / count
     starts = begin + np.linspace(0.0, (1.0 - width) * length, number).astype(np.int64)
-    return tuple((start, start + round(width * length) + 1) for start in starts.tolist())
+    return [(start, start + round(width * length) + 1) for start in starts.tolist()]
 
 
 def _indexed(reader: AnyReader) -> bool:
@@ -163,29 +167,29 @@ def _indexed(reader: AnyReader) -> bool:
     return all(getattr(file, "chunks", True) for file in files)
 
 
-def _read(source: BagSource, reader: AnyReader, found: Survey, show: Show) -> None:
-    """Read the parts."""
-    takers = _takers(source, reader, found)
-    total, done, begin = sum(t.count for t in found.topics.values()), 0, reader.start_time
-    last_path: tuple[float, bytes] | None = None
-    for start, stop in found.parts:
-        for topic in found.topics.values():
+def _read(source: BagSource, reader: AnyReader, found: Survey, number: int, show: Show) -> None:
+    """Read so many parts, or everything if it is 0."""
+    takers, usual = _takers(source, reader, found), _usual(found)
+    total, done = sum(t.count for t in found.topics.values()), 0
+    spans = _spans(reader, number, usual)
+    found.complete = spans == [(None, None)]
+    if not found.complete:
+        length = (reader.end_time - reader.start_time) * 1e-9
+        found.slack = length / (len(spans) - 1) if len(spans) > 1 else np.inf
+    # What comes more rarely than the clouds has parts of its own.
+    rare = [t for t in takers if found.topics[t].count < usual and not found.complete]
+    jobs: list[tuple[str | None, Span]] = [(None, span) for span in spans]
+    jobs += [(t, span) for t in rare for span in _spans(reader, number, found.topics[t].count)]
+    for name, span in jobs:
+        names = [name] if name else [t for t in found.topics if t not in rare]
+        chosen = {t: found.topics[t] for t in names}
+        for topic in chosen.values():
             topic.stamps.append([])
             topic.recorded.append([])
         try:
-            span: Span = (start, stop) if _indexed(reader) else (None, None)
-            for connection, when, data in source.read(reader, None, span):
-                if stop is not None and when >= stop:
-                    break
-                topic, seconds = found.topics[connection.topic], (when - begin) * 1e-9
-                topic.recorded[-1].append(when)
-                stamp = header_stamp(data, reader.is2) if topic.stamped else None
-                if stamp is not None:
-                    topic.stamps[-1].append(stamp)
-                if topic.kind == PATH and topic.name == found.reference:
-                    last_path = seconds, data
-                elif topic.name in takers:
-                    _try(takers[topic.name], data, topic, seconds)
+            for connection, when, data in _messages(source, reader, name, span):
+                if (read := chosen.get(connection.topic)) is not None:
+                    _take(takers.get(read.name), read, when, data, reader)
                 done += 1
                 if done % 100 == 0:
                     show("reading", done, total)
@@ -193,16 +197,38 @@ def _read(source: BagSource, reader: AnyReader, found: Survey, show: Show) -> No
             lacks = "a recording that can be read to its end"
             if str(error) not in [fault.text for fault in found.faults]:
                 found.faults.append(Fault(str(error), "points", lacks))
-    if last_path is not None and found.reference is not None:
-        seconds, data = last_path
-        _try(takers[found.reference], data, found.topics[found.reference], seconds)
+    if found.path and found.reference is not None:
+        take = partial(_take_poses, PATH, reader, found)
+        _try(take, found.topics[found.reference], reader.end_time, found.path, reader)
     show("reading", total, total)
 
 
-def _try(take: Take, data: bytes, topic: Reading, seconds: float) -> None:
+def _messages(
+    source: BagSource, reader: AnyReader, topic: str | None, span: Span
+) -> Iterator[tuple[Connection, int, bytes]]:
+    for connection, when, data in source.read(
+        reader, topic, span if _indexed(reader) else (None, None)
+    ):
+        if span[1] is not None and when >= span[1]:
+            return
+        yield connection, when, data
+
+
+def _take(take: Take | None, topic: Reading, when: int, data: bytes, reader: AnyReader) -> None:
+    """Keep when a message was made and recorded, and decode it where it is used."""
+    topic.recorded[-1].append(when)
+    stamp = header_stamp(data, reader.is2) if topic.stamped else None
+    if stamp is not None:
+        topic.stamps[-1].append(stamp)
+    if take is not None:
+        _try(take, topic, when, data, reader)
+
+
+def _try(take: Take, topic: Reading, when: int, data: bytes, reader: AnyReader) -> None:
     try:
         take(data)
     except Exception as error:  # deserializers raise whatever damaged data leads them to
+        seconds = (when - reader.start_time) * 1e-9
         topic.undecoded.append((seconds, str(error) or type(error).__name__))
 
 
@@ -210,34 +236,39 @@ def _takers(source: BagSource, reader: AnyReader, found: Survey) -> dict[str, Ta
     """What decodes the messages of the topics that adaptune would use."""
     takers: dict[str, Take] = {}
     if found.points is not None:
-        kind = found.topics[found.points].kind
         try:
             source.check(None, None)
-            load = source.loader(reader)
+            takers[found.points] = partial(_take_cloud, source.loader(reader), reader, found)
         except SequenceError as error:
             found.faults.append(Fault(str(error), "points", "point clouds that can be read"))
-        else:
-            takers[found.points] = lambda data: _take_cloud(data, load, reader, kind, found)
     if found.reference is not None:
-        pose = found.topics[found.reference].kind
-        takers[found.reference] = lambda data: found.poses.extend(
-            POSES[pose](reader.deserialize(data, pose))
+        kind = found.topics[found.reference].kind
+        # Each path repeats the one before.
+        takers[found.reference] = (
+            partial(setattr, found, "path")
+            if kind == PATH
+            else partial(_take_poses, kind, reader, found)
         )
     if found.imu is not None:
-        takers[found.imu] = lambda data: _take_measurement(reader.deserialize(data, IMU_TYPES[0]))
+        takers[found.imu] = partial(_take_measurement, reader)
     return takers
 
 
 def _take_cloud(
-    data: bytes, load: Callable[[bytes, str], Scan], reader: AnyReader, kind: str, found: Survey
+    load: Callable[[bytes, str], Scan], reader: AnyReader, found: Survey, data: bytes
 ) -> None:
-    scan = load(data, "a message")
+    scan = load(data, "message")
     found.valid.append(n_valid(scan))
-    if found.first is None:
-        found.first = scan, reader.deserialize(data, kind)
+    if found.first is None and found.points is not None:
+        found.first = scan, reader.deserialize(data, found.topics[found.points].kind)
 
 
-def _take_measurement(message: Any) -> None:
+def _take_poses(kind: str, reader: AnyReader, found: Survey, data: bytes) -> None:
+    found.poses += POSES[kind](reader.deserialize(data, kind))
+
+
+def _take_measurement(reader: AnyReader, data: bytes) -> None:
+    message: Any = reader.deserialize(data, IMU_TYPES[0])
     w, a = message.angular_velocity, message.linear_acceleration
     if not np.isfinite([w.x, w.y, w.z, a.x, a.y, a.z]).all():
         raise SequenceError("a measurement is not finite")

@@ -78,7 +78,9 @@ class IndexReader(Reader):
         assert self.bio is not None
         indexes: dict[int, list[IndexData]] = defaultdict(list)
         for info in self.chunk_infos:
-            if (start is None or info.end_time > start) and (stop is None or info.start_time < stop):
+            if (start is None or info.end_time > start) and (
+                stop is None or info.start_time < stop
+            ):
                 self.bio.seek(info.pos)
                 self.chunks[info.pos] = super().read_chunk()
                 for _ in info.connection_counts:
