@@ -260,8 +260,11 @@ def _topic_faults(topic: Reading, of: str, complete: bool) -> Iterator[Fault]:
         what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
         yield Fault(f"{topic.name}: {what}; {help_}", of, lacks)
     if of and topic.count and not topic.n_read:
-        what = f"none of its {topic.count} messages is in the sample"
-        yield Fault(f"{topic.name}: {what}, `--deep` reads them", of)
+        if complete:
+            what, lacks = "are listed but cannot be found: repair the bag", _UNDECODED[of][1]
+        else:
+            what, lacks = "are not in the sample, `--deep` reads them", ""
+        yield Fault(f"{topic.name}: its {topic.count} messages {what}", of, lacks)
     if any(topic.stamps):
         yield from faults.of_stamps(topic.name, of, topic.stamps, topic.recorded)
         if not complete:

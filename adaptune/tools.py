@@ -26,13 +26,16 @@ def inspect(
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study."""
     from adaptune.inspect import inspect as inspect_file
-    from adaptune.rendering import render_inspection, write_inspection_png
+    from adaptune.rendering import draw_inspection, render_inspection
 
-    with progress() as show:
-        found = inspect_file(file, deep, show if deep else None)
+    if deep:
+        with progress() as show:
+            found = inspect_file(file, deep, show)
+    else:
+        found = inspect_file(file)
     console.print(render_inspection(found))
     if png is not None:
-        write_inspection_png(found, png)
+        draw_inspection(found, png)
         say(f"First scan: {png}")
 
 

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 from rich.console import Console
-
 from rosbags.highlevel import AnyReader
 from small_bag import START, cloud, drive, pose, write
 
 from adaptune import survey, yaml
 from adaptune.inspect import Inspection, inspect
-from adaptune.rendering import render_inspection, write_inspection_png
+from adaptune.rendering import draw_inspection, render_inspection
 from adaptune.sequence import SequenceConfig, SequenceError
 from adaptune.sequence.opening import open_sequence
 from offline.offline_study import load_study
@@ -257,7 +256,7 @@ def test_poses_between_the_parts_of_a_sample_are_no_claim(tmp_path: Path) -> Non
     messages = [("/points", t, cloud(t)) for t in range(START, START + 40 * 10**9, 10**8)]
     messages += [("/poses", t, pose(t, x)) for t, x in poses]
     inspection = inspect(write(tmp_path / "a.bag", sorted(messages, key=lambda m: m[1])))
-    expected = "/poses: none of its 400 messages is in the sample, `--deep` reads them"
+    expected = "/poses: its 400 messages are not in the sample, `--deep` reads them"
     assert texts(inspection) == [expected]
     assert inspection.missing["offline"] == ()
     assert "offline: can run, but see" in inspection_text(inspection)
@@ -278,7 +277,7 @@ def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     assert inspection.missing["online"] == ("point clouds that can be read",)
     assert inspection.scan is None
     with pytest.raises(SequenceError, match="no scan can be drawn"):
-        write_inspection_png(inspection, tmp_path / "a.png")
+        draw_inspection(inspection, tmp_path / "a.png")
     inspection_text(inspection)
 
 
@@ -288,6 +287,38 @@ def test_a_cloud_that_cannot_be_decoded_is_a_problem_not_a_crash(tmp_path: Path)
     inspection = inspect(write(tmp_path / "a.bag", [("/points", START, broken)]))
     assert inspection.scan is None
     assert any("no field z; there is x, y" in text for text in texts(inspection))
+
+
+def test_a_file_of_a_folder_that_cannot_be_read_is_reported(tmp_path: Path) -> None:
+    for i in range(100):
+        np.save(tmp_path / f"{i}.npy", np.full((30, 3), i + 1.0, np.float32))
+    assert inspect(tmp_path).faults == ()
+    assert "sample of 40 of 100" in inspection_text(inspect(tmp_path), width=1000)
+    (tmp_path / "99.npy").write_bytes(b"no array")
+    np.save(tmp_path / "50.npy", np.zeros((30, 3), np.float32))
+    inspection = inspect(tmp_path, deep=True)
+    assert inspection.n_read == (100, 100)
+    assert inspection.missing["online"] == ("point clouds that decode",)
+    undecoded, empty = texts(inspection)
+    assert "1 of 100 messages do not decode, the first at 9.9 s" in undecoded
+    assert "99.npy: cannot be read as a scan" in undecoded
+    assert "1 of 99 clouds hold fewer than 20 valid points" in empty
+
+
+def test_the_poses_of_a_kitti_folder_are_inspected(tmp_path: Path) -> None:
+    (tmp_path / "velodyne").mkdir()
+    for i in range(20):
+        np.full((30, 4), i + 1.0, "<f4").tofile(tmp_path / f"velodyne/{i:06}.bin")
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * i}\n" for i in range(20)))
+    (tmp_path / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (tmp_path / "poses.txt").write_text(KITTI)
+    inspection = inspect(tmp_path)
+    assert inspection.faults == ()
+    assert not inspection.missing["offline"]
+    ((_, config),) = entry(inspection).items()
+    assert config.kitti == str(tmp_path)
+    (tmp_path / "poses.txt").write_text(KITTI.splitlines()[0] + "\n")
+    assert inspect(tmp_path).missing["offline"] == ("a reference trajectory",)
 
 
 def test_files_that_are_no_recording_are_refused(tmp_path: Path) -> None:
