@@ -92,8 +92,8 @@ def _clocks(
 
 def inner_steps(stamps: Parts) -> NDArray[np.float64]:
     """Seconds from each message to the next one of its part."""
-    steps = [np.diff(np.array(part, np.int64)) for part in stamps if len(part) > 1]
-    return np.concatenate(steps) * 1e-9 if steps else np.empty(0)
+    steps = [np.diff(np.array(part, np.int64)) * 1e-9 for part in stamps if len(part) > 1]
+    return np.concatenate([np.empty(0), *steps])
 
 
 def of_count(name: str, of: str, stamps: Parts, count: int) -> Iterator[Fault]:

@@ -12,6 +12,7 @@ from adaptune import faults, yaml
 from adaptune.errors import AdaptuneError
 from adaptune.faults import Fault, Parts
 from adaptune.sequence import Scan, SequenceConfig, SequenceError
+from adaptune.sequence.bag_files import SUFFIXES as BAG_SUFFIXES
 from adaptune.sequence.config import REFERENCE_FILES
 from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.pointcloud2 import DATATYPES
@@ -121,8 +122,9 @@ def _kind(path: Path) -> str:
         return "bag"
     if any((path / name).is_dir() for name in _KITTI_FOLDERS):
         return "kitti"
-    suffixes = {p.suffix for p in path.iterdir()}
-    return "bag" if suffixes & {".bag", ".mcap", ".db3"} else "folder"
+    # Files of a ROS 2 folder may be compressed, and then have other suffixes.
+    bags = {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES}
+    return "bag" if bags or (path / "metadata.yaml").exists() else "folder"
 
 
 def _inspect_bag(path: Path, found: Survey) -> Inspection:
@@ -137,7 +139,8 @@ def _inspect_bag(path: Path, found: Survey) -> Inspection:
         problems += _topic_faults(topic, of, found.complete)
     if found.points is not None:
         problems += faults.of_clouds(found.points, found.topics[found.points].count, found.valid)
-    layout, summary = (), None
+    layout: Layout = ()
+    summary = None
     if found.first is not None:
         layout, count = _layout(found.first[1])
         summary = _summary(found.first[0], count)

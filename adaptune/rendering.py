@@ -123,7 +123,7 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
     figure = Figure(figsize=(9, 12), layout="constrained")
     above, side = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
-    for axes, j, title in ((above, 1, "from above"), (side, 2, "from the side")):
+    for axes, j, title in ((above, 1, "from above"), (side, 2, "from the side, z not to scale")):
         order = np.argsort(points[:, 2])
         x, y, z = points[order, 0], points[order, j], points[order, 2]
         # As a picture inside an SVG: it would have tens of thousands of shapes.
