@@ -1,9 +1,11 @@
 import os
+import struct
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import fuzz
+import numpy as np
 import pytest
 from inspected import entry, inspection_text, texts
 from small_bag import START, bad_cloud, cloud, pose, write
@@ -118,6 +120,42 @@ def test_bags_of_every_format_are_sampled(tmp_path: Path) -> None:
         assert points.rate == pytest.approx(10)
         assert inspection.missing["online"] == ()
         assert len(list(open_sequence(*entry(inspection).values()))) == 60
+
+
+def without_chunks(path: Path, clouds: int) -> Path:
+    """An mcap file as `ros2 bag record --storage-preset-profile fastwrite` leaves it."""
+    made, rng = fuzz.stores()[True], np.random.default_rng(0)
+    definition, _ = made.typestore.generate_msgdef(fuzz.CLOUD, ros_version=2)
+
+    def text(given: str) -> bytes:
+        return struct.pack("<I", len(given)) + given.encode()
+
+    def record(op: int, *parts: bytes) -> bytes:
+        body = b"".join(parts)
+        return struct.pack("<BQ", op, len(body)) + body
+
+    schema = (struct.pack("<H", 1), text(fuzz.CLOUD), text("ros2msg"), text(definition))
+    channel = (struct.pack("<HH", 1, 1), text("/points"), text("cdr"), bytes(4))
+    parts = [record(1, text("ros2"), text("")), record(3, *schema), record(4, *channel)]
+    for i in range(clouds):
+        t = START + i * 10**8
+        data = made.typestore.serialize_cdr(fuzz.message(made, "plain", t, rng), fuzz.CLOUD)
+        parts.append(record(5, struct.pack("<HIQQ", 1, i, t, t), bytes(data)))
+    magic = b"\x89MCAP0\r\n"
+    path.write_bytes(magic + b"".join(parts) + record(2, bytes(20)) + magic)
+    return path
+
+
+@pytest.mark.usefixtures("sampled")
+def test_the_sample_of_an_mcap_file_without_chunks_is_its_beginning(tmp_path: Path) -> None:
+    bag = without_chunks(tmp_path / "a.mcap", 200)
+    inspection = inspect(bag)
+    assert inspection.n_read == (13, 13)
+    (topic,) = inspection.topics
+    assert topic.count == 200
+    assert (topic.first, topic.last) == (START, START + 12 * 10**8)
+    assert texts(inspection) == []
+    assert inspect(bag, deep=True).n_read == (200, 200)
 
 
 @pytest.mark.parametrize(
