@@ -60,6 +60,7 @@ class Inspection:
 
     path: Path
     topics: tuple[Topic, ...]
+    complete: bool  # whether it was read to its end or damage, and not only a sample of it
     n_read: tuple[int, int]  # messages that were read, and clouds among them
     layout: Layout  # of the first cloud
     scan: ScanSummary | None  # none where no scan could be read
@@ -73,11 +74,6 @@ class Inspection:
     def n_messages(self) -> int:
         """How many messages, scans or poses there are."""
         return sum(topic.count for topic in self.topics)
-
-    @property
-    def complete(self) -> bool:
-        """Whether all were read."""
-        return self.n_read[0] >= self.n_messages
 
     def doubts(self, stage: str) -> bool:
         """Whether a fault concerns a stage that can run."""
@@ -153,6 +149,7 @@ def _inspect_bag(path: Path, found: Survey) -> Inspection:
     return Inspection(
         path,
         topics=tuple(_topic(reading) for reading in readings),
+        complete=found.complete,
         n_read=(sum(reading.n_read for reading in readings), len(found.valid)),
         layout=layout,
         scan=summary,
@@ -197,6 +194,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Show) -> Inspection:
     return Inspection(
         path,
         topics=(_topic(reading),),
+        complete=number == len(frames),
         n_read=(number, number),
         layout=(),
         scan=summary,
@@ -220,6 +218,7 @@ def _inspect_poses(path: Path) -> Inspection:
     return Inspection(
         path,
         topics=(topic,),
+        complete=True,
         n_read=(len(reference), 0),
         layout=(),
         scan=None,

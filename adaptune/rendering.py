@@ -39,7 +39,7 @@ def render_inspection(inspection: Inspection) -> RenderableType:
 def _read_text(inspection: Inspection) -> str:
     (read, clouds), total = inspection.n_read, inspection.n_messages
     if inspection.complete:
-        return f"read: all {total:,} messages"
+        return f"read: {'all' if read >= total else f'{read:,} of'} {total:,} messages"
     among = f" ({clouds:,} clouds)" if 0 < clouds < read else ""
     what = "rates, gaps and problems are estimates; `--deep` reads all"
     return f"read: a sample of {read:,} of {total:,} messages{among}: {what}"

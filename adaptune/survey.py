@@ -17,7 +17,7 @@ from adaptune.sequence import Scan, SequenceError
 from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, BagSource
 from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.bag_index import IndexReader
-from adaptune.sequence.pose_messages import PATH, POSES, TRANSFORMS, Pose, of_frame, usable
+from adaptune.sequence.pose_messages import PATH, POSES, Pose, usable
 from adaptune.sequence.serialized import header_stamp
 from adaptune.trajectory import Trajectory
 
@@ -76,17 +76,12 @@ class Survey:
         """The reference, as far as it was read; its faults are kept."""
         if self.reference is None or not self.poses:
             return None
-        try:
-            if self.topics[self.reference].kind in TRANSFORMS:
-                of_frame(self.reference, self.poses, None)
-            found, unusable = usable(self.poses)
-        except SequenceError as error:
-            self.faults.append(Fault(str(error), "reference", "a reference trajectory"))
-            return None
+        found, unusable = usable(self.poses)
         if unusable:
             what = f"{unusable} of {len(self.poses)} poses are not finite or have no rotation"
-            help_ = "adaptune leaves them out"
-            self.faults.append(Fault(f"{self.reference}: {what}; {help_}", "reference"))
+            lacks = "a reference trajectory" if found is None else ""
+            text = f"{self.reference}: {what}: adaptune leaves them out"
+            self.faults.append(Fault(text, "reference", lacks))
         return found
 
 
@@ -206,9 +201,8 @@ def _read(source: BagSource, reader: AnyReader, found: Survey, number: int, show
 def _messages(
     source: BagSource, reader: AnyReader, topic: str | None, span: Span
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    for connection, when, data in source.read(
-        reader, topic, span if _indexed(reader) else (None, None)
-    ):
+    asked: Span = span if _indexed(reader) else (None, None)
+    for connection, when, data in source.read(reader, topic, asked):
         if span[1] is not None and when >= span[1]:
             return
         yield connection, when, data
@@ -243,12 +237,9 @@ def _takers(source: BagSource, reader: AnyReader, found: Survey) -> dict[str, Ta
             found.faults.append(Fault(str(error), "points", "point clouds that can be read"))
     if found.reference is not None:
         kind = found.topics[found.reference].kind
-        # Each path repeats the one before.
-        takers[found.reference] = (
-            partial(setattr, found, "path")
-            if kind == PATH
-            else partial(_take_poses, kind, reader, found)
-        )
+        poses = partial(_take_poses, kind, reader, found)
+        # Each path repeats the one before: the last one will do.
+        takers[found.reference] = partial(setattr, found, "path") if kind == PATH else poses
     if found.imu is not None:
         takers[found.imu] = partial(_take_measurement, reader)
     return takers

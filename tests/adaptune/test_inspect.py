@@ -1,10 +1,11 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from inspected import entry, inspection_text, texts
 from rosbags.highlevel import AnyReader
-from small_bag import START, bad_cloud, cloud, drive, pose, write
+from small_bag import START, STORE, bad_cloud, cloud, drive, header, pose, write
 from typer.testing import CliRunner
 
 from adaptune import yaml
@@ -132,6 +133,54 @@ def test_messages_that_do_not_decode_are_reported(tmp_path: Path) -> None:
     assert inspection.missing["online"] == ("point clouds that decode",)
     ((_, config),) = entry(inspection).items()
     assert len(list(open_sequence(config.model_copy(update={"stop": 0.3})))) == 3
+
+
+def test_a_bag_that_is_damaged_in_the_middle_says_so(tmp_path: Path) -> None:
+    bag = drive(tmp_path / "a.bag", [0.1 * i for i in range(5)], [])
+    data = bag.read_bytes()
+    at = [i for i in range(len(data)) if data.startswith(b"op=\x02", i)][3]
+    bag.write_bytes(data[:at] + b"op=\x09" + data[at + 4 :])
+    inspection = inspect(bag, deep=True)
+    assert "the rest cannot be read" in " ".join(texts(inspection))
+    assert inspection.missing["online"] == ("a recording that can be read to its end",)
+    text = inspection_text(inspection)
+    assert "read: 3 of 5 messages" in text
+    assert "--deep" not in text
+
+
+def test_poses_that_are_not_finite_are_counted(tmp_path: Path) -> None:
+    bag = drive(tmp_path / "a.bag", [0, 0.1], [(0, 0), (0.05, np.nan), (0.1, 30)])
+    assert "/poses: 1 of 3 poses are not finite" in " ".join(texts(inspect(bag)))
+    bag = drive(tmp_path / "b.bag", [0, 0.1], [(0, np.nan), (0.1, np.nan)])
+    assert inspect(bag).missing["offline"] == ("a reference trajectory",)
+
+
+def test_the_last_path_is_the_reference(tmp_path: Path) -> None:
+    messages: list[Any] = []
+    for i in range(5):
+        t = START + i * 10**8
+        poses = [pose(START + j * 10**8, 8.0 * j) for j in range(i + 1)]
+        path = STORE.types["nav_msgs/msg/Path"](header(t), poses)
+        messages += [("/points", t, cloud(t)), ("/path", t, path)]
+    inspection = inspect(write(tmp_path / "a.bag", messages))
+    assert inspection.faults == ()
+    assert inspection.reference is not None
+    assert len(inspection.reference) == 5
+
+
+def test_an_imu_that_is_not_finite_is_reported(tmp_path: Path) -> None:
+    types = STORE.types
+    q, none = types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1), np.zeros(9)
+    messages: list[Any] = [("/points", t, cloud(t)) for t in (START, START + 10**8)]
+    for z in (9.81, np.nan):
+        v = types["geometry_msgs/msg/Vector3"](0, 0, z)
+        imu = types["sensor_msgs/msg/Imu"](header(START), q, none, v, none, v, none)
+        messages.append(("/imu", START, imu))
+    inspection = inspect(write(tmp_path / "a.bag", messages))
+    assert "/imu: 1 of 2 messages do not decode" in " ".join(texts(inspection))
+    text = inspection_text(inspection, width=1000)
+    assert "online: has all it needs" in text
+    assert "motion compensation: can run, but see" in text
 
 
 def test_poses_that_do_not_decode_are_reported(tmp_path: Path) -> None:

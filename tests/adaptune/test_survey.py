@@ -1,5 +1,7 @@
 import os
+import runpy
 import struct
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -156,6 +158,21 @@ def test_the_sample_of_an_mcap_file_without_chunks_is_its_beginning(tmp_path: Pa
     assert (topic.first, topic.last) == (START, START + 12 * 10**8)
     assert texts(inspection) == []
     assert inspect(bag, deep=True).n_read == (200, 200)
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_a_large_bag_is_inspected_by_its_index(tmp_path: Path, name: str) -> None:
+    # The benchmark has ten times as many chunks.
+    file = Path(__file__).parents[2] / "benchmarks/inspecting.py"
+    written = runpy.run_path(str(file))["write_mcap" if name == "a.mcap" else "write_ros1"]
+    written(tmp_path / name, 10_000, 800_000)
+    assert (tmp_path / name).stat().st_size > 8e9
+    begin = time.process_time()
+    inspection = inspect(tmp_path / name)
+    assert time.process_time() - begin < 3.0
+    assert inspection.n_messages == 120_000
+    assert inspection.n_read[0] < 1000
+    assert texts(inspection) == []
 
 
 @pytest.mark.parametrize(
