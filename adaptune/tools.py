@@ -10,7 +10,7 @@ import typer
 
 from adaptune.errors import AdaptuneError
 from adaptune.next_command import say_next
-from adaptune.terminal import begin_work, console, say
+from adaptune.terminal import begin_work, console, progress, say
 
 if TYPE_CHECKING:
     from adaptune.inspect import Inspection
@@ -18,21 +18,29 @@ if TYPE_CHECKING:
 
 def inspect(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A bag, or its folder.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="FILE", help="A bag, a folder, or a file of poses.", show_default=False
+        ),
     ],
     png: Annotated[
-        Path | None, typer.Option(help="Draw the first scan to this PNG.", dir_okay=False)
+        Path | None, typer.Option(help="Draw the first scan to this PNG or SVG.", dir_okay=False)
     ] = None,
+    deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study."""
     from adaptune.inspect import inspect as inspect_file
-    from adaptune.rendering import render_inspection, write_inspection_png
+    from adaptune.rendering import draw_inspection, render_inspection
 
     begin_work()
-    found = inspect_file(file)
+    if deep:
+        with progress() as show:
+            found = inspect_file(file, deep, show)
+    else:
+        found = inspect_file(file)
     console.print(render_inspection(found))
     if png is not None:
-        write_inspection_png(found, png)
+        draw_inspection(found, png)
         say(f"First scan: {png}")
     _begin_study(found)
 

@@ -26,6 +26,7 @@ SLOW = [
     "adaptune/odometry/test_gicp.py",
     "offline/test_full.py",
     "adaptune/odometry/test_protocol.py",
+    "adaptune/test_survey.py",
     "adaptune/test_inspect.py",
     "offline/test_resume.py",
     "adaptune/odometry/test_command.py",

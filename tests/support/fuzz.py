@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import drives
 import numpy as np
@@ -25,6 +26,8 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import get_types_from_msg
 
 from adaptune.errors import AdaptuneError
+from adaptune.inspect import inspect
+from adaptune.rendering import render_inspection
 from adaptune.sequence import Scan, SequenceConfig, livox, pointcloud2
 from adaptune.sequence.export import Messages
 from adaptune.sequence.opening import open_sequence
@@ -174,7 +177,7 @@ def fuzz_messages(number: int, seed: int) -> Counter[str]:
     return counts
 
 
-def bags(folder: Path, scans: int = 4) -> list[Path]:
+def bags(folder: Path, scans: int = 16) -> list[Path]:
     """Bags of every format and compression; of ROS 2, the files themselves and their folders."""
     made = []
     rng = np.random.default_rng(0)
@@ -261,8 +264,9 @@ def _writer(path: Path, cdr: bool, option: Any) -> Any:
     return folder
 
 
+@patch("adaptune.survey.SECONDS", 0.0)
 def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
-    """Read so many damaged bags, and count what became of them."""
+    """Read so many damaged bags, and count what became of them; inspect samples of half of them."""
     rng = np.random.default_rng(seed)
     sound = bags(folder)
     counts: Counter[str] = Counter()
@@ -288,6 +292,8 @@ def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
                     counts["scans"] += 1
                 except AdaptuneError:
                     counts["errors"] += 1
+                with contextlib.suppress(AdaptuneError):
+                    render_inspection(inspect(path, deep=i // len(sound) % 2 == 0))
         finally:
             hit.write_bytes(whole)
     return counts
