@@ -61,7 +61,7 @@ def cap() -> int:
 def key(paths: Sequence[Path], settings: Any) -> str:
     """Digest of files and settings; an OSError if a file cannot be read.
 
-    A file counts by its size, its time of change, its beginning and its end, not by its name. A
+    A file counts by its size, its times of change, its beginning and its end, not by its name. A
     folder counts by its files.
     """
     digest = hashlib.blake2b(f"{_VERSION} {settings!r}".encode(), digest_size=16)
@@ -69,7 +69,8 @@ def key(paths: Sequence[Path], settings: Any) -> str:
         files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
         for file in files:
             status = file.stat()
-            digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
+            times = f"{status.st_mtime_ns} {status.st_ctime_ns}"
+            digest.update(f"{status.st_size} {times}".encode())
             with file.open("rb") as stream:
                 digest.update(stream.read(_SAMPLE))
                 stream.seek(max(status.st_size - _SAMPLE, 0))
