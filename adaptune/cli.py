@@ -143,6 +143,9 @@ def offline(
             show_default="processes of this machine",
         ),
     ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Compute again what depends on what has changed.")
+    ] = False,
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
@@ -156,7 +159,7 @@ def offline(
 
     say(f"Seed {loaded.config.offline.seed}.")
     with progress() as show:
-        training = train(loaded, show, cluster)
+        training = train(loaded, show, cluster, again)
     model = training.model
     console.print(
         report.table(

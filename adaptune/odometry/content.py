@@ -83,8 +83,6 @@ def module_file(name: str) -> Path | None:
 
 def _program(settings: Any) -> Content:
     found: Content = {}
-    if settings.version is not None:
-        found["settings.version"] = settings.version
     program, *arguments = settings.command or ("",)
     for name in (shutil.which(program), *arguments, getattr(settings, "template", None)):
         # Arguments may be anything, also too long for a path.

@@ -1,6 +1,5 @@
 """A study: a checked configuration, and what is made of it."""
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -141,9 +140,10 @@ class Study(Generic[C_co]):
         }
 
     def check(self) -> None:
-        """Refuse a folder that was begun with another study.
+        """Refuse a folder that was begun with other settings of the offline stage.
 
-        The budget, the number of workers, the test sequences and the replays may change.
+        The budget, the number of workers, the sequences and the replays may change. What results
+        depend on is compared by `adaptune.study.inputs`.
 
         Raises
         ------
@@ -165,15 +165,11 @@ class Study(Generic[C_co]):
         open_folder(self.folder, self._resolved())
 
     def _resolved(self) -> dict[str, Any]:
-        """The configuration with nothing left to defaults, and the sizes of its recordings."""
+        """The configuration with nothing left to defaults."""
         resolved, settings = self.config.resolved(), self.odometry.settings
         resolved["odometry"]["settings"] = settings.model_dump(mode="json")
         resolved["odometry"]["parameters"] = self.odometry.space.dump()
-        if template := getattr(settings, "template", None):
-            text = Path(template).read_bytes()
-            resolved["odometry"]["template"] = hashlib.sha256(text).hexdigest()[:16]
-        sizes = {name: self.sequences.recording_size(name) for name in self.config.training}
-        return resolved | {"recordings": sizes}
+        return resolved
 
 
 def odometry_settings(config: OdometryConfig) -> Any:
