@@ -245,7 +245,9 @@ class Archive:
             text = path.read_text("utf-8") if path.exists() else "{}"
             slots = {str(name): int(slot) for name, slot in json.loads(text).items()}
         except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise ArchiveError(f"{path}: is damaged ({error}); give the study another folder") from error
+            raise ArchiveError(
+                f"{path}: is damaged ({error}); give the study another folder"
+            ) from error
         for name in (new := [name for name in names if name not in slots]):
             slots[name] = max(slots.values(), default=0) + 1
         if new:

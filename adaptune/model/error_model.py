@@ -209,8 +209,10 @@ class ErrorModel:
             return named if named in self.sets else None
         return self.sets.find(named)
 
-    def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
-        """Refuse a model of another odometry or of other parameters.
+    def check_study(
+        self, odometry: dict[str, Any], space: ParameterSpace, length: float, path: Path
+    ) -> None:
+        """Refuse a model of another odometry, of other parameters, or of other sub-trajectories.
 
         Parameters
         ----------
@@ -218,6 +220,8 @@ class ErrorModel:
             Its name and settings.
         space
             The parameters.
+        length
+            Metres of a sub-trajectory.
         path
             Where the model is from.
 
@@ -234,6 +238,11 @@ class ErrorModel:
             raise ModelError(
                 f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
                 f"offline` for this study"
+            )
+        if self.length != length:
+            raise ModelError(
+                f"{path}: is a model of errors over {self.length:g} m, the study's sub_trajectory "
+                f"is {length:g} m; run `adaptune offline` for this study"
             )
 
     def is_foreign(self, elevation: float) -> bool:

@@ -1,6 +1,7 @@
 """A study: a checked configuration, and what is made of it."""
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing_extensions import TypeVar
 
 from adaptune.cores import available
 from adaptune.odometry.base import Description, WarmUp
+from adaptune.odometry.content import odometry_content
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.registry import odometry_class
 from adaptune.sequence.names import OF_VIEW
@@ -22,6 +24,8 @@ from adaptune.study.run_folder import check_folder, open_folder
 from adaptune.study.sequences import StudySequences
 
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
+
+_log = logging.getLogger(__name__)
 
 Mechanism = Literal["live", "hand_over", "bank"]
 
@@ -121,6 +125,11 @@ class Study(Generic[C_co]):
                     f"{path}: was written by an older adaptune; run `adaptune switching` again"
                 )
             if measured["of"] != self.switching_identity():
+                _log.warning(
+                    "%s: was measured with another odometry, warm-up or recording; a switch counts "
+                    "as free until you run `adaptune switching` again",
+                    path,
+                )
                 return 0.0
             return max(0.0, float(measured["switch_cost"]))
         except FileNotFoundError:
@@ -135,9 +144,14 @@ class Study(Generic[C_co]):
         return {
             "odometry": self.odometry.name,
             "settings": self.odometry.settings.model_dump(mode="json"),
+            "content": odometry_content(self.odometry.name, self.odometry.settings),
+            "sequences": {name: self._measured_on(name) for name in self.config.training},
             "mechanism": self.mechanism,
             "warm_up": self.warm_up._asdict(),
         }
+
+    def _measured_on(self, name: str) -> dict[str, Any]:
+        return self.sequences.identity(name) | self.sequences.reference(name)
 
     def check(self) -> None:
         """Refuse a folder that was begun with other settings of the offline stage.

@@ -83,7 +83,9 @@ def test_only_what_depends_on_another_recording_is_computed_again(trained, tmp_p
     drives.write_bag(tmp_path / "new.bag", drives.scans(7, 40))
     (tmp_path / "new.bag").replace(tmp_path / "one.bag")
     study = load(tmp_path)
-    with pytest.raises(ConfigurationError, match=r"one\.bag has other content .* 4 trials on one, "):
+    with pytest.raises(
+        ConfigurationError, match=r"one\.bag has other content .* 4 trials on one, "
+    ):
         train(study)
     assert mtimes(trials) == written
     found = train(study, again=True).model

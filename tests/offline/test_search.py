@@ -81,7 +81,9 @@ def test_every_number_is_of_one_search(study_of, kind):
     stages = stages_of(study)
     searches = [search for stage in stages for search in stage.searches]
     assert len(searches) == {"shared": 1, "own": 3, "both": 4}[kind]
-    assert len({search.number(i) for search in searches for i in range(1, 20)}) == 19 * len(searches)
+    assert len({search.number(i) for search in searches for i in range(1, 20)}) == 19 * len(
+        searches
+    )
     slots = Archive(study.folder / "trials").slots()
     for search in searches:
         assert search.number(0) == 0
@@ -115,13 +117,7 @@ def test_each_sequence_searches_for_itself(study_of):
     assert means[fixed] < means[0]
     # The searches differ from each other, in their initial points too.
     assert (
-        len(
-            {
-                str(archive.finished(owner_of(archive, n))[n].parameters)
-                for n in numbers[1:]
-            }
-        )
-        == 30
+        len({str(archive.finished(owner_of(archive, n))[n].parameters) for n in numbers[1:]}) == 30
     )
 
 
