@@ -1,6 +1,7 @@
 """Searches for parameter sets: one over all training sequences, one for each, or both."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,8 @@ class Search:
 
     def __init__(
         self,
-        sampler: Sampler,
+        sampler: Callable[[], Sampler],
+        config: OfflineConfig,
         sequences: Sequence[str],
         finished: Finished,
         known: Mapping[int, ParameterSet],
@@ -54,13 +56,17 @@ class Search:
         self.numbers: list[int] = []
         self.order = self.sequences
         self.end: str | None = None
-        self._sampler = sampler
-        self._config = sampler.config
-        self._limit = max_trials(sampler.config)
+        self._make_sampler, self._config = sampler, config
+        self._limit = max_trials(config)
         self._finished = finished
         self._known, self._slot = known, slot
         self._alive: list[int] = []
         self._sets: dict[int, ParameterSet] = {}
+
+    @cached_property
+    def _sampler(self) -> Sampler:
+        # Where nothing is to be proposed, it is not needed, and takes long to import.
+        return self._make_sampler()
 
     def number(self, i: int) -> int:
         """Trial number in the study of trial `i` of this search."""
@@ -196,15 +202,15 @@ def make_stages(
     finished, known = {name: archive.finished(name) for name in names}, archive.sets()
     stages = []
     if config.sets != "own":
-        shared = Search(make_sampler(space, config), names, finished, known)
+        shared = Search(partial(make_sampler, space, config), config, names, finished, known)
         stages.append(Stage([shared], alone=False))
     if config.sets != "shared":
         slots, own = archive.slots(names), []
         for name in names:
             seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
             seed = {"seed": int(seeds.generate_state(1)[0])}
-            sampler = make_sampler(space, config.model_copy(update=seed))
-            own.append(Search(sampler, [name], finished, known, slots[name]))
+            sampler = partial(make_sampler, space, config.model_copy(update=seed))
+            own.append(Search(sampler, config, [name], finished, known, slots[name]))
         stages.append(Stage(own, alone=True))
     return stages
 

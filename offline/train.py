@@ -28,8 +28,6 @@ from offline.budget import BUDGETS
 from offline.campaign import Progress, run_batches, run_tasks
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
-from offline.fit import fit, tuned
-from offline.labelled import labelled_data
 from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
 from offline.offline_study import OfflineStudy
 from offline.search import Finished
@@ -184,6 +182,10 @@ def _fit(
     provenance: dict[str, Any],
 ) -> ErrorModel:
     """Fit the error model to the trials of all sets that keep the limits."""
+    # They import scikit-learn and compiled code.
+    from offline.fit import fit, tuned
+    from offline.labelled import labelled_data
+
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
     parameters = tuple(verdict.parameters for verdict in feasible.values())
     sets = ParameterSets(study.odometry.space, tuple(feasible), parameters)

@@ -4,14 +4,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from adaptune.archive import compact
-from adaptune.descriptor.pca import ScaledPCA
 from adaptune.model.bank_weights import BankSettings
 from adaptune.model.base import TrainingData
 from adaptune.model.model_file import (
@@ -25,6 +24,9 @@ from adaptune.model.paired import PairedSettings
 from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.names import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
+
+if TYPE_CHECKING:
+    from adaptune.descriptor.pca import ScaledPCA
 
 SAME_SENSOR = 3.0
 """Degrees by which the lowest points of one sensor's scans may differ between drives."""
@@ -127,11 +129,13 @@ class ErrorModel:
         """Whether there is a bank, and it was shown to pay."""
         return bool(self.bank) and self.bank_settings.adapt
 
-    def pca(self) -> ScaledPCA:
+    def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
+        from adaptune.descriptor.pca import ScaledPCA  # not needed to load a model
+
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
 
-    def training_data(self, pca: ScaledPCA, members: Sequence[int] | None = None) -> TrainingData:
+    def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
         """What selection rules are fitted to.
 
         Parameters

@@ -35,7 +35,7 @@ def check_sampler(
         axes = RandomSettings.model_validate(settings).grid
         if axes is not None:
             yield from check_grid(axes, space, bounded=budgeted or name == "random")
-    elif name != "sobol":
+    elif settings or name not in ("sobol", "tpe"):  # which need no look at Optuna
         yield from _check_optuna(name, settings, space)
 
 

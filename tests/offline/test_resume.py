@@ -129,6 +129,23 @@ def test_with_nothing_to_do_nothing_is_done(trained):
     assert len(first.means["one"]) == 4
 
 
+def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
+    code = (
+        "import sys\n"
+        "from typer.testing import CliRunner\n"
+        "from adaptune.cli import app\n"
+        f"given = ['offline', {str(trained.folder.parent / 'small.yaml')!r}, '--folder', "
+        f"{str(trained.folder)!r}, '-o', 'offline.trials=4']\n"
+        "done = CliRunner().invoke(app, given)\n"
+        "assert done.exit_code == 0, done.output\n"
+        "print(*sys.modules)"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    heavy = {"optuna", "sklearn", "scipy", "open3d", "numba", "matplotlib", "pandas", "sqlalchemy"}
+    assert not heavy & set(done.stdout.split())
+
+
 def test_sequences_are_added_and_removed(trained, tmp_path):
     written = mtimes(trained.folder / "trials")
     drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
