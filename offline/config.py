@@ -119,7 +119,7 @@ class OfflineConfig(StudySection):
             if found:
                 yield from found
                 return
-        else:
+        elif self.sampler != "tpe":  # which is always there, and need not be imported
             try:
                 optuna_class(self.sampler)
             except SamplerError as error:

@@ -143,7 +143,7 @@ def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     heavy = {"optuna", "sklearn", "scipy", "open3d", "numba", "matplotlib", "pandas", "sqlalchemy"}
-    assert not heavy & set(done.stdout.split())
+    assert heavy.isdisjoint(done.stdout.split()), heavy.intersection(done.stdout.split())
 
 
 def test_sequences_are_added_and_removed(trained, tmp_path):
