@@ -73,6 +73,11 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
     return SequenceFiles(source.files, source.pose_files if own is None else own)
 
 
+def section_of(config: SequenceConfig) -> Section:
+    """The part of its recording that a sequence is; a SequenceError if it cannot be opened."""
+    return _recorded(config).section
+
+
 def _recorded(config: SequenceConfig) -> RecordedSequence:
     reference: str | Path | None = config.reference
     if isinstance(reference, str) and reference.endswith(REFERENCE_FILES):

@@ -16,6 +16,7 @@ from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated
+from adaptune.study.overlaps import overlaps
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 
 C = TypeVar("C", bound=StudyConfig)
@@ -146,6 +147,8 @@ def _check(
         mistakes += _check_recording(name, entry, folder)
     for role in ("training", "test"):
         mistakes += _check_role(role, data, {*sequences, *courses})
+    if config is not None and not mistakes:
+        mistakes += overlaps(config)
     return config, mistakes
 
 
