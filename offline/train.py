@@ -17,13 +17,7 @@ from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import ParameterSet
-from adaptune.study.inputs import (
-    InputNotes,
-    check_inputs,
-    digest,
-    remove_other_descriptions,
-    remove_stale,
-)
+from adaptune.study.inputs import InputNotes, digest, resume
 from offline.budget import BUDGETS
 from offline.campaign import Progress, run_batches, run_tasks
 from offline.cluster import Cluster
@@ -76,11 +70,7 @@ def train(
         If a sequence cannot be used, or no set keeps the limits, or stored trials depend on
         something that has changed.
     """
-    if not again:
-        check_inputs(study)
-    study.open()
-    remove_stale(study)
-    remove_other_descriptions(study)
+    resume(study, again)
     config = study.config.offline
     if timed := sorted(config.metrics & set(TIMED)):
         _log.warning(

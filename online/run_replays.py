@@ -74,36 +74,55 @@ def run_replays(
     digest = model.digest
     made = 0
     for name in study.config.test:
-        folder = study.folder / "replays" / name
         shared = shared_identity(study, name)
         about = {
             mode: ReplayIdentity(**setup.identity(mode, model, digest), **shared)
             for mode in setup.modes
         }
+        folder = study.folder / "replays" / name
         others = {mode: other_keys(folder / mode, about[mode]) for mode in setup.modes}
-        due = [mode for mode, keys in others.items() if again or keys != []]
         _report_changes(name, others)
-        poses = study.sequences.reference(name)
-        if not due:
-            if not is_reference_of(folder, poses):
-                trajectory = StoredReplay.read(folder / setup.modes[0]).trajectory
-                write_reference(folder, study.sequences.open(name).reference(), trajectory, poses)
-                _log.info("%s: the reference has changed; no replay depends on it", name)
-            continue
-        sequence = study.sequences.open(name)
-        for mode in due:
-            started = setup.start(mode, model, name)
-            result = _replay(
-                study.config, sequence, name, started, partial(progress, f"{name}, {mode}")
-            )
-            if mode == due[0]:
-                write_reference(folder, sequence.reference(), result.trajectory, poses)
-            write_replay(folder / mode, result, about[mode], model_path)
-            if started.selector is not None:
-                selections = [choice.selection for choice in result.choices]
-                warn_of_scant_evidence(f"{name}, {mode}", selections, started.selector.fixed)
+        due = {mode: about[mode] for mode, keys in others.items() if again or keys != []}
+        if due:
+            _replay_modes(study, name, due, setup, (model, model_path), progress)
+        else:
+            _renew_reference(study, name, folder / setup.modes[0])
         made += len(due)
     return made
+
+
+def _replay_modes(
+    study: Study,
+    name: str,
+    due: Mapping[str, ReplayIdentity],
+    setup: ReplaySetup,
+    of_file: tuple[ErrorModel, Path],
+    progress: Progress,
+) -> None:
+    """Replay a sequence in some modes, with a model and its file."""
+    folder, (model, model_path) = study.folder / "replays" / name, of_file
+    poses, sequence = study.sequences.reference(name), study.sequences.open(name)
+    for i, (mode, about) in enumerate(due.items()):
+        started = setup.start(mode, model, name)
+        result = _replay(
+            study.config, sequence, name, started, partial(progress, f"{name}, {mode}")
+        )
+        if i == 0:
+            write_reference(folder, sequence.reference(), result.trajectory, poses)
+        write_replay(folder / mode, result, about, model_path)
+        if started.selector is not None:
+            selections = [choice.selection for choice in result.choices]
+            warn_of_scant_evidence(f"{name}, {mode}", selections, started.selector.fixed)
+
+
+def _renew_reference(study: Study, name: str, replayed: Path) -> None:
+    """Write the reference beside the replays again, if it has changed."""
+    poses = study.sequences.reference(name)
+    if not is_reference_of(replayed.parent, poses):
+        trajectory = StoredReplay.read(replayed).trajectory
+        reference = study.sequences.open(name).reference()
+        write_reference(replayed.parent, reference, trajectory, poses)
+        _log.info("%s: the reference has changed; no replay depends on it", name)
 
 
 def _report_changes(name: str, others: Mapping[str, Sequence[str] | None]) -> None:

@@ -154,20 +154,43 @@ def digest(study: Study) -> str:
     return hashlib.blake2b(json.dumps(kept).encode(), digest_size=16).hexdigest()
 
 
-def remove_stale(study: Study) -> None:
-    """Remove the trials that depend on something that has changed; the folder must be open."""
+def resume(study: Study, again: bool = False) -> None:
+    """Open the study's folder, and remove what has to be made again.
+
+    Parameters
+    ----------
+    study
+        The study.
+    again
+        Remove the trials that depend on something that has changed, instead of refusing them.
+
+    Raises
+    ------
+    ConfigurationError
+    """
+    if not again:
+        check_inputs(study)
+    study.open()
+    _remove_stale(study)
+    _remove_other_descriptions(study)
+
+
+def _remove_stale(study: Study) -> None:
+    """Remove the trials that depend on something that has changed."""
     found = stale(study)
     for one in found:
         folder = study.folder / "trials" / one.name
         # The note goes last: until then, the trials are known to be stale.
         for path in (*folder.glob("*.npz"), folder / FILE):
             path.unlink(missing_ok=True)
+    for path in study.folder.glob("optuna.log*") if found else ():
+        path.unlink()  # it is written again
     if found and not any((study.folder / "trials").glob("*/*.npz")):
-        for path in (*study.folder.glob("elapsed*.json"), *study.folder.glob("optuna.log*")):
+        for path in study.folder.glob("elapsed*.json"):
             path.unlink()
 
 
-def remove_other_descriptions(study: Study) -> None:
+def _remove_other_descriptions(study: Study) -> None:
     """Remove the frames that another version of a user's descriptor has described."""
     for name in study.training:
         note = _read(study, name)

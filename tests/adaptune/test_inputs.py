@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.study.inputs import InputNotes, check_inputs, remove_other_descriptions
+from adaptune.study.inputs import InputNotes, check_inputs, resume
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import write_tum
 from offline.offline_study import load_study
@@ -211,16 +211,16 @@ def test_a_descriptor_that_was_edited_describes_again(load, tmp_path):
     overrides = [f"descriptor=[ndt, '{module.stem}:describe']"]
     study = load(*overrides)
     note(study)
-    remove_other_descriptions(study)
+    resume(study)
     frames = [study.folder / "trials" / name / "frames.npz" for name in ("one", "two")]
     assert all(path.exists() for path in frames)
     module.write_text(CLASS.replace("{number}", "2"))
     check_inputs(study)
-    remove_other_descriptions(study)
+    resume(study)
     assert not any(path.exists() for path in frames)
     assert len(list(study.folder.glob("trials/*/0000?.npz"))) == 4
     note(study, 0)
-    remove_other_descriptions(study)
+    resume(study)
     assert all(path.exists() for path in frames)
 
 
