@@ -15,7 +15,7 @@ from pathlib import Path
 from adaptune.errors import AdaptuneError
 from adaptune.sequence import cache
 
-SMALL = 1 << 24
+SMALL = cache.SMALL
 """Bytes below which files are read every time, one or several together."""
 FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""

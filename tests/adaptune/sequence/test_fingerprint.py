@@ -114,8 +114,10 @@ def test_a_pass_that_ends_early_leaves_no_thread(tmp_path, hashed):
     assert hashed == ["a", "a"]
 
 
-def test_a_decoded_bag_is_that_of_its_content(rec, tmp_path):
+@pytest.mark.parametrize("small", [1, 1 << 24])
+def test_a_decoded_bag_is_that_of_its_content(rec, tmp_path, monkeypatch, small):
     """Also if another one of the same size and time takes its place."""
+    monkeypatch.setattr(opening.cache, "SMALL", small)
     path = rec.drive(tmp_path / "a.bag", n=300)
     config = SequenceConfig(bag=str(path))
     before = [scan.points for scan in opening.open_sequence(config)]
