@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -155,6 +155,10 @@ class _Entry(NamedTuple):
 
 
 INDEX = "index.jsonl"
+SLOTS = "slots.json"
+"""Of each sequence that is searched for sets of its own, the hundred thousand of its trials."""
+OF_SLOT = 100_000
+"""Trial numbers of a slot; the first hundred thousand are of sets that all sequences share."""
 _PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy")
 """Parts of a trial that are stored as JSON, as its parameters are."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
@@ -167,15 +171,27 @@ class Archive:
     truth. The index of their summaries, ``index.jsonl``, only avoids opening all of them. A line
     does not count if its file has changed or is gone. Trials without a line are read from their
     files. All methods raise an ArchiveError where a file that they need is missing or damaged.
+
+    Parameters
+    ----------
+    folder
+        It may not exist yet.
+    note
+        Called before anything is written about a sequence, with its name.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, note: Callable[[str], None] = lambda _: None):
         self.folder = folder
+        self._note = note
         self._finished: dict[str, dict[int, Summary]] | None = None
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
         """File of a trial, or of its whole run, which never restarts at the reference."""
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
+
+    def frames_path(self, sequence: str) -> Path:
+        """File of the data that all trials on a sequence share."""
+        return self.folder / sequence / "frames.npz"
 
     def tidy(self) -> None:
         """Remove unfinished files and repair the index. No process may be writing."""
@@ -190,11 +206,53 @@ class Archive:
 
         It grows as trials are written.
         """
+        return self._all().setdefault(sequence, {})
+
+    def _all(self) -> dict[str, dict[int, Summary]]:
         if self._finished is None:
             self._finished = {}
             for entry in self._entries():
                 self._finished.setdefault(entry.sequence, {})[entry.trial] = entry.summary
-        return self._finished.setdefault(sequence, {})
+        return self._finished
+
+    def sets(self) -> dict[int, ParameterSet]:
+        """The parameter sets of all finished trials, also on sequences that a study has left out.
+
+        Raises
+        ------
+        ArchiveError
+            If two trials of one number have different sets.
+        """
+        found: dict[int, tuple[str, ParameterSet]] = {}
+        for name, trials in self._all().items():
+            for number, summary in trials.items():
+                first, parameters = found.setdefault(number, (name, summary.parameters))
+                if parameters != summary.parameters:
+                    one, other = (self.trial_path(n, number) for n in (first, name))
+                    raise ArchiveError(
+                        f"{other}: has other parameters than {one}; remove the one that is not "
+                        f"of this study, and run again"
+                    )
+        return {number: parameters for number, (_, parameters) in found.items()}
+
+    def slots(self, names: Iterable[str] = ()) -> dict[str, int]:
+        """The slot of every sequence that has one, or is among `names`; a sequence keeps its slot.
+
+        Its own search numbers its trials from `OF_SLOT` times the slot, which begin at 1.
+        """
+        path = self.folder / SLOTS
+        try:
+            text = path.read_text("utf-8") if path.exists() else "{}"
+            slots = {str(name): int(slot) for name, slot in json.loads(text).items()}
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise ArchiveError(
+                f"{path}: is damaged ({error}); give the study another folder"
+            ) from error
+        for name in (new := [name for name in names if name not in slots]):
+            slots[name] = max(slots.values(), default=0) + 1
+        if new:
+            write_text(path, json.dumps(slots) + "\n")
+        return slots
 
     def _entries(self) -> Iterator[_Entry]:
         """Entries that the index should have."""
@@ -224,7 +282,8 @@ class Archive:
 
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Write the data that all trials on a sequence share."""
-        path = self.folder / sequence / "frames.npz"
+        self._note(sequence)
+        path = self.frames_path(sequence)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -237,7 +296,7 @@ class Archive:
 
     def read_frames(self, sequence: str) -> Frames:
         """Read the data that all trials on a sequence share."""
-        path = self.folder / sequence / "frames.npz"
+        path = self.frames_path(sequence)
         data = _read(path)
         try:
             return Frames(
@@ -254,11 +313,13 @@ class Archive:
 
     def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
         """Write a trial."""
+        self._note(sequence)
         path = self.trial_path(sequence, number, whole)
         plain: dict[str, Any] = {name: _packed(getattr(trial, name)) for name in _PLAIN}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
+                place=_packed([sequence, number, whole]),
                 parameters=_packed(trial.parameters),
                 T_odom_sensor=trial.T_odom_sensor,
                 errors=trial.errors.astype(np.float32),
@@ -283,6 +344,7 @@ class Archive:
         data = _read(path)
         # Older files have none.
         data.setdefault("unhealthy", _packed({}))
+        _check_place(path, data, [sequence, number, whole])
         try:
             plain = {name: _unpacked(data[name]) for name in _PLAIN}
             plain |= {name: tuple(plain[name]) for name in ("faults", "repeats")}
@@ -310,7 +372,9 @@ class Archive:
             path = self.trial_path(sequence, number)
             try:
                 # Arrays are loaded one by one. Poses, most of the file, are not needed.
-                errors = _read(path, ["errors"])["errors"]
+                data = _read(path, ["errors", "place"])
+                _check_place(path, data, [sequence, number, False])
+                errors = data["errors"]
             except KeyError as error:
                 raise ArchiveError(f"{path}: lacks {error}; remove it and run again") from error
             if read is None:
@@ -336,6 +400,21 @@ def _packed(value: Any) -> NDArray[np.uint8]:
 
 def _unpacked(array: NDArray[np.uint8]) -> Any:
     return json.loads(array.tobytes())
+
+
+def _check_place(path: Path, data: Mapping[str, NDArray[Any]], place: list[Any]) -> None:
+    """Refuse the file of another trial."""
+    try:
+        found = _unpacked(data["place"])
+        sequence, number, whole = found
+    except (KeyError, ValueError, TypeError) as error:
+        raise _damaged(path, error) from error
+    if found != place:
+        what = f"the whole run of trial {number}" if whole else f"trial {number}"
+        raise ArchiveError(
+            f"{path}: holds {what} on {sequence}, so it was copied over the trial of its name; "
+            f"remove it and run again"
+        )
 
 
 def _damaged(path: Path, error: Exception) -> ArchiveError:

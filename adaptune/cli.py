@@ -160,6 +160,9 @@ def offline(
             show_default="processes of this machine",
         ),
     ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Compute again what depends on what has changed.")
+    ] = False,
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
@@ -173,7 +176,7 @@ def offline(
     from offline.tuning import MIN_SEQUENCES
 
     with progress() as show:
-        training = train(loaded, show, cluster)
+        training = train(loaded, show, cluster, again)
     model = training.model
     console.print(
         report.table(

@@ -33,11 +33,11 @@ from adaptune.model import (
     BankRule,
     BankSettings,
     ErrorModel,
-    NearestNeighbours,
     PairedExpectedRatio,
     Rule,
     TrainingData,
 )
+from adaptune.model.knn import NearestNeighbours
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import Float, ParameterSpace
 from offline.leave_one_out import BANK_SIZE

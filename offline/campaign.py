@@ -53,14 +53,13 @@ class _Campaign:
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
-        of_sequences = self._finished.values()
-        known = {n: trial.parameters for trials in of_sequences for n, trial in trials.items()}
+        self._stages = make_stages(self._config, study.odometry.space, self._names, archive)
+        known = archive.sets()
         self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
         ]
-        self._stages = make_stages(self._config, study.odometry.space, self._names, self._finished)
         self._tally = _Tally(progress, self._finished, self._stages)
         # For each trial number, the sequences that count.
         self._counted: dict[int, Sequence[str]] = {}

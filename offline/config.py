@@ -124,7 +124,7 @@ class OfflineConfig(StrictModel):
             if found:
                 yield from found
                 return
-        else:
+        elif self.sampler != "tpe":  # which is always there, and need not be imported
             try:
                 check_class(self.sampler)
             except SamplerError as error:

@@ -199,7 +199,8 @@ def labelled_data(
     eligible = {sets.trials[c] for c in order if np.isfinite(means[c])}
     named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
     eligible |= {trial for trial in named if trial is not None}
-    owners = [owner(config.offline, list(run), trial) for trial in sets]
+    slots = archive.slots()
+    owners = [owner(slots, trial) for trial in sets]
     labelled = []
     for sequence, frames, known in read:
         name, length = sequence.name, config.sub_trajectory

@@ -21,7 +21,6 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-import optuna
 
 Pruning = Literal["none", "halving", "hyperband", "wilcoxon"]
 
@@ -76,6 +75,8 @@ def survivors(
 
 
 def _worse(values: Values, best: Values) -> bool:
+    import optuna  # takes a second, and few studies need it
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         pruner = optuna.pruners.WilcoxonPruner(p_threshold=SIGNIFICANCE)

@@ -1,11 +1,12 @@
 """Searches for parameter sets: one over all training sequences, one for each, or both."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from adaptune.archive import Summary
+from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.budget import max_trials, spent
 from offline.config import OfflineConfig
@@ -21,9 +22,9 @@ Finished = Mapping[str, Mapping[int, Summary]]
 class Search:
     """One search, batch by batch.
 
-    Several searches of a study number their trials in turn: all of them share trial 0, the
-    baseline, and trial i > 0 of search j of n is trial 1 + (i - 1) n + j of the study. So numbers
-    do not depend on a budget.
+    Each search has a slot of trial numbers, see `adaptune.archive.OF_SLOT`; all of them share trial
+    0, the baseline. So numbers depend neither on a budget nor on the other searches. A number keeps
+    its set: one that ran on any sequence is not proposed anew where others are added.
 
     Attributes
     ----------
@@ -41,7 +42,13 @@ class Search:
     """
 
     def __init__(
-        self, sampler: Sampler, sequences: Sequence[str], finished: Finished, place: tuple[int, int]
+        self,
+        sampler: Callable[[], Sampler],
+        config: OfflineConfig,
+        sequences: Sequence[str],
+        finished: Finished,
+        known: Mapping[int, ParameterSet],
+        slot: int = 0,
     ):
         self.sequences = list(sequences)
         self.verdicts: list[Verdict] = []
@@ -49,18 +56,21 @@ class Search:
         self.numbers: list[int] = []
         self.order = self.sequences
         self.end: str | None = None
-        self._sampler = sampler
-        self._config = sampler.config
-        self._limit = max_trials(sampler.config)
+        self._make_sampler, self._config = sampler, config
+        self._limit = max_trials(config)
         self._finished = finished
-        self._place = place
+        self._known, self._slot = known, slot
         self._alive: list[int] = []
         self._sets: dict[int, ParameterSet] = {}
 
+    @cached_property
+    def _sampler(self) -> Sampler:
+        # Where nothing is to be proposed, it is not needed, and takes long to import.
+        return self._make_sampler()
+
     def number(self, i: int) -> int:
         """Trial number in the study of trial `i` of this search."""
-        j, n = self._place
-        return 1 + (i - 1) * n + j if i else 0
+        return OF_SLOT * self._slot + i if i else 0
 
     @property
     def done(self) -> dict[int, Verdict]:
@@ -77,12 +87,15 @@ class Search:
         first, size = len(self.verdicts), self._config.batch
         stop = first + size if self._limit is None else min(first + size, self._limit)
         self.numbers = [self.number(i) for i in range(first, stop)]
-        self._sets = {}
+        self._sets = {n: self._known[n] for n in self.numbers if n in self._known}
         if first and self._config.pruning != "none":
             self.order = self._hardest_first()
-        if any(n not in self._finished[self.order[0]] for n in self.numbers):
-            self._propose()
-            self.numbers = self.numbers[: len(self._sets)]
+        if len(self._sets) < len(self.numbers):
+            proposed = self._sampler.propose(sampler_results(self.verdicts))
+            new = [s for s in proposed if s not in self._sets.values()]
+            unknown = [n for n in self.numbers if n not in self._sets]
+            self._sets |= zip(unknown, new, strict=False)
+            self.numbers = [n for n in self.numbers if n in self._sets]
         if not self.numbers:
             self.end = self._sampler.end
             return False
@@ -98,8 +111,6 @@ class Search:
 
     def parameters(self, number: int) -> ParameterSet:
         """The set of a trial of the batch."""
-        if not self._sets:
-            self._propose()
         return self._sets[number]
 
     def prune(self, m: int) -> None:
@@ -125,10 +136,6 @@ class Search:
         n_trials = len(self.verdicts) if self.end else self._limit
         n_trials = len(self.verdicts) + len(self.numbers) if n_trials is None else n_trials
         return n_trials * len(self.sequences)
-
-    def _propose(self) -> None:
-        sets = self._sampler.propose(sampler_results(self.verdicts))
-        self._sets = dict(zip(self.numbers, sets, strict=False))
 
     def _hardest_first(self) -> list[str]:
         """The sequences by falling mean of the first objective over the first batch."""
@@ -189,20 +196,23 @@ class Stage(NamedTuple):
 
 
 def make_stages(
-    config: OfflineConfig, space: ParameterSpace, names: list[str], finished: Finished
+    config: OfflineConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
 ) -> list[Stage]:
-    """Make the searches of a study, in their order."""
-    shared = [names] if config.sets != "own" else []
-    own = [[name] for name in names] if config.sets != "shared" else []
-    searches = []
-    for j, sequences in enumerate([*shared, *own]):
-        seed = config.seed
-        if j >= len(shared):
-            seed = int(np.random.SeedSequence((seed, j - len(shared))).generate_state(1)[0])
-        sampler = make_sampler(space, config.model_copy(update={"seed": seed}))
-        searches.append(Search(sampler, sequences, finished, (j, len(shared) + len(own))))
-    n = len(shared)
-    return [Stage(s, alone) for s, alone in ((searches[:n], False), (searches[n:], True)) if s]
+    """Make the searches of a study over some sequences, in their order."""
+    finished, known = {name: archive.finished(name) for name in names}, archive.sets()
+    stages = []
+    if config.sets != "own":
+        shared = Search(partial(make_sampler, space, config), config, names, finished, known)
+        stages.append(Stage([shared], alone=False))
+    if config.sets != "shared":
+        slots, own = archive.slots(names), []
+        for name in names:
+            seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
+            seed = {"seed": int(seeds.generate_state(1)[0])}
+            sampler = partial(make_sampler, space, config.model_copy(update=seed))
+            own.append(Search(sampler, config, [name], finished, known, slots[name]))
+        stages.append(Stage(own, alone=True))
+    return stages
 
 
 def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
@@ -215,10 +225,14 @@ def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
     return best
 
 
-def owner(config: OfflineConfig, sequences: Sequence[str], number: int) -> str | None:
-    """The sequence whose own search proposed a trial's set; None for a shared search."""
-    n_shared = 0 if config.sets == "own" else 1
-    if config.sets == "shared" or number == 0:
-        return None
-    j = (number - 1) % (len(sequences) + n_shared) - n_shared
-    return sequences[j] if j >= 0 else None
+def owner(slots: Mapping[str, int], number: int) -> str | None:
+    """The sequence whose own search proposed a trial's set; None for a shared search.
+
+    Parameters
+    ----------
+    slots
+        See `adaptune.archive.Archive.slots`.
+    number
+        The trial's.
+    """
+    return next((name for name, slot in slots.items() if slot == number // OF_SLOT), None)

@@ -9,17 +9,19 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import optuna
-import sqlalchemy.exc
-from optuna.storages.journal import JournalFileBackend
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import needing_room
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
+
+if TYPE_CHECKING:
+    import optuna
+
+# Optuna takes a second to import, which a campaign with nothing to do does not need.
 
 JOURNAL = "optuna.log"
 """The default storage, in the study's folder."""
@@ -71,29 +73,33 @@ class Mirror(ABC):
 
     def __init__(self, name: str, n_objectives: int, space: ParameterSpace):
         self._name = name
-        self._directions = [optuna.study.StudyDirection.MINIMIZE] * n_objectives
-        self._distributions = {n: distribution(p) for n, p in space.parameters.items()}
+        self._n_objectives, self._space = n_objectives, space
 
     @abstractmethod
     def report(self, numbers: Collection[int], row: Callable[[int], MirrorRow]) -> None:
         """Report trials in this order; `row` is called for those that the mirror lacks."""
 
-    def _create(self, storage: Any) -> optuna.Study:
+    def _create(self, storage: Any) -> "optuna.Study":
+        import optuna
+
         return optuna.create_study(
             storage=storage,
             study_name=self._name,
             load_if_exists=True,
-            directions=self._directions,
+            directions=["minimize"] * self._n_objectives,
         )
 
     @staticmethod
-    def _known(mirror: optuna.Study) -> dict[int, ParameterSet]:
+    def _known(mirror: "optuna.Study") -> dict[int, ParameterSet]:
         trials = mirror.get_trials(deepcopy=False)
         return {trial.user_attrs.get(_NUMBER, trial.number): trial.params for trial in trials}
 
     def _add(
-        self, mirror: optuna.Study, numbers: Collection[int], row: Callable[[int], MirrorRow]
+        self, mirror: "optuna.Study", numbers: Collection[int], row: Callable[[int], MirrorRow]
     ) -> None:
+        from optuna.trial import TrialState, create_trial
+
+        distributions = {n: distribution(p) for n, p in self._space.parameters.items()}
         known = self._known(mirror)
         for number in numbers:
             if number in known:
@@ -101,18 +107,15 @@ class Mirror(ABC):
             trial = row(number)
             finite = np.isfinite(trial.values).all()
             mirror.add_trial(
-                optuna.trial.create_trial(
-                    state=optuna.trial.TrialState.COMPLETE if finite else _FAIL,
+                create_trial(
+                    state=TrialState.COMPLETE if finite else TrialState.FAIL,
                     params=trial.parameters,
-                    distributions=self._distributions,
+                    distributions=distributions,
                     values=trial.values if finite else None,
                     user_attrs={_NUMBER: number} | dict(trial.attributes),
                     constraints=dict(trial.constraints),
                 )
             )
-
-
-_FAIL = optuna.trial.TrialState.FAIL
 
 
 class JournalMirror(Mirror):
@@ -136,7 +139,7 @@ class JournalMirror(Mirror):
         with needing_room(self._path):
             self._add(self._mirror, numbers, row)
 
-    def _open(self) -> optuna.Study:
+    def _open(self) -> "optuna.Study":
         if self._path.exists() and not self._path.read_bytes().endswith(b"\n"):
             self._path.unlink()
         try:
@@ -147,8 +150,11 @@ class JournalMirror(Mirror):
             return self._create(_journal(self._path))
 
 
-def _journal(path: Path) -> optuna.storages.JournalStorage:
-    return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
+def _journal(path: Path) -> "optuna.storages.JournalStorage":
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    return JournalStorage(JournalFileBackend(str(path)))
 
 
 def _reported(path: Path) -> set[int]:
@@ -170,6 +176,8 @@ class DatabaseMirror(Mirror):
         space: ParameterSpace,
         finished: Mapping[int, ParameterSet],
     ):
+        import sqlalchemy.exc
+
         super().__init__(name, n_objectives, space)
         if url.startswith("postgresql://"):
             url = url.replace("://", "+pg8000://", 1)
@@ -208,9 +216,12 @@ class DatabaseMirror(Mirror):
 
     def report(self, numbers: Collection[int], row: Callable[[int], MirrorRow]) -> None:
         """See `Mirror`; a database that is away receives the trials when it returns."""
+        from optuna.exceptions import StorageInternalError
+        from sqlalchemy.exc import SQLAlchemyError
+
         try:
             self._add(self._mirror, numbers, row)
-        except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+        except (SQLAlchemyError, StorageInternalError) as error:
             if not self._complained:
                 _log.warning(
                     "%s: does not receive trials now, the archive keeps them (%s)",
@@ -224,13 +235,17 @@ class DatabaseMirror(Mirror):
 
 def distribution(parameter: Float | Integer | Categorical) -> Any:
     """A parameter as Optuna describes it."""
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
     if isinstance(parameter, Categorical):
-        return optuna.distributions.CategoricalDistribution(parameter.choices)
+        return CategoricalDistribution(parameter.choices)
     if isinstance(parameter, Integer):
-        return optuna.distributions.IntDistribution(
-            parameter.low, parameter.high, log=parameter.log
-        )
-    return optuna.distributions.FloatDistribution(parameter.low, parameter.high, log=parameter.log)
+        return IntDistribution(parameter.low, parameter.high, log=parameter.log)
+    return FloatDistribution(parameter.low, parameter.high, log=parameter.log)
 
 
 def _first_line(error: Exception) -> str:

@@ -1,8 +1,10 @@
 """The offline stage: run the trials, choose the fixed set, fit the error model."""
 
-import dataclasses
+import hashlib
+import json
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,15 +14,14 @@ from adaptune import report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
 from adaptune.files import write_text
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, ModelError
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import ParameterSet
+from adaptune.study.inputs import InputNotes, digest, resume
 from offline.budget import BUDGETS
 from offline.campaign import Progress, run_batches, watch_tasks
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
-from offline.fit import fit, tuned
-from offline.labelled import labelled_data
 from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
 from offline.offline_study import OfflineStudy
 from offline.pictures import draw_front
@@ -44,7 +45,10 @@ class Training(NamedTuple):
 
 
 def train(
-    study: OfflineStudy, progress: Progress = lambda *_: None, cluster: str | None = None
+    study: OfflineStudy,
+    progress: Progress = lambda *_: None,
+    cluster: str | None = None,
+    again: bool = False,
 ) -> Training:
     """Run all trials that are not in the archive yet, and fit the model.
 
@@ -58,28 +62,30 @@ def train(
         Called about every finished trial.
     cluster
         Address of a Dask scheduler whose workers run the trials; None for processes here.
+    again
+        Remove the trials that depend on something that has changed since they were run.
 
     Raises
     ------
     AdaptuneError
-        If a sequence cannot be used, or no set keeps the limits.
+        If a sequence cannot be used, or no set keeps the limits, or stored trials depend on
+        something that has changed.
     """
-    study.open()
+    resume(study, again)
     config = study.config.offline
     if timed := sorted(config.metrics & set(TIMED)):
         _log.warning(
             "%s differ from run to run: the same study run again will not find the same sets",
             " and ".join(timed),
         )
-    archive = Archive(study.folder / "trials")
+    archive = Archive(study.folder / "trials", InputNotes(study))
     archive.tidy()
     with _workers(study, cluster) as workers:
         verdicts = run_batches(study, archive, workers, progress)
         fixed = choose_fixed(config, verdicts)
         sets = {n: verdicts[n].parameters for n in sorted({0, fixed})}
         whole = _run_whole(study.training, sets, archive, workers, progress)
-    model = _fit(study, archive, verdicts, fixed)
-    model.save(study.model_path)
+    model = _fitted(study, archive, verdicts, fixed)
     finished = {
         name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
         for name in study.training
@@ -104,25 +110,79 @@ def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    odometry = dataclasses.replace(study.odometry, user_code=True)
+    odometry = replace(study.odometry, user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = config.memory * 1e9
     return Cluster(setup, study.training, memory, cluster) if cluster else Workers(setup, n, memory)
 
 
-def _fit(
+def _fitted(
     study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int
 ) -> ErrorModel:
+    """The study's error model: as it is stored, if that was fitted to just this, or fitted now."""
+    settings = study.config.offline.model_dump(
+        mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
+    )
+    provenance = {"versions": study.odometry.versions} | settings
+    provenance |= {"inputs": digest(study)}
+    provenance |= {"evidence": _evidence(study, archive, verdicts, fixed, provenance)}
+    try:
+        before = ErrorModel.load(study.model_path)
+    except ModelError:
+        before = None
+    if before is not None and before.provenance == provenance:
+        return before
+    model = _fit(study, archive, verdicts, fixed, provenance)
+    if before is not None and before.digest == model.digest:
+        model = replace(model, validation=before.validation)
+    model.save(study.model_path)
+    return model
+
+
+def _evidence(
+    study: OfflineStudy,
+    archive: Archive,
+    verdicts: Mapping[int, Verdict],
+    fixed: int,
+    provenance: Mapping[str, Any],
+) -> str:
+    """Digest of everything that a model of the study depends on."""
+    config = study.config
+    trials = {
+        name: [
+            (n, run.parameters, run.mean_error, run.lost, judge(config.offline, [run]).values)
+            for n, run in sorted(archive.finished(name).items())
+            if n in verdicts and name in verdicts[n].sequences
+        ]
+        for name in study.training
+    }
+    settings = (config.sub_trajectory, config.lost_track, study.window, config.online.period)
+    switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
+    feasible = [n for n, verdict in verdicts.items() if verdict.feasible]
+    about = [provenance, trials, settings, switching, feasible, fixed, list(study.training)]
+    found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
+    for name in study.training:
+        found.update(archive.frames_path(name).read_bytes())
+    return found.hexdigest()
+
+
+def _fit(
+    study: OfflineStudy,
+    archive: Archive,
+    verdicts: Mapping[int, Verdict],
+    fixed: int,
+    provenance: dict[str, Any],
+) -> ErrorModel:
     """Fit the error model to the trials of all sets that keep the limits."""
+    # They import scikit-learn and compiled code.
+    from offline.fit import fit, tuned
+    from offline.labelled import labelled_data
+
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
     parameters = tuple(verdict.parameters for verdict in feasible.values())
     sets = ParameterSets(study.odometry.space, tuple(feasible), parameters)
     run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
     data = labelled_data(archive, run, sets, study.config, study.window)
-    settings = study.config.offline.model_dump(
-        mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
-    )
-    provenance = {"versions": study.odometry.versions} | settings
     length = study.config.sub_trajectory
     model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
     model = tuned(model, data, study.config.online.switching)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from adaptune.descriptor.pca import ScaledPCA
@@ -45,6 +44,8 @@ NO_BANK = BankSettings(adapt=False)
 
 def interval_margin(logs: NDArray[np.float64]) -> float:
     """Half of the 95 % interval of the mean, Student's."""
+    from scipy import stats
+
     return float(stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs))
 
 

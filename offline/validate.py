@@ -12,6 +12,7 @@ from adaptune import report
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.paired import ERROR_FLOOR
+from adaptune.study.inputs import check_model
 from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, labelled_data
 from offline.leave_one_out import Interval, Validation, leave_one_out
@@ -100,7 +101,9 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 def _checked_model(study: OfflineStudy) -> ErrorModel:
     path = study.model_path
     model = ErrorModel.load(path)
-    model.check_study(study.odometry.identity, study.odometry.space, path)
+    length = study.config.sub_trajectory
+    check_model(study, model.sequences, model.provenance)
+    model.check_study(study.odometry.identity, study.odometry.space, length, path)
     if (study.training, study.window) != (model.sequences, model.window):
         raise ModelError(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "

@@ -5,12 +5,14 @@ from numpy.typing import NDArray
 
 from adaptune import report
 from adaptune.geometry import invert
+from adaptune.model import ErrorModel
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
 from online.modes import ReplaySetup
 from online.replay_picture import Track, draw_replays
 from online.run_replays import shared_identity
 from online.statistics import ComparisonRow, Reference, compare_modes, pooled
+from online.stored_reference import is_reference_of
 from online.stored_replays import ReplaySummary, StoredReplay, StoredReplayError
 
 
@@ -83,13 +85,26 @@ def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
 
 def _check_replays(study: Study, setup: ReplaySetup) -> None:
     """Refuse replays that are missing, or of another recording or configuration."""
+    model = ErrorModel.load(study.model_path) if study.model_path.exists() else None
+    own, digest = str(study.model_path.resolve()), "" if model is None else model.digest
     for name in study.config.test:
-        now = shared_identity(study, name)
+        shared = shared_identity(study, name)
         for mode in setup.modes:
+            now = dict(shared)
             folder = study.folder / "replays" / name / mode
-            made = ReplaySummary.read(folder).about.model_dump()
+            summary = ReplaySummary.read(folder)
+            made = summary.about.model_dump()
+            if model is not None and summary.model_file == own:
+                now |= {
+                    key: setup.identity(mode, model, digest)[key] for key in ("model", "parameters")
+                }
             if differing := [key for key, value in now.items() if made[key] != value]:
                 raise StoredReplayError(
                     f"{folder}: was replayed with another {', '.join(differing)}; run `adaptune "
                     f"online` with this study"
                 )
+        if not is_reference_of(study.folder / "replays" / name, study.sequences.reference(name)):
+            raise StoredReplayError(
+                f"{study.folder / 'replays' / name}: was judged by another reference; run "
+                f"`adaptune online` with this study, which replays nothing for it"
+            )

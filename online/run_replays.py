@@ -2,24 +2,23 @@
 
 import itertools
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from adaptune.descriptor.base import DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.selection import Selection
-from adaptune.sequence.sequence import Sequence
+from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.study.config import StudyConfig
+from adaptune.study.inputs import check_model, odometry_inputs
 from adaptune.study.study import Study
-from adaptune.trajectory import Trajectory, write_tum
 from online.modes import Mode, ReplaySetup
 from online.replay import Replay, replay
-from online.stored_replays import ReplayIdentity, is_current, write_replay
+from online.stored_reference import is_reference_of, write_reference
+from online.stored_replays import ReplayIdentity, StoredReplay, other_keys, write_replay
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -58,10 +57,14 @@ def run_replays(
     Raises
     ------
     AdaptuneError
-        If there is no test sequence, or the model is of another odometry or other parameters.
+        If there is no test sequence, the model is of another odometry, other parameters or other
+        sub-trajectories, or what the study's own model was fitted to has changed.
     """
     model = ErrorModel.load(model_path)
-    model.check_study(study.odometry.identity, study.odometry.space, model_path)
+    if model_path == study.model_path:
+        check_model(study, model.sequences, model.provenance)
+    length = study.config.sub_trajectory
+    model.check_study(study.odometry.identity, study.odometry.space, length, model_path)
     setup = ReplaySetup.of(study)
     setup.check(model, model_path)
     if not study.config.test:
@@ -70,34 +73,67 @@ def run_replays(
     digest = model.digest
     made = 0
     for name in study.config.test:
-        folder = study.folder / "replays" / name
         shared = shared_identity(study, name)
         about = {
             mode: ReplayIdentity(**setup.identity(mode, model, digest), **shared)
             for mode in setup.modes
         }
-        due = [mode for mode in setup.modes if again or not is_current(folder / mode, about[mode])]
-        if not due:
-            continue
-        sequence = study.sequences.open(name)
-        for mode in due:
-            started = setup.start(mode, model, name)
-            result = _replay(
-                study.config, sequence, name, started, partial(progress, f"{name}, {mode}")
-            )
-            if mode == due[0]:
-                _write_reference(folder, sequence.reference(), result.trajectory)
-            write_replay(folder / mode, result, about[mode])
-            if started.selector is not None:
-                selections = [choice.selection for choice in result.choices]
-                warn_of_scant_evidence(f"{name}, {mode}", selections, started.selector.fixed)
+        folder = study.folder / "replays" / name
+        others = {mode: other_keys(folder / mode, about[mode]) for mode in setup.modes}
+        _report_changes(name, others)
+        due = {mode: about[mode] for mode, keys in others.items() if again or keys != []}
+        if due:
+            _replay_modes(study, name, due, setup, (model, model_path), progress)
+        else:
+            _renew_reference(study, name, folder / setup.modes[0])
         made += len(due)
     return made
 
 
+def _replay_modes(
+    study: Study,
+    name: str,
+    due: Mapping[str, ReplayIdentity],
+    setup: ReplaySetup,
+    of_file: tuple[ErrorModel, Path],
+    progress: Progress,
+) -> None:
+    """Replay a sequence in some modes, with a model and its file."""
+    folder, (model, model_path) = study.folder / "replays" / name, of_file
+    poses, sequence = study.sequences.reference(name), study.sequences.open(name)
+    for i, (mode, about) in enumerate(due.items()):
+        started = setup.start(mode, model, name)
+        result = _replay(
+            study.config, sequence, name, started, partial(progress, f"{name}, {mode}")
+        )
+        if i == 0:
+            write_reference(folder, sequence.reference(), result.trajectory, poses)
+        write_replay(folder / mode, result, about, model_path)
+        if started.selector is not None:
+            selections = [choice.selection for choice in result.choices]
+            warn_of_scant_evidence(f"{name}, {mode}", selections, started.selector.fixed)
+
+
+def _renew_reference(study: Study, name: str, replayed: Path) -> None:
+    """Write the reference beside the replays again, if it has changed."""
+    poses = study.sequences.reference(name)
+    if not is_reference_of(replayed.parent, poses):
+        trajectory = StoredReplay.read(replayed).trajectory
+        reference = study.sequences.open(name).reference()
+        write_reference(replayed.parent, reference, trajectory, poses)
+        _log.info("%s: the reference has changed; no replay depends on it", name)
+
+
+def _report_changes(name: str, others: Mapping[str, Sequence[str] | None]) -> None:
+    """Say what stored replays are made again for."""
+    for mode, keys in others.items():
+        if keys:
+            _log.info("%s, %s: replayed again, with another %s", name, mode, ", ".join(keys))
+
+
 def _replay(
     config: StudyConfig,
-    sequence: Sequence,
+    sequence: Recording,
     name: str,
     mode: Mode,
     progress: Callable[[int, int], None],
@@ -139,22 +175,6 @@ def shared_identity(study: Study, name: str) -> dict[str, Any]:
     """What the replays of a sequence depend on in all modes."""
     return {
         "period": study.config.online.period,
-        "odometry": study.config.odometry.model_dump(mode="json"),
+        "odometry": odometry_inputs(study),
         "health": study.config.health.model_dump(mode="json"),
     } | study.sequences.identity(name)
-
-
-def _write_reference(folder: Path, reference: Trajectory | None, odometry: Trajectory) -> None:
-    """Write ``reference.tum``, at the scans' stamps; remove it if there is none."""
-    path = folder / "reference.tum"
-    if reference is None:
-        path.unlink(missing_ok=True)
-        return
-    T = reference.at(odometry.stamps)
-    known = ~np.isnan(T[:, 0, 0])
-    if not known.any():
-        raise ReplayError(
-            f"{folder.name}: the reference does not overlap the scans in time; check that both are "
-            f"of the same recording and clock"
-        )
-    write_tum(path, Trajectory(odometry.stamps[known], T[known]))

@@ -13,8 +13,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.plain_words import in_one_line
-from adaptune.trajectory import Trajectory, read_tum, write_tum
+from adaptune.study.run_folder import differences
+from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
 from online.replay import Replay
+
+_TABLES = ("frames.csv", "selections.csv")
+"""Files of a replay besides its trajectory."""
 
 
 class StoredReplayError(AdaptuneError):
@@ -31,11 +35,11 @@ class ReplayIdentity(BaseModel):
     model: str | None  # its digest, of an adaptive mode
     switching: dict[str, Any] | None  # see `online.modes.ReplaySetup.identity`
     period: float  # seconds
-    odometry: dict[str, Any]
+    odometry: dict[str, Any]  # with its content, see `adaptune.study.inputs.odometry_inputs`
     health: dict[str, Any]
     sequence: dict[str, Any]
     course: dict[str, Any] | None
-    recording: list[int] | None  # sizes of the recording's files
+    recording: list[str]  # hashes of the recording's files
 
 
 class ReplaySummary(BaseModel):
@@ -48,6 +52,7 @@ class ReplaySummary(BaseModel):
     unhealthy: dict[str, int]  # how often the health check found what
     poor_scans: int  # scans that were too poor to register
     selections: int
+    model_file: str  # of the model that it was made with
     about: ReplayIdentity
 
     @classmethod
@@ -69,12 +74,15 @@ class ReplaySummary(BaseModel):
             raise _damaged(path, error) from error
 
 
-def is_current(folder: Path, about: ReplayIdentity) -> bool:
-    """Whether a folder holds a replay of just this."""
+def other_keys(folder: Path, about: ReplayIdentity) -> list[str] | None:
+    """In what a stored replay differs from another; None if there is none, or not all of it."""
     try:
-        return ReplaySummary.read(folder).about == about
+        made = ReplaySummary.read(folder).about.model_dump()
     except StoredReplayError:
-        return False
+        return None
+    if not all((folder / name).exists() for name in ("trajectory.tum", *_TABLES)):
+        return None
+    return sorted(differences(made, about.model_dump()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +109,11 @@ class StoredReplay:
             If a file is missing or damaged.
         """
         summary = ReplaySummary.read(folder)
-        trajectory = read_tum(folder / "trajectory.tum")
+        try:
+            trajectory = read_tum(folder / "trajectory.tum")
+        except TrajectoryError as error:
+            help_ = "run `adaptune online --again`"
+            raise StoredReplayError(f"{error}; {help_}") from error
         restarted = _columns(folder / "frames.csv").get("restarted", [])
         if len(restarted) != len(trajectory):
             raise _damaged(folder / "frames.csv", ValueError("not a row for every scan"))
@@ -113,7 +125,7 @@ class StoredReplay:
         return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices, weights)
 
 
-def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
+def write_replay(folder: Path, replay: Replay, about: ReplayIdentity, model_file: Path) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
     Parameters
@@ -124,6 +136,8 @@ def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
         The replay.
     about
         What it was made from.
+    model_file
+        The model that it was made with.
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     _write_selections(folder / "selections.csv", replay)
@@ -145,6 +159,7 @@ def write_replay(folder: Path, replay: Replay, about: ReplayIdentity) -> None:
         unhealthy=replay.unhealthy,
         poor_scans=int((~replay.registered).sum()),
         selections=len(replay.choices),
+        model_file=str(model_file.resolve()),
         about=about,
     )
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")

@@ -19,6 +19,7 @@ from adaptune.odometry.health import HealthCheck
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
+from adaptune.study.inputs import check_inputs
 from adaptune.study.study import Study
 from online.replay import replay
 
@@ -87,6 +88,7 @@ def measure_switching(
     AdaptuneError
         If a sequence is too short, or its reference unknown.
     """
+    check_inputs(study)
     study.open()
     warm_up, catch_up_scans = study.warm_up, study.config.online.switching.catch_up_scans
     mechanisms = _mechanisms(study.odometry, warm_up, catch_up_scans)

@@ -33,6 +33,8 @@ SLOW = [
     "offline/test_objective.py",
     "adaptune/simulation/test_recording.py",
     "offline/test_search.py",
+    "online/test_stale_replays.py",
+    "adaptune/test_inputs.py",
     "offline/samplers/test_conformance.py",
     "test_readme.py",
     "offline/test_budget.py",

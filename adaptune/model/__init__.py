@@ -3,7 +3,6 @@
 from adaptune.model.bank_weights import BankRule, BankSettings
 from adaptune.model.base import Rule, TrainingData
 from adaptune.model.error_model import ErrorModel
-from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 from adaptune.model.model_file import ModelError
 from adaptune.model.paired import PairedExpectedRatio, PairedSettings
 from adaptune.space import nearest
@@ -22,7 +21,11 @@ def make_rule(name: str, settings: PairedSettings, switch_cost: float = 0.0) -> 
     """
     if name not in RULES:
         raise ModelError(f"there is no selection rule {name!r}: {nearest(name, RULES)}")
-    return NearestNeighbours() if name == "paper" else PairedExpectedRatio(settings, switch_cost)
+    if name == "paper":
+        from adaptune.model.knn import NearestNeighbours  # compiled code, which few need
+
+        return NearestNeighbours()
+    return PairedExpectedRatio(settings, switch_cost)
 
 
 __all__ = [
@@ -31,10 +34,8 @@ __all__ = [
     "BankSettings",
     "ErrorModel",
     "ModelError",
-    "NearestNeighbours",
     "PairedExpectedRatio",
     "PairedSettings",
-    "ProductKNeighborsRegressor",
     "Rule",
     "TrainingData",
     "make_rule",

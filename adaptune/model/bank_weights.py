@@ -6,7 +6,6 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
-from scipy.optimize import nnls
 
 from adaptune.metrics import FAILURE
 from adaptune.model.base import Rule, TrainingData, mean_errors
@@ -259,6 +258,8 @@ def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64
     squares = squares + np.eye(n) * (RIDGE * squares[0, 0] + 1e-12)
     # Up to a factor they are those for which w'Sw - 2 sum w is least.
     root = np.linalg.cholesky(squares)
+    from scipy.optimize import nnls  # not needed to load a model
+
     weights, _ = nnls(root.T, np.linalg.solve(root, np.ones(n)))
     return np.asarray(weights / weights.sum())
 

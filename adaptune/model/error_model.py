@@ -4,7 +4,7 @@ import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from adaptune.archive import compact
 from adaptune.descriptor.base import DESCRIPTORS
-from adaptune.descriptor.pca import ScaledPCA
 from adaptune.model.bank_weights import BankSettings
 from adaptune.model.base import TrainingData
 from adaptune.model.model_file import (
@@ -27,6 +26,9 @@ from adaptune.parameter_sets import ParameterSets
 from adaptune.plain_words import in_one_line
 from adaptune.sequence.names import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
+
+if TYPE_CHECKING:
+    from adaptune.descriptor.pca import ScaledPCA
 
 SAME_SENSOR = 3.0
 """Degrees by which the lowest points of one sensor's scans may differ between drives."""
@@ -129,11 +131,13 @@ class ErrorModel:
         """Whether there is a bank, and it was shown to pay."""
         return bool(self.bank) and self.bank_settings.adapt
 
-    def pca(self) -> ScaledPCA:
+    def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
+        from adaptune.descriptor.pca import ScaledPCA  # not needed to load a model
+
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
 
-    def training_data(self, pca: ScaledPCA, members: Sequence[int] | None = None) -> TrainingData:
+    def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
         """What selection rules are fitted to.
 
         Parameters
@@ -211,8 +215,10 @@ class ErrorModel:
             return named if named in self.sets else None
         return self.sets.find(named)
 
-    def check_study(self, odometry: dict[str, Any], space: ParameterSpace, path: Path) -> None:
-        """Refuse a model of another odometry or of other parameters.
+    def check_study(
+        self, odometry: dict[str, Any], space: ParameterSpace, length: float, path: Path
+    ) -> None:
+        """Refuse a model of another odometry, of other parameters, or of other sub-trajectories.
 
         Parameters
         ----------
@@ -220,6 +226,8 @@ class ErrorModel:
             Its name and settings.
         space
             The parameters.
+        length
+            Metres of a sub-trajectory.
         path
             Where the model is from.
 
@@ -236,6 +244,11 @@ class ErrorModel:
             raise ModelError(
                 f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
                 f"offline` for this study"
+            )
+        if self.length != length:
+            raise ModelError(
+                f"{path}: is a model of errors over {self.length:g} m, the study's sub_trajectory "
+                f"is {length:g} m; run `adaptune offline` for this study"
             )
 
     def check_descriptors(

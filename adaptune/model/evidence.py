@@ -5,7 +5,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 NOVEL = 0.1
 """Familiarity below which evidence counts less and less."""
@@ -133,6 +132,8 @@ def _nearest(
     features: NDArray[np.float64], queries: NDArray[np.float64], n: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Mean squared distance of the `n` frames nearest to each query, and their numbers."""
+    from scipy.spatial.distance import cdist  # not needed to load a model
+
     squared = cdist(queries, features, "sqeuclidean")
     if n >= len(features):
         return squared.mean(axis=1), np.tile(np.arange(len(features)), (len(queries), 1))

@@ -66,6 +66,9 @@ class CommandSettings(BaseSettings):
         What the program reads.
     extrinsic : Transform, optional
         The LiDAR's pose in the frame whose poses the program writes.
+    version : str, optional
+        Version of the program. Change it where its file stays the same and the program does not, as
+        with a container or a shared library: results of the version before do not count any more.
     """
 
     command: Arguments
@@ -74,6 +77,7 @@ class CommandSettings(BaseSettings):
     format: Literal["tum", "kitti", "evalio"] = "tum"
     input: Layout = "bag"
     extrinsic: Transform | None = None
+    version: str | None = None
 
 
 class Command(OdometryInstance):

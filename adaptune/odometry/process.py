@@ -39,11 +39,15 @@ class ProcessSettings(BaseSettings):
         Where the program listens: ``tcp://HOST:PORT`` or ``unix:PATH``.
     settings : dict
         Settings that the program receives.
+    version : str, optional
+        Version of the program. Change it where its file stays the same and the program does not, as
+        with a container or a shared library: results of the version before do not count any more.
     """
 
     command: Arguments | None = None
     address: str | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
+    version: str | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -36,7 +36,7 @@ PROGRAMS = {
 }
 """Programs of the user."""
 
-_PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
+PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
 """Packages that our adapters run on, if the adapter's module has another name."""
 
 AnyOdometry = type[Odometry] | type["Command"] | type["Process"]
@@ -94,7 +94,7 @@ def versions(name: str) -> dict[str, str]:
     module = where(name).partition(":")[0]
     top = module.removeprefix(f"{__package__}.").partition(".")[0]
     if module.startswith(f"{__package__}."):
-        names.add(_PACKAGES.get(top, top))
+        names.add(PACKAGES.get(top, top))
     else:
         names |= set(metadata.packages_distributions().get(top, ()))
     found = {}

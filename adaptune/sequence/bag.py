@@ -15,6 +15,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.sequence import livox, pointcloud2, velodyne
+from adaptune.sequence.bag_files import files_of
 from adaptune.sequence.bag_index import IndexReader
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloudError
@@ -59,6 +60,7 @@ class BagSource:
     """
 
     random_access: ClassVar[bool] = False
+    pose_files: Sequence[Path] = ()
 
     def __init__(
         self,
@@ -104,6 +106,11 @@ class BagSource:
         """The bag's file; the first one's, and how many more there are."""
         more = f" (and {len(self.paths) - 1} more)" if len(self.paths) > 1 else ""
         return f"{self.paths[0]}{more}"
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of all bags."""
+        return files_of(self.paths)
 
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of their recording."""

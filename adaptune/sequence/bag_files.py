@@ -32,6 +32,12 @@ def bag_paths(given: Sequence[str]) -> list[Path]:
     return paths
 
 
+def files_of(paths: Sequence[Path]) -> list[Path]:
+    """The files of bags, of which some may be folders."""
+    found = [sorted(path.iterdir()) if path.is_dir() else [path] for path in paths]
+    return [file for files in found for file in files if file.is_file()]
+
+
 def _in_folder(folder: Path) -> list[Path]:
     if (folder / "metadata.yaml").exists():
         return [folder]

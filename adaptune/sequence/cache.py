@@ -30,7 +30,9 @@ from adaptune.sequence.scan import Scan
 _log = logging.getLogger(__name__)
 _NOT_KEPT = "%s: not kept in the cache (%s)"
 
-_VERSION = 3
+SMALL = 1 << 24
+"""Bytes below which the content of a file counts, all of it."""
+_VERSION = 4
 _SAMPLE = 1 << 16
 _CAP_GB, _MOST_GB = 50.0, 1e9
 # Seconds. A writer that has not written for this long is dead.
@@ -71,16 +73,20 @@ def cap() -> int:
 def key(paths: Sequence[Path], settings: Any) -> str:
     """Digest of files and settings; an OSError if a file cannot be read.
 
-    A file counts by its size, its time of change, its beginning and its end, not by its name. A
-    folder counts by its files.
+    A small file counts by its content, a large one by its size, its times of change, its beginning
+    and its end, and none by its name. A folder counts by its files.
     """
     digest = hashlib.blake2b(f"{_VERSION} {settings!r}".encode(), digest_size=16)
     for path in paths:
         files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
         for file in files:
             status = file.stat()
-            digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
+            digest.update(f"{status.st_size}".encode())
             with file.open("rb") as stream:
+                if status.st_size < SMALL:
+                    digest.update(stream.read())
+                    continue
+                digest.update(f" {status.st_mtime_ns} {status.st_ctime_ns}".encode())
                 digest.update(stream.read(_SAMPLE))
                 stream.seek(max(status.st_size - _SAMPLE, 0))
                 digest.update(stream.read(_SAMPLE))

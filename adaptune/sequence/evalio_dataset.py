@@ -1,10 +1,11 @@
 """Sequences of the public data sets that evalio knows, by name."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from itertools import count
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -49,6 +50,10 @@ def evalio_source(name: str) -> Source:
     return EvalioFiles(dataset)
 
 
+def _files(dataset: Any) -> list[Path]:
+    return sorted(path for path in Path(dataset.folder).rglob("*") if path.is_file())
+
+
 def _poses(dataset: Any) -> Trajectory | None:
     """Poses of the LiDAR; evalio's own are of a frame of each data set."""
     truth = dataset.ground_truth_raw()
@@ -77,6 +82,12 @@ class EvalioBag(BagSource):
         timing = Timing(stamp, period=float(recording.lidar_params.delta_time().to_sec()))
         super().__init__(paths, recording.lidar_topic, timing)
 
+    @property
+    def pose_files(self) -> list[Path]:  # type: ignore[override]
+        """The data set's other files."""
+        bags = set(self.files)
+        return [file for file in _files(self._dataset) if file not in bags]
+
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """The data set's poses, or those of a topic."""
         return _poses(self._dataset) if name is None else super().poses(name, child_frame)
@@ -91,10 +102,16 @@ class EvalioFiles:
     """A data set in its own format, which evalio converts point by point."""
 
     random_access: ClassVar[bool] = False
+    pose_files: Sequence[Path] = ()
 
     def __init__(self, dataset: Any):
         self._dataset = dataset
         self.n_messages = len(dataset)
+
+    @property
+    def files(self) -> list[Path]:
+        """All files of the data set."""
+        return _files(self._dataset)
 
     @property
     def name(self) -> str:

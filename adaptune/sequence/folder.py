@@ -34,12 +34,14 @@ class FileSource:
     """Scans in files of their own."""
 
     name: str  # the folder
-    files: Sequence[Path]
+    scans: Sequence[Path]
     stamps: NDArray[np.int64]  # nanoseconds of each file, of shape (n,)
     timing: Timing = AUTO  # what the stamps mean
     # Reads the LiDAR's poses stored with the files.
     own_poses: Callable[[], Trajectory] | None = None
     elevation: float = 0.0  # degrees by which every ray is to be turned up
+    stamp_files: Sequence[Path] = ()  # hold the stamps, where the files' names do not
+    pose_files: Sequence[Path] = ()  # hold the poses
 
     random_access: ClassVar[bool] = True
 
@@ -50,11 +52,16 @@ class FileSource:
     @property
     def n_messages(self) -> int:
         """Number of files."""
-        return len(self.files)
+        return len(self.scans)
+
+    @property
+    def files(self) -> list[Path]:
+        """Scans and stamps."""
+        return [*self.scans, *self.stamp_files]
 
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of the files' names."""
-        for path, stamp in zip(self.files, self.stamps.tolist(), strict=True):
+        for path, stamp in zip(self.scans, self.stamps.tolist(), strict=True):
             yield Frame(stamp, stamp, partial(self._load, path, stamp))
 
     def _load(self, path: Path, stamp: int) -> Scan:
@@ -160,7 +167,9 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
             break
     else:
         raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)})")
+    stamp_files: list[Path] = []
     if (times := folder / "times.txt").exists():
+        stamp_files.append(times)
         stamps = _seconds(times)
         if len(stamps) != len(files):
             raise SequenceError(
@@ -170,7 +179,7 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
         named = _named_stamps(files)
         evenly = np.arange(len(files)) * round(timing.period * 1e9)
         stamps = evenly if named is None else named
-    return FileSource(str(folder), files, stamps, timing)
+    return FileSource(str(folder), files, stamps, timing, stamp_files=stamp_files)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -223,8 +232,15 @@ def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
         return Trajectory(stamps, T)
 
     # Files may be missing from the front or the middle: their numbers give the stamps.
-    of_files, own_poses = _by_number(files, stamps), poses if found else None
-    return FileSource(str(folder), files, of_files, own_poses=own_poses, elevation=elevation)
+    return FileSource(
+        str(folder),
+        files,
+        _by_number(files, stamps),
+        own_poses=poses if found else None,
+        elevation=elevation,
+        stamp_files=[folder / "times.txt"],
+        pose_files=[found, folder / "calib.txt"] if found else [],
+    )
 
 
 def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
@@ -234,18 +250,35 @@ def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
     path = started if started.exists() else points / "timestamps.txt"
     stamps = _by_number(files, _dates(path))
     poses: Callable[[], Trajectory] | None = None
+    pose_files: list[Path] = []
     if (folder / "oxts" / "data").is_dir():
         poses = partial(_oxts_poses, folder)
+        pose_files = [*_oxts_files(folder), folder / "oxts" / "timestamps.txt"]
+        pose_files.append(folder.parent / "calib_imu_to_velo.txt")
     elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
         poses = partial(_kitti_360_poses, record, _dates(path))
+        calibrations = record.parent.parent / "calibration"
+        pose_files = [record / "poses.txt", *sorted(calibrations.glob("*.txt"))]
     if elevation is None:
         # Only the raw drives record the start of each turn; KITTI-360 has another LiDAR.
         elevation = _ELEVATION if started.exists() else 0.0
-    return FileSource(str(folder), files, stamps, own_poses=poses, elevation=elevation)
+    return FileSource(
+        str(folder),
+        files,
+        stamps,
+        own_poses=poses,
+        elevation=elevation,
+        stamp_files=[path],
+        pose_files=[file for file in pose_files if file.is_file()],
+    )
+
+
+def _oxts_files(folder: Path) -> list[Path]:
+    return sorted((folder / "oxts" / "data").glob("*.txt"))
 
 
 def _oxts_poses(folder: Path) -> Trajectory:
-    files = sorted((folder / "oxts" / "data").glob("*.txt"))
+    files = _oxts_files(folder)
     stamps = _by_number(files, _dates(folder / "oxts" / "timestamps.txt"))
     T_sensor_imu = _calibration_rt(folder.parent / "calib_imu_to_velo.txt")
     T_world_imu = read_oxts(files)

@@ -1,12 +1,13 @@
 """Open the sequences that a study describes."""
 
 from collections.abc import Callable
+from collections.abc import Sequence as Items
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from adaptune.sequence import cache, views
 from adaptune.sequence.bag import IMU_TYPES, BagSource
-from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.bag_files import bag_paths, files_of
 from adaptune.sequence.config import REFERENCE_FILES, ImuConfig, SequenceConfig, to_pose
 from adaptune.sequence.folder import kitti, scan_folder
 from adaptune.sequence.imu import ImuNoise
@@ -52,6 +53,29 @@ def check_sequence(config: SequenceConfig) -> None:
     reference is of another time.
     """
     _recorded(config).check()
+
+
+class SequenceFiles(NamedTuple):
+    """The files that a sequence is read from."""
+
+    recording: Items[Path]
+    reference: Items[Path]  # those of the poses, where they are not in the recording
+
+
+def sequence_files(config: SequenceConfig) -> SequenceFiles:
+    """The files that a sequence is read from; a SequenceError if it cannot be opened."""
+    reference = config.reference or ""
+    own = [Path(reference)] if reference.endswith(REFERENCE_FILES) else None
+    if config.bag is not None:
+        bags = bag_paths((config.bag,) if isinstance(config.bag, str) else config.bag)
+        return SequenceFiles(files_of(bags), own or ())
+    source, _ = _source(config)
+    return SequenceFiles(source.files, source.pose_files if own is None else own)
+
+
+def section_of(config: SequenceConfig) -> Section:
+    """The part of its recording that a sequence is; a SequenceError if it cannot be opened."""
+    return _recorded(config).section
 
 
 def _recorded(config: SequenceConfig) -> RecordedSequence:

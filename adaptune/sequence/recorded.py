@@ -14,6 +14,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.sequence import cache
 from adaptune.sequence.compensation import turning_of
+from adaptune.sequence.fingerprint import alongside
 from adaptune.sequence.imu import USUAL, Imu, ImuNoise, clock_offset
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import SequenceError
@@ -101,14 +102,15 @@ class RecordedSequence:
         the log.
         """
         repairs = Repairs()
-        if self.key is None:
-            yield from self._decode(repairs)
-        elif (kept := cache.find(self.key)) is not None:
+        kept = None if self.key is None else cache.find(self.key)
+        if kept is not None:
             yield from kept
             repairs.counts = kept.about["left_out"]
         else:
             about = self.source.about() | {"left_out": repairs.counts}
-            yield from cache.tee(self._decode(repairs), self.key, about)
+            decoded = self._decode(repairs)
+            with alongside(self.source.files):
+                yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
         repairs.report(self.name)
 
     def _decode(self, repairs: Repairs) -> Iterator[Scan]:

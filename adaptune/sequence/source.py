@@ -1,8 +1,9 @@
 """What every format of recordings offers, and which of its scans are used."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 from adaptune.sequence.imu import Imu
@@ -39,6 +40,14 @@ class Source(Protocol):
     @property
     def n_messages(self) -> int:
         """At least as many as there are scans."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """All files that its scans and its IMU are read from."""
+
+    @property
+    def pose_files(self) -> Sequence[Path]:
+        """All other files that its own poses are read from."""
 
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of their recording."""

@@ -151,13 +151,7 @@ class StudyConfig(StrictModel):
     def lasting(cls, resolved: Mapping[str, Any]) -> dict[str, Any]:
         """The part of a resolved configuration that may not change when a study is resumed.
 
-        Trials depend on it. Recordings may be added, and test sequences may change.
+        Trials depend on it. What is compared elsewhere, see `adaptune.study.inputs`, and the test
+        sequences may change.
         """
-        lasting = {key: resolved.get(key) for key in ("odometry", "sub_trajectory", "lost_track")}
-        lasting |= {key: resolved[key] for key in ("training", "recordings")}
-        for name in resolved["training"]:
-            for kind in ("sequences", "courses"):
-                entry = dict(resolved.get(kind, {}).get(name) or {})
-                entry.pop("cache", None)  # changes nothing but the time it takes
-                lasting[f"{kind}.{name}"] = entry
-        return lasting
+        return {key: resolved[key] for key in ("sub_trajectory", "lost_track")}

@@ -17,6 +17,7 @@ from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
+from adaptune.study.overlaps import overlaps
 from adaptune.study.roles import settle_roles
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 
@@ -160,6 +161,8 @@ def _check(
     for name, entry in sequences.items():
         if name not in origins:
             mistakes += _check_recording(name, entry, folder)
+    if config is not None and not mistakes:
+        mistakes += overlaps(config)
     return config, [_at_origin(mistake, origins) for mistake in mistakes]
 
 

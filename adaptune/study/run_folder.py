@@ -39,7 +39,7 @@ def check_folder(
             f"{path}: is damaged ({error}); give this study another folder (--folder), or remove "
             f"that one"
         ) from error
-    if differing := sorted(_differences(before, lasting(resolved))):
+    if differing := sorted(differences(before, lasting(resolved))):
         raise ConfigurationError(
             f"{folder} was begun with other values of {', '.join(differing)}; give this study "
             f"another folder (--folder), or remove that one"
@@ -75,9 +75,10 @@ def open_folder(folder: Path, resolved: Mapping[str, Any]) -> None:
     write_text(folder / CONFIGURATION, yaml.dump(resolved))
 
 
-def _differences(a: Any, b: Any, path: str = "") -> Iterable[str]:
+def differences(a: Any, b: Any, path: str = "") -> Iterable[str]:
+    """Paths of the values in which nested mappings differ."""
     if isinstance(a, dict) and isinstance(b, dict):
         for key in a.keys() | b.keys():
-            yield from _differences(a.get(key), b.get(key), f"{path}.{key}" if path else str(key))
+            yield from differences(a.get(key), b.get(key), f"{path}.{key}" if path else str(key))
     elif a != b:
         yield path

@@ -7,15 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.program_input import ProgramInput, program_input
-from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.config import SequenceConfig, ViewConfig
 from adaptune.sequence.export import Layout
+from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.names import OF_VIEW, origin
-from adaptune.sequence.opening import open_sequence
+from adaptune.sequence.opening import SequenceFiles, open_sequence, sequence_files
 from adaptune.sequence.sequence import Sequence
 from adaptune.sequence.views import WithImu
 from adaptune.simulation.course import Course
 from adaptune.study.mistakes import ConfigurationError
+
+_PATHS = ("bag", "kitti", "folder", "evalio")
+_OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
+"""Keys of a sequence that change its reference only."""
 
 _inputs: dict[tuple[str, str], ProgramInput] = {}
 """What programs read, by folder and everything that it depends on."""
@@ -58,44 +62,49 @@ class StudySequences:
         ConfigurationError
             If the course has not been recorded.
         """
+        self._check_recorded(name)
+        sequence = open_sequence(self.config(name))
+        return WithImu(sequence) if self.with_imu else sequence
+
+    def _check_recorded(self, name: str) -> None:
         course = origin(name)
         if course in self.courses and not self.recording(course).exists():
             raise ConfigurationError(
                 f"{self.recording(course)}: the course {course} is not recorded yet; run "
                 f"`adaptune simulate` with this study first"
             )
-        sequence = open_sequence(self.config(name))
-        return WithImu(sequence) if self.with_imu else sequence
 
-    def recording_size(self, name: str) -> list[int] | None:
-        """Sizes in bytes of a recording's files, which show that another one is in its place.
-
-        None for simulated courses, which their configuration identifies, and for folders of scans.
-        """
-        bag = self.config(name).bag
-        if bag is None or name in self.courses:
-            return None
-        files = [
-            file
-            for path in bag_paths((bag,) if isinstance(bag, str) else bag)
-            for file in (sorted(path.iterdir()) if path.is_dir() else [path])
-        ]
-        return [file.stat().st_size for file in files if file.is_file()]
+    def files(self, name: str) -> SequenceFiles:
+        """The files that a sequence is read from; errors as of `open`."""
+        self._check_recorded(name)
+        return sequence_files(self.config(name))
 
     def identity(self, name: str) -> dict[str, Any]:
-        """Everything that the scans of a sequence depend on, as plain data."""
-        course = self.courses.get(name)
+        """Everything that the scans of a sequence depend on, as plain data.
+
+        A recording is known by its content, not by its path.
+        """
+        course = self.courses.get(origin(name))
+        config = self.config(name).model_dump(mode="json", exclude={*_PATHS, *_OF_POSES, "cache"})
         return {
-            "sequence": self.config(name).model_dump(mode="json"),
+            "sequence": config,
             "course": None if course is None else course.model_dump(mode="json"),
-            "recording": self.recording_size(name),
+            "recording": fingerprints(self.files(name).recording),
         }
+
+    def reference(self, name: str) -> dict[str, Any]:
+        """Everything that the reference of a sequence depends on besides its scans."""
+        config = self.config(name).model_dump(mode="json", include=set(_OF_POSES))
+        files = self.files(name).reference
+        if files and config["reference"] is not None:
+            config["reference"] = "a file"
+        return {"poses": config, "reference": fingerprints(files)}
 
     def program_input(self, name: str) -> ProgramInput:
         """A sequence as a program reads it."""
         folder = self.folder / "inputs" / name
-        # 2: with intensities.
-        about = {"version": 2, "input": self.layout} | self.identity(name)
+        # 3: with the recording's content.
+        about = {"version": 3, "input": self.layout} | self.identity(name)
         key = str(folder), json.dumps(about)
         if key not in _inputs:
             config = self.config(name)

@@ -1,7 +1,7 @@
 """A study: a checked configuration, and what is made of it."""
 
-import hashlib
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from typing_extensions import TypeVar
 
 from adaptune.cores import available
 from adaptune.odometry.base import Description, WarmUp
+from adaptune.odometry.content import odometry_content
 from adaptune.odometry.declaration import declare
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.sequence.names import OF_VIEW
@@ -23,6 +24,8 @@ from adaptune.study.run_folder import check_folder, open_folder
 from adaptune.study.sequences import StudySequences
 
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
+
+_log = logging.getLogger(__name__)
 
 Mechanism = Literal["live", "hand_over", "bank"]
 
@@ -122,6 +125,11 @@ class Study(Generic[C_co]):
                     f"{path}: was written by an older adaptune; run `adaptune switching` again"
                 )
             if measured["of"] != self.switching_identity():
+                _log.warning(
+                    "%s: was measured with another odometry, warm-up or recording; a switch counts "
+                    "as free until you run `adaptune switching` again",
+                    path,
+                )
                 return 0.0
             return max(0.0, float(measured["switch_cost"]))
         except FileNotFoundError:
@@ -136,14 +144,20 @@ class Study(Generic[C_co]):
         return {
             "odometry": self.odometry.name,
             "settings": self.odometry.settings.model_dump(mode="json"),
+            "content": odometry_content(self.odometry.name, self.odometry.settings),
+            "sequences": {name: self._measured_on(name) for name in self.config.training},
             "mechanism": self.mechanism,
             "warm_up": self.warm_up._asdict(),
         }
 
-    def check(self) -> None:
-        """Refuse a folder that was begun with another study.
+    def _measured_on(self, name: str) -> dict[str, Any]:
+        return self.sequences.identity(name) | self.sequences.reference(name)
 
-        The budget, the number of workers, the test sequences and the replays may change.
+    def check(self) -> None:
+        """Refuse a folder that was begun with other settings of the offline stage.
+
+        The budget, the number of workers, the sequences and the replays may change. What results
+        depend on is compared by `adaptune.study.inputs`.
 
         Raises
         ------
@@ -165,15 +179,11 @@ class Study(Generic[C_co]):
         open_folder(self.folder, self._resolved())
 
     def _resolved(self) -> dict[str, Any]:
-        """The configuration with nothing left to defaults, and the sizes of its recordings."""
+        """The configuration with nothing left to defaults."""
         resolved, settings = self.config.resolved(), self.odometry.settings
         resolved["odometry"]["settings"] = settings.model_dump(mode="json")
         resolved["odometry"]["parameters"] = self.odometry.space.dump()
-        if template := getattr(settings, "template", None):
-            text = Path(template).read_bytes()
-            resolved["odometry"]["template"] = hashlib.sha256(text).hexdigest()[:16]
-        sizes = {name: self.sequences.recording_size(name) for name in self.config.training}
-        return resolved | {"recordings": sizes}
+        return resolved
 
 
 def odometry_settings(config: OdometryConfig) -> Any:

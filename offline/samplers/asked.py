@@ -38,7 +38,9 @@ class AskedSampler(Sampler):
     Many Optuna samplers keep notes on the trials that they proposed: a generation, a population,
     the state of their random numbers. A resumed search therefore asks again for the earlier
     proposals, and answers from the history. Samplers without notes receive the history instead,
-    and begin every batch with a seed of its own. Nothing is kept on disk.
+    and begin every batch with a seed of its own; so do those that no longer propose what they did,
+    because sequences were added or removed, or another version is installed. Nothing is kept on
+    disk.
 
     If the sampler proposes a set that was tried before, it receives the known value at once and is
     asked again. After many attempts, a random set is taken.
@@ -47,6 +49,7 @@ class AskedSampler(Sampler):
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         super().__init__(space, config)
         self._distributions = {name: _distribution(p) for name, p in space.parameters.items()}
+        self._forgetful = config.sampler in FORGETFUL
         self._begin(0, ())
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
@@ -85,16 +88,15 @@ class AskedSampler(Sampler):
         return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        if self.config.sampler in FORGETFUL:
-            self._begin(numbers.start // self.config.batch, history)
-            return self._ask(numbers)
         if self._history != list(history[: len(self._history)]):
             self._begin(0, ())
-        while len(self._history) < numbers.start:
+        while len(self._history) < numbers.start and not self._forgetful:
             first = len(self._history)
             batch = range(first, first + self.config.batch)
             self._ask(batch)
             self._answer(history[batch.start : batch.stop])
+        if self._forgetful:
+            self._begin(numbers.start // self.config.batch, history)
         return self._ask(numbers)
 
     def _ask(self, numbers: range) -> list[ParameterSet]:
@@ -148,12 +150,8 @@ class AskedSampler(Sampler):
     def _answer(self, results: Sequence[SamplerResult]) -> None:
         asked = [parameters for parameters, _ in self._waiting.values()]
         if asked != [result.parameters for result in results]:
-            raise SamplerError(
-                f"{self.config.sampler} no longer proposes what it proposed for trials "
-                f"{len(self._history)} to {len(self._history) + len(results) - 1}: is another "
-                f"version of it installed? Go back to that one, or give the study another folder "
-                f"(--folder)"
-            )
+            self._forgetful = True
+            return
         for (_, trials), result in zip(self._waiting.values(), results, strict=True):
             for trial in trials:
                 self._tell(trial, result)

@@ -102,9 +102,9 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
     assert n_seen[training.fixed] == 4
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
     assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
-    before = (study.folder / "model.safetensors").read_bytes()
     validation = validate(study).validation
     assert len(validation.left_out) == 4
+    before = (study.folder / "model.safetensors").read_bytes()
 
     # Some of it lost, as to a killed driver, and made again.
     for number in (4, 7):

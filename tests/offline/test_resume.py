@@ -3,14 +3,20 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import drives
+import numpy as np
 import pytest
 
+from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.study.inputs import check_inputs
 from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
 from offline.train import train
+from offline.validate import validate
 
 
 def load(folder):
@@ -20,7 +26,7 @@ def load(folder):
 def write(study_file, folder):
     for name in ("one", "two"):
         shutil.copy2(study_file.parent / f"{name}.bag", folder)
-    text = study_file.read_text().replace("bag: three.bag", "bag: two.bag")
+    text = study_file.read_text().replace("bag: three.bag", f"bag: {study_file.parent}/three.bag")
     (folder / "small.yaml").write_text(text)
     return load(folder)
 
@@ -66,11 +72,119 @@ def test_a_damaged_trial_is_named(trained):
     train(trained)
 
 
-def test_another_recording_in_its_place_is_noticed(trained, tmp_path):
-    (tmp_path / "one.bag").unlink()
-    drives.write_bag(tmp_path / "one.bag", drives.scans(7, 40))
-    with pytest.raises(ConfigurationError, match=r"other values of recordings\.one"):
-        train(load_study(tmp_path / "small.yaml", ["offline.trials=4"], trained.folder))
+def mtimes(folder):
+    """When the files of trials were written, by sequence and number."""
+    return {path.relative_to(folder): path.stat().st_mtime_ns for path in folder.rglob("*.npz")}
+
+
+def test_only_what_depends_on_another_recording_is_computed_again(trained, tmp_path):
+    before, trials = ErrorModel.load(trained.model_path), trained.folder / "trials"
+    written = mtimes(trials)
+    drives.write_bag(tmp_path / "new.bag", drives.scans(7, 40))
+    (tmp_path / "new.bag").replace(tmp_path / "one.bag")
+    study = load(tmp_path)
+    with pytest.raises(
+        ConfigurationError, match=r"one\.bag has other content .* 4 trials on one, "
+    ):
+        train(study)
+    assert mtimes(trials) == written
+    found = train(study, again=True).model
+    after = mtimes(trials)
+    assert {path.parts[0] for path in written if after[path] != written[path]} == {"one"}
+    assert found.sets.parameters == before.sets.parameters
+    of_one, of_two = found.sequence == 0, found.sequence == 1
+    assert not np.array_equal(found.errors[of_one], before.errors[before.sequence == 0])
+    assert np.array_equal(found.errors[of_two], before.errors[before.sequence == 1])
+    check_inputs(study)
+
+
+def test_another_odometry_computes_everything_again(trained, tmp_path):
+    written = mtimes(trained.folder / "trials")
+    other = ["offline.trials=4", "odometry.settings.downsampling=0.6"]
+    study = load_study(tmp_path / "small.yaml", other, trained.folder)
+    with pytest.raises(ConfigurationError, match=r"downsampling has another value.* the model\."):
+        train(study)
+    train(study, again=True)
+    after = mtimes(trained.folder / "trials")
+    assert after.keys() >= {path for path in written if "whole" not in path.name}
+    assert not any(after.get(path) == written[path] for path in written)
+    assert b'"adaptune trial":3' in (trained.folder / "optuna.log").read_bytes()
+
+
+def test_with_nothing_to_do_nothing_is_done(trained):
+    """And the validation stays."""
+    validate(trained)
+    before, time = trained.model_path.read_bytes(), trained.model_path.stat().st_mtime_ns
+    first = train(trained)
+    assert trained.model_path.stat().st_mtime_ns == time
+    assert ErrorModel.load(trained.model_path).validation
+    # A refit keeps it, too, if it finds the same.
+    model = ErrorModel.load(trained.model_path)
+    replace(model, provenance=model.provenance | {"evidence": ""}).save(trained.model_path)
+    train(trained)
+    assert trained.model_path.read_bytes() == before
+    # Other evidence drops it.
+    more = load_study(trained.folder.parent / "small.yaml", ["offline.trials=5"], trained.folder)
+    assert not train(more).model.validation
+    assert len(first.means["one"]) == 4
+
+
+def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
+    code = (
+        "import sys\n"
+        "from typer.testing import CliRunner\n"
+        "from adaptune.cli import app\n"
+        f"given = ['offline', {str(trained.folder.parent / 'small.yaml')!r}, '--folder', "
+        f"{str(trained.folder)!r}, '-o', 'offline.trials=4']\n"
+        "done = CliRunner().invoke(app, given)\n"
+        "assert done.exit_code == 0, done.output\n"
+        "print(*sys.modules)"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    heavy = {"optuna", "sklearn", "scipy", "open3d", "numba", "matplotlib", "pandas", "sqlalchemy"}
+    assert heavy.isdisjoint(done.stdout.split()), heavy.intersection(done.stdout.split())
+
+
+def test_sequences_are_added_and_removed(trained, tmp_path):
+    written = mtimes(trained.folder / "trials")
+    drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
+    four = "sequences.four={bag: four.bag, points: /points, reference: /truth}"
+
+    def run(*names):
+        given = ["offline.trials=4", four, f"training=[{', '.join(names)}]"]
+        return train(load_study(tmp_path / "small.yaml", given, trained.folder)).model
+
+    added = run("one", "two", "four")
+    assert added.sequences == ["one", "two", "four"]
+    assert not np.isnan(added.errors).any()
+    after = mtimes(trained.folder / "trials")
+    assert {path.parts[0] for path in after.keys() - written.keys() if path.stem.isdigit()} == {
+        "four"
+    }
+    assert all(after[path] == time for path, time in written.items())
+    assert run("one", "four").sequences == ["one", "four"]
+    # It counts again, and nothing is run for it.
+    again = run("one", "two", "four")
+    assert again.digest == added.digest
+    assert mtimes(trained.folder / "trials").items() >= after.items()
+
+
+@pytest.mark.parametrize("place", [("two", 2), ("one", 3)])
+def test_a_trial_copied_over_another_is_named(trained, place):
+    folder = trained.folder / "trials"
+    shutil.copy2(folder / "one/00002.npz", Archive(folder).trial_path(*place))
+    with pytest.raises(AdaptuneError, match=r"holds trial 2 on one, so it was copied over"):
+        train(trained)
+
+
+def test_trials_that_changed_places_are_named(trained):
+    one, two = (trained.folder / "trials" / name / "00001.npz" for name in ("one", "two"))
+    one.rename(one.with_name("x"))
+    two.rename(one)
+    one.with_name("x").rename(two)
+    with pytest.raises(AdaptuneError, match=r"one/00001\.npz: holds trial 1 on two"):
+        train(trained)
 
 
 @pytest.mark.usefixtures("study")

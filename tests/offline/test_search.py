@@ -29,11 +29,11 @@ def study_of(study_file, tmp_path):
     """A study of three sequences with some settings, in an unused folder or in a given one."""
     numbers = itertools.count()
 
-    def make(folder=None, **given):
+    def make(folder=None, training=NAMES, **given):
         given = {"trials": 11, "initial": 4, "batch": 4} | given
         overrides = [f"offline.{key}={value}" for key, value in given.items()]
         folder = folder or tmp_path / str(next(numbers)) / "study"
-        overrides += ["training=[one, two, three]", "test=[]"]
+        overrides += [f"training=[{', '.join(training)}]", "test=[]"]
         study = load_study(study_file, overrides, folder)
         folder.mkdir(parents=True, exist_ok=True)
         return study
@@ -61,9 +61,13 @@ def run(study):
     return verdicts, seen, archive
 
 
-def stages_of(study, finished):
-    space = study.odometry.space
-    return make_stages(study.config.offline, space, study.training, finished)
+def stages_of(study):
+    space, archive = study.odometry.space, Archive(study.folder / "trials")
+    return make_stages(study.config.offline, space, study.training, archive)
+
+
+def owner_of(archive, number):
+    return owner(archive.slots(), number)
 
 
 def sets(archive):
@@ -74,33 +78,34 @@ def sets(archive):
 @pytest.mark.parametrize("kind", ["shared", "own", "both"])
 def test_every_number_is_of_one_search(study_of, kind):
     study = study_of(sets=kind)
-    finished = {name: {} for name in NAMES}
-    stages = stages_of(study, finished)
+    stages = stages_of(study)
     searches = [search for stage in stages for search in stage.searches]
     assert len(searches) == {"shared": 1, "own": 3, "both": 4}[kind]
-    numbers = sorted(search.number(i) for search in searches for i in range(1, 20))
-    assert numbers == list(range(1, 1 + 19 * len(searches)))
-    config = study.config.offline
+    assert len({search.number(i) for search in searches for i in range(1, 20)}) == 19 * len(
+        searches
+    )
+    slots = Archive(study.folder / "trials").slots()
     for search in searches:
         assert search.number(0) == 0
         alone = search.sequences[0] if len(search.sequences) == 1 else None
-        assert {owner(config, NAMES, search.number(i)) for i in range(1, 9)} == {alone}
-    assert owner(config, NAMES, 0) is None
+        assert {owner(slots, search.number(i)) for i in range(1, 9)} == {alone}
+    assert owner(slots, 0) is None
 
 
 def test_each_sequence_searches_for_itself(study_of):
     study = study_of(sets="own")
     verdicts, seen, archive = run(study)
-    assert list(verdicts) == list(seen) == list(range(1 + 3 * 10))
+    numbers = [0, *(100_000 * slot + i for slot in (1, 2, 3) for i in range(1, 11))]
+    assert list(verdicts) == list(seen) == numbers
     best = {}
     for name in NAMES:
         of = archive.finished(name)
-        mine = [n for n in seen if owner(study.config.offline, NAMES, n) in (name, None)]
+        mine = [n for n in seen if owner_of(archive, n) in (name, None)]
         assert len(mine) == 11
         best[name] = min(mine, key=lambda n: (of[n].mean_error, n))
     for n, names in seen.items():
         everywhere = n == 0 or n in best.values()
-        assert names == (NAMES if everywhere else [owner(study.config.offline, NAMES, n)])
+        assert names == (NAMES if everywhere else [owner_of(archive, n)])
         assert verdicts[n].complete == everywhere
         assert list(verdicts[n].sequences) == names
     fixed = choose_fixed(study.config.offline, verdicts)
@@ -112,23 +117,17 @@ def test_each_sequence_searches_for_itself(study_of):
     assert means[fixed] < means[0]
     # The searches differ from each other, in their initial points too.
     assert (
-        len(
-            {
-                str(archive.finished(owner(study.config.offline, NAMES, n))[n].parameters)
-                for n in range(1, 31)
-            }
-        )
-        == 30
+        len({str(archive.finished(owner_of(archive, n))[n].parameters) for n in numbers[1:]}) == 30
     )
 
 
 def test_both_make_what_each_would_make_alone(study_of):
     of_both = sets(run(study_of(sets="both"))[2])
     shared, own = (sets(run(study_of(sets=kind))[2]) for kind in ("shared", "own"))
-    for name in NAMES:
-        j = NAMES.index(name)
-        assert all(of_both[name, 1 + 4 * i] == shared[name, 1 + i] for i in range(10))
-        assert all(of_both[name, 2 + 4 * i + j] == own[name, 1 + 3 * i + j] for i in range(10))
+    for slot, name in enumerate(NAMES, start=1):
+        assert all(of_both[name, i] == shared[name, i] for i in range(1, 11))
+        own_numbers = [100_000 * slot + i for i in range(1, 11)]
+        assert all(of_both[name, n] == own[name, n] for n in own_numbers)
 
 
 SAMPLERS = {
@@ -162,10 +161,45 @@ def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind):
     assert sets(archive).items() <= sets(other).items()
 
 
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("kind", ["shared", "both"])
+def test_sequences_are_added_and_removed(study_of, sampler, kind):
+    """Sets that have run are not proposed again, and numbers stay."""
+    given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
+
+    def run_on(names, trials, folder=None):
+        study = study_of(folder, trials=trials, training=names, **given)
+        pool = drawn.Drawn(error)
+        verdicts = run_batches(study, Archive(study.folder / "trials"), pool)
+        return study.folder, verdicts, {(t.sequence, n) for t in pool.tasks for n in t.numbers}
+
+    folder, first, _ = run_on(["two", "one"], 10)
+    before = sets(Archive(folder / "trials"))
+    _, verdicts, ran = run_on(NAMES, 10, folder)
+    after = sets(Archive(folder / "trials"))
+    assert before.items() <= after.items()
+    new = {(name, n) for name, n in ran if name != "three" and n < 300_000}
+    # Only the best set of each sequence may be another one now, and runs everywhere.
+    assert new <= ({(n, t) for n in NAMES for t in verdicts} if kind == "both" else set())
+    shared = [n for n in verdicts if n < 100_000]
+    assert shared == [n for n in first if n < 100_000]
+    assert all(after["three", n] == before["one", n] for n in shared)
+    _, fewer, ran = run_on(["three"], 14, folder)
+    assert max(n for n in fewer if n < 100_000) >= max(shared)
+    _, _, ran = run_on(NAMES, 14, folder)
+    everything = sets(Archive(folder / "trials"))
+    assert after.items() <= everything.items()
+    numbers = {n: str(s) for (_, n), s in everything.items()}
+    assert all(str(s) == numbers[n] for (_, n), s in everything.items())
+    of_search = [text for n, text in numbers.items() if n < 100_000]
+    assert len(set(of_search)) == len(of_search)
+    assert run_on(NAMES, 14, folder)[2] == set()
+
+
 def test_a_search_that_is_over_waits_for_the_others(study_of):
     study = study_of(sets="own", target=1.2, trials=60)
-    verdicts, seen, _ = run(study)
-    n = {name: sum(owner(study.config.offline, NAMES, k) == name for k in seen) for name in NAMES}
+    verdicts, seen, archive = run(study)
+    n = {name: sum(owner_of(archive, k) == name for k in seen) for name in NAMES}
     # The third is never below 2.
     assert n["three"] == 59
     assert max(n["one"], n["two"]) < 59
@@ -174,7 +208,7 @@ def test_a_search_that_is_over_waits_for_the_others(study_of):
 
 def test_views_search_for_themselves(study_of):
     study = study_of(sets="own", augment="[{reverse: true}]")
-    (stage,) = stages_of(study, {name: {} for name in study.training})
+    (stage,) = stages_of(study)
     assert [search.sequences for search in stage.searches] == [[name] for name in study.training]
     assert len(stage.searches) == 6
 
@@ -193,14 +227,14 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     assert complete.fixed() == choose_fixed(study.config.offline, verdicts)
     for sequence in complete.sequences:
         assert sequence.own.tolist() == [
-            owner(study.config.offline, NAMES, n) == sequence.name for n in complete.sets
+            owner_of(archive, n) == sequence.name for n in complete.sets
         ]
     validation = leave_one_out(complete)
     for left_out in validation.left_out:
         known = [
             archive.finished(left_out.name)[n].mean_error
             for n in complete.sets
-            if owner(study.config.offline, NAMES, n) != left_out.name
+            if owner_of(archive, n) != left_out.name
         ]
         assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
 

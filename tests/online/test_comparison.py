@@ -4,6 +4,7 @@ import math
 import shutil
 from dataclasses import replace
 
+import drives
 import numpy as np
 import pytest
 from pictures import texts
@@ -213,8 +214,8 @@ def test_a_written_reference_is_that_of_the_scans(replayed):
     np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.3 * np.arange(40), atol=1e-9)
 
 
-def test_rows_over_several_sequences(replayed, study_file):
-    bag = study_file.parent / "two.bag"
+def test_rows_over_several_sequences(replayed, study_file, tmp_path):
+    bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
     study = load_study(
         study_file,
         [
@@ -238,12 +239,14 @@ def test_rows_over_several_sequences(replayed, study_file):
         ("odometry.settings.downsampling=0.4", "is a model of .*0.5.*0.4"),
         ("odometry.parameters.keyframe_interval.high=20", "other parameters or ranges"),
         ("test=[]", "name at least one sequence"),
+        ("sub_trajectory=2", "is a model of errors over 3 m, the study's sub_trajectory is 2 m"),
     ],
 )
-def test_refuses_a_model_of_something_else(trained, study_file, override, words):
+def test_refuses_a_model_of_something_else(trained, study_file, tmp_path, override, words):
     study = load_study(study_file, [override], trained.folder)
+    model = shutil.copy(trained.model_path, tmp_path / "other.safetensors")
     with pytest.raises(AdaptuneError, match=words):
-        run_replays(study, trained.folder / "model.safetensors")
+        run_replays(study, model)
 
 
 def test_names_a_missing_replay(study_file, tmp_path):

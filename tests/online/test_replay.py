@@ -1,5 +1,6 @@
 import csv
 import json
+from pathlib import Path
 
 import drives
 import numpy as np
@@ -54,6 +55,7 @@ def scans(stamps):
 
 
 HEALTH = HealthCheck(max_speed=5.0, max_acceleration=20.0)
+MODEL = Path("model.safetensors")
 ABOUT = ReplayIdentity(
     mode="x",
     parameters=None,
@@ -64,7 +66,7 @@ ABOUT = ReplayIdentity(
     health={},
     sequence={},
     course=None,
-    recording=None,
+    recording=[],
 )
 
 
@@ -180,7 +182,7 @@ def test_poor_scans_are_counted(tmp_path):
     odometry = Scripted([0.1, None, 0.1])
     result = replay(scans(np.arange(5) / 10), InProcess(odometry), HEALTH)
     assert result.registered.tolist() == [True, True, False, True, True]
-    write_replay(tmp_path, result, ABOUT)
+    write_replay(tmp_path, result, ABOUT, MODEL)
     assert json.loads((tmp_path / "replay.json").read_text())["poor_scans"] == 1
 
 
@@ -190,7 +192,7 @@ def test_too_many_scans_that_do_not_register_restart(tmp_path):
     result = replay(scans(np.arange(11) / 10), InProcess(odometry), check)
     assert np.flatnonzero(result.restarted).tolist() == [5, 8]
     assert result.unhealthy == {"max_unregistered": 2}
-    write_replay(tmp_path, result, ABOUT)
+    write_replay(tmp_path, result, ABOUT, MODEL)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["unhealthy"] == {"max_unregistered": 2}
 
@@ -220,7 +222,7 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
     a, b = (r.trajectory.T_world_sensor for r in results)
     np.testing.assert_array_equal(a, b)
     assert abs(a[-1, 0, 3] - 24 * 0.3) < 0.1
-    write_replay(tmp_path, results[0], ABOUT)
+    write_replay(tmp_path, results[0], ABOUT, MODEL)
     written = read_tum(tmp_path / "trajectory.tum")
     np.testing.assert_array_equal(written.stamps, [stamp for stamp, _, _ in drives.scans(0, 25)])
     np.testing.assert_allclose(written.T_world_sensor, a, atol=1e-8)

@@ -10,9 +10,9 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.utils.estimator_checks import parametrize_with_checks
 from tables import table
 
-from adaptune.model import NearestNeighbours, TrainingData
+from adaptune.model import TrainingData
 from adaptune.model.base import mean_errors
-from adaptune.model.knn import ProductKNeighborsRegressor, nearest_of_groups
+from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor, nearest_of_groups
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

@@ -303,8 +303,8 @@ def test_the_whole_way(make):
     assert {row.mode for row in compare(study)} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")
-    with pytest.raises(ConfigurationError, match=r"other values of odometry\.template"):
-        study.open()
+    with pytest.raises(ConfigurationError, match=r"file\.json has other content .* 2 replays\."):
+        train(study)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,98 @@
+"""What an odometry or a descriptor is, by its content: versions, sources, programs.
+
+Nothing of the user's is imported. What a class imports, shared libraries, and a program behind an
+address are not part of it.
+"""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from adaptune.descriptor import DESCRIPTORS
+from adaptune.descriptor.base import ENTRY_POINTS as DESCRIPTOR_ENTRY_POINTS
+from adaptune.odometry.registry import ENTRY_POINTS, ODOMETRIES, PACKAGES, PROGRAMS
+from adaptune.sequence.fingerprint import fingerprint
+
+Content = dict[str, str]
+"""By what it is of, in words, a version or the hash of a file."""
+
+
+def odometry_content(name: str, settings: Any) -> Content:
+    """What the poses of an odometry depend on besides its name, settings and parameters.
+
+    Parameters
+    ----------
+    name
+        See `adaptune.odometry.registry.odometry_class`.
+    settings
+        Its settings, which name the files of a program.
+    """
+    if name in PROGRAMS:
+        return _program(settings)
+    if name in ODOMETRIES:
+        adapter = ODOMETRIES[name].split(":")[0].removeprefix("adaptune.odometry.").split(".")[0]
+        package = PACKAGES.get(adapter, adapter)
+        return {f"version of {package}": _version(package)}
+    return _python(name, ENTRY_POINTS)
+
+
+def descriptor_content(names: Iterable[str]) -> Content:
+    """What the descriptors of these names depend on; nothing for those of adaptune."""
+    found: Content = {}
+    for name in names:
+        if name not in DESCRIPTORS:
+            found |= _python(name, DESCRIPTOR_ENTRY_POINTS)
+    return found
+
+
+def _python(name: str, group: str) -> Content:
+    """Source of a module, and version of the distribution that it is from."""
+    versions: Content = {}
+    if ":" not in name:
+        for point in metadata.entry_points(group=group, name=name):
+            name = point.value
+            if point.dist is not None:
+                versions[f"version of {point.dist.name}"] = point.dist.version
+    module = name.partition(":")[0]
+    file = module_file(module)
+    if file is None:
+        return versions
+    if not versions and "site-packages" in file.parts:
+        # This takes half a second.
+        for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
+            versions[f"version of {package}"] = _version(package)
+    return versions | {f"module {module}": fingerprint(file)}
+
+
+def module_file(name: str) -> Path | None:
+    """File of a module, found without importing it or what it is in; None if there is none."""
+    where, origin, parts = None, None, name.split(".")
+    for i in range(len(parts)):
+        full = ".".join(parts[: i + 1])
+        specs = (finder.find_spec(full, where) for finder in sys.meta_path)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None:
+            return None
+        where, origin = spec.submodule_search_locations, spec.origin
+    return Path(origin) if origin is not None and os.path.isfile(origin) else None  # noqa: PTH113
+
+
+def _program(settings: Any) -> Content:
+    found: Content = {}
+    program, *arguments = settings.command or ("",)
+    for name in (shutil.which(program), *arguments, getattr(settings, "template", None)):
+        # Arguments may be anything, also too long for a path.
+        if name and os.path.isfile(name):  # noqa: PTH113
+            found[name] = fingerprint(Path(name))
+    return found
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"

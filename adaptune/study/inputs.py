@@ -1,0 +1,269 @@
+"""What a study's results depend on: noted beside its trials, and compared when it is resumed."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adaptune import __version__
+from adaptune.files import write_text
+from adaptune.odometry.content import descriptor_content, odometry_content
+from adaptune.sequence.fingerprint import MANY
+from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.run_folder import differences
+from adaptune.study.study import Study
+
+FILE = "inputs.json"
+"""In the folder of a sequence's trials: what they depend on."""
+AGAIN = "`adaptune offline --again` with this study"
+
+
+class Stale(NamedTuple):
+    """A sequence whose trials depend on something that has changed."""
+
+    name: str
+    changes: Sequence[str]  # what has changed, in words
+    odometry: bool  # whether this concerns all sequences
+
+
+class InputNotes:
+    """Notes what the trials of a sequence depend on, before the first of them is stored."""
+
+    def __init__(self, study: Study):
+        self._study = study
+        # What runs is what is there now, whatever becomes of the files.
+        self._odometry, self._descriptors = odometry_inputs(study), described_by(study)
+
+    def __call__(self, name: str) -> None:
+        """Write the note of a sequence, if it has none."""
+        path = _path(self._study, name)
+        if path.exists():
+            return
+        of_sequence = self._study.sequences.identity(name) | self._study.sequences.reference(name)
+        about = {"adaptune": __version__, "odometry": self._odometry}
+        about |= {"descriptors": self._descriptors}
+        write_text(path, json.dumps(about | of_sequence, indent=1) + "\n")
+
+
+def odometry_inputs(study: Study) -> dict[str, Any]:
+    """Everything about the odometry that trials and replays depend on, as plain data."""
+    odometry = study.odometry
+    about = {
+        **odometry.identity,
+        "parameters": odometry.space.dump(),
+        "content": odometry_content(odometry.name, odometry.settings),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(about))
+    return plain
+
+
+def described_by(study: Study) -> dict[str, str]:
+    """What the user's descriptors depend on."""
+    return descriptor_content(study.config.descriptor.names)
+
+
+def stale(study: Study) -> list[Stale]:
+    """The sequences whose stored trials depend on something that has changed since.
+
+    Of sequences that are not trained on at present, only the odometry is compared.
+
+    Raises
+    ------
+    ConfigurationError
+        If a note is damaged.
+    """
+    now, found = odometry_inputs(study), []
+    for folder in sorted((study.folder / "trials").glob("*/")):
+        name = folder.name
+        before = _read(study, name)
+        if before is None:
+            if n_trials(study, name):
+                what = f"{folder} holds trials of an older adaptune, which did not note their input"
+                found.append(Stale(name, [what], odometry=False))
+            continue
+        changes = list(_odometry_changes(before["odometry"], now))
+        odometry = bool(changes)
+        if name in study.training:
+            changes += _sequence_changes(study, name, before)
+        if changes:
+            found.append(Stale(name, changes, odometry))
+    return found
+
+
+def check_inputs(study: Study) -> None:
+    """Refuse a study whose stored trials depend on something that has changed since.
+
+    Raises
+    ------
+    ConfigurationError
+        It says what has changed, which results depend on it, and what to do.
+    """
+    if not (found := stale(study)):
+        return
+    changes = dict.fromkeys(change for one in found for change in one.changes)
+    results = [f"{n_trials(study, one.name)} trials on {one.name}" for one in found]
+    results += ["the model"] if study.model_path.exists() else []
+    everything = any(one.odometry for one in found)
+    replays = [
+        path
+        for path in study.folder.glob("replays/*/*/replay.json")
+        if everything or path.parent.name != "baseline"
+    ]
+    results += [f"{len(replays)} replays"] if replays else []
+    raise ConfigurationError(
+        f"{study.folder}: {'; '.join(changes)}. On this depend {', '.join(results)}. {AGAIN} "
+        f"computes them again, and nothing else; or give this study another folder (--folder)"
+    )
+
+
+def check_model(study: Study, sequences: Sequence[str], provenance: Mapping[str, Any]) -> None:
+    """Refuse a model of the study's own that was fitted to other input than there is now.
+
+    Parameters
+    ----------
+    study
+        The study.
+    sequences, provenance
+        Of the model.
+
+    Raises
+    ------
+    ConfigurationError
+        It says what has changed, and what to do.
+    """
+    check_inputs(study)
+    why = ""
+    if list(sequences) != study.training:
+        why = "other training sequences"
+    elif any(_other_descriptors(study, name) for name in study.training):
+        why = f"another {' and '.join(described_by(study))}"
+    elif provenance.get("inputs") != digest(study):
+        why = "other trials"
+    if why:
+        raise ConfigurationError(
+            f"{study.model_path}: was fitted to {why} than the study has now; run `adaptune "
+            f"offline` again"
+        )
+
+
+def digest(study: Study) -> str:
+    """Digest of what is noted for all training sequences."""
+    notes = {name: _read(study, name) or {} for name in study.training}
+    kept = {name: {k: v for k, v in n.items() if k != "adaptune"} for name, n in notes.items()}
+    return hashlib.blake2b(json.dumps(kept).encode(), digest_size=16).hexdigest()
+
+
+def resume(study: Study, again: bool = False) -> None:
+    """Open the study's folder, and remove what has to be made again.
+
+    Parameters
+    ----------
+    study
+        The study.
+    again
+        Remove the trials that depend on something that has changed, instead of refusing them.
+
+    Raises
+    ------
+    ConfigurationError
+    """
+    if not again:
+        check_inputs(study)
+    study.open()
+    _remove_stale(study)
+    _remove_other_descriptions(study)
+
+
+def _remove_stale(study: Study) -> None:
+    """Remove the trials that depend on something that has changed."""
+    found = stale(study)
+    for one in found:
+        folder = study.folder / "trials" / one.name
+        # The note goes last: until then, the trials are known to be stale.
+        for path in (*folder.glob("*.npz"), folder / FILE):
+            path.unlink(missing_ok=True)
+    for path in study.folder.glob("optuna.log*") if found else ():
+        path.unlink()  # it is written again
+    if found and not any((study.folder / "trials").glob("*/*.npz")):
+        for path in study.folder.glob("elapsed*.json"):
+            path.unlink()
+
+
+def _remove_other_descriptions(study: Study) -> None:
+    """Remove the frames that another version of a user's descriptor has described."""
+    for name in study.training:
+        note = _read(study, name)
+        if note is not None and _other_descriptors(study, name):
+            (study.folder / "trials" / name / "frames.npz").unlink(missing_ok=True)
+            note["descriptors"] = described_by(study)
+            write_text(_path(study, name), json.dumps(note, indent=1) + "\n")
+
+
+def n_trials(study: Study, name: str) -> int:
+    """Number of stored trials on a sequence."""
+    return len(list((study.folder / "trials" / name).glob("*[0-9].npz")))
+
+
+def _other_descriptors(study: Study, name: str) -> bool:
+    note, now = _read(study, name), described_by(study)
+    known = {} if note is None else note["descriptors"]
+    return any(known.get(what, of) != of for what, of in now.items())
+
+
+def _path(study: Study, name: str) -> Path:
+    return study.folder / "trials" / name / FILE
+
+
+def _read(study: Study, name: str) -> dict[str, Any] | None:
+    path = _path(study, name)
+    try:
+        note = dict(json.loads(path.read_text(encoding="utf-8")))
+        parts = (note["odometry"]["content"], note["sequence"], note["descriptors"])
+        if all(isinstance(part, dict) for part in parts):
+            return note
+        error: Exception = TypeError("it lacks a part")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as problem:
+        error = problem
+    raise ConfigurationError(
+        f"{path}: is damaged ({error}); remove the folder {path.parent} and run `adaptune offline`"
+    )
+
+
+def _odometry_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    if before["name"] != now["name"]:
+        yield f"odometry.name is {now['name']}, and was {before['name']}"
+        return
+    for part in ("settings", "parameters"):
+        for key in sorted(differences(before.get(part), now[part])):
+            yield f"odometry.{part}.{key} has another value"
+    for what in sorted({*before["content"], *now["content"]}):
+        was, is_ = before["content"].get(what), now["content"].get(what)
+        if was == is_:
+            continue
+        if what.startswith("version of"):
+            yield f"the {what} is {is_}, and was {was}"
+        else:
+            yield f"{what} has other content than when the trials were run"
+
+
+def _sequence_changes(study: Study, name: str, before: Mapping[str, Any]) -> Iterator[str]:
+    sequences, files = study.sequences, study.sequences.files(name)
+    now = sequences.identity(name) | sequences.reference(name)
+    for what, of in (("recording", files.recording), ("reference", files.reference)):
+        for file in _other_files(before.get(what) or [], now[what], of):
+            yield f"{file} has other content than when {name} was trained on"
+    kind = "sequences" if now["course"] is None else "courses"
+    for part in ("sequence", "course", "poses"):
+        for key in sorted(differences(before.get(part), now[part])):
+            yield f"{kind}.{name}.{key} has another value"
+
+
+def _other_files(before: Sequence[str], now: Sequence[str], files: Sequence[Path]) -> Iterable[Any]:
+    if before == now:
+        return []
+    if len(before) == len(now) == len(files):
+        return [f for f, a, b in zip(files, before, now, strict=True) if a != b]
+    return files if 0 < len(files) < MANY else [files[0].parent if files else "the reference"]

@@ -1,0 +1,75 @@
+import sys
+from importlib import metadata
+
+import pytest
+
+from adaptune.odometry.command import CommandSettings
+from adaptune.odometry.content import descriptor_content, module_file, odometry_content
+from adaptune.odometry.process import ProcessSettings
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A package of the user whose modules must not be imported."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("raise SystemExit\n")
+    (folder / "odometry.py").write_text("raise SystemExit\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return folder
+
+
+def test_a_class_is_its_module(package):
+    before = odometry_content("theirs.odometry:Mine", None)
+    assert list(before) == ["module theirs.odometry"]
+    (package / "odometry.py").write_text("# another\n")
+    assert odometry_content("theirs.odometry:Mine", None) != before
+    assert not any(name.startswith("theirs") for name in sys.modules)
+
+
+def test_modules_are_found_without_importing_them(package):
+    assert module_file("theirs.odometry") == package / "odometry.py"
+    assert module_file("theirs") == package / "__init__.py"
+    assert module_file("theirs.nothing") is None
+    assert module_file("nothing.at.all") is None
+    assert odometry_content("nothing:Mine", None) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [("gicp", "small_gicp"), ("vgicp", "small_gicp"), ("ndt", "open3d"), ("mad_icp", "evalio")],
+)
+def test_a_built_in_one_is_the_version_of_its_package(name, package):
+    version = metadata.version(package)
+    assert odometry_content(name, None) == {f"version of {package}": version}
+
+
+def test_a_class_of_a_distribution_is_its_version_too():
+    found = odometry_content("kiss_icp.kiss_icp:KissICP", None)
+    assert found["version of kiss-icp"] == metadata.version("kiss-icp")
+
+
+def test_a_program_is_its_files(tmp_path):
+    script, template = tmp_path / "run.py", tmp_path / "template.yaml"
+    script.write_text("1")
+    template.write_text("a: 1")
+    arguments = (sys.executable, str(script), "{input}", "x" * 5000, "\0")
+    settings = CommandSettings(command=arguments, template=str(template))
+    before = odometry_content("command", settings)
+    assert set(before) == {sys.executable, str(script), str(template)}
+    for file in (script, template):
+        file.write_text("b: 2")
+        assert odometry_content("command", settings)[str(file)] != before[str(file)]
+    served = ProcessSettings(command=(sys.executable, str(script)))
+    assert set(odometry_content("process", served)) == {sys.executable, str(script)}
+    away = ProcessSettings(address="tcp://there:1")
+    assert odometry_content("process", away) == {}
+
+
+def test_descriptors_of_the_user_are_their_modules(package):
+    assert descriptor_content(["ndt", "intensity"]) == {}
+    before = descriptor_content(["ndt", "theirs.odometry:describe"])
+    (package / "odometry.py").write_text("# another\n")
+    after = descriptor_content(["ndt", "theirs.odometry:describe"])
+    assert before.keys() == after.keys() == {"module theirs.odometry"}
+    assert before != after

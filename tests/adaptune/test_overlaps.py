@@ -1,0 +1,91 @@
+"""The same recording under two names, in training and test."""
+
+import shutil
+
+import drives
+import pytest
+
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
+
+
+@pytest.fixture
+def load(study_file, tmp_path):
+    """Load a study whose test sequence is a copy of a training sequence's bag."""
+    shutil.copytree(study_file.parent, tmp_path, dirs_exist_ok=True)
+    shutil.copyfile(tmp_path / "one.bag", tmp_path / "copy.bag")
+
+    def make(*overrides):
+        given = ["sequences.three.bag=copy.bag", *overrides]
+        return load_study(tmp_path / "small.yaml", given, tmp_path / "run")
+
+    return make
+
+
+def test_a_copy_of_a_training_sequence_is_refused(load):
+    with pytest.raises(ConfigurationError, match=r"line 12: test\.0: 'three' is the recording of"):
+        load()
+
+
+def test_so_is_the_same_file(load):
+    with pytest.raises(ConfigurationError, match="the training sequence 'two', and proves nothing"):
+        load("sequences.three.bag=two.bag")
+
+
+@pytest.mark.parametrize(
+    ("one", "three", "overlapping"),
+    [
+        ("stop=2", "start=2", False),
+        ("stop=2", "start=1.9", True),
+        ("start=2", "stop=2", False),
+        ("start=1", "stride=2", True),
+        ("stop=1", "start=3", False),
+    ],
+)
+def test_sections_may_not_overlap(load, one, three, overlapping):
+    overrides = [f"sequences.one.{one}", f"sequences.three.{three}"]
+    if not overlapping:
+        load(*overrides)
+        return
+    with pytest.raises(ConfigurationError, match="proves nothing here"):
+        load(*overrides)
+
+
+def test_other_content_of_the_same_size_is_read(load, tmp_path):
+    data = bytearray((tmp_path / "copy.bag").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "copy.bag").write_bytes(data)
+    load()
+
+
+def test_a_bag_among_others(load, tmp_path):
+    drives.write_bag(tmp_path / "later.bag", drives.scans(9, 40))
+    with pytest.raises(ConfigurationError, match="proves nothing here"):
+        load("sequences.three.bag=[later.bag, copy.bag]")
+
+
+def test_a_copy_of_a_folder_is_refused(load, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for i in range(3):
+            (tmp_path / name / f"{i}.bin").write_bytes(bytes([i + 1]) * 16 * (i + 1))
+        (tmp_path / name / "times.txt").write_text("0\n1\n2\n")
+    poses = (tmp_path / "poses.tum").absolute()
+    poses.write_text("0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    given = [
+        f"sequences.{name}={{folder: {folder}, reference: {poses}}}"
+        for name, folder in (("one", "a"), ("three", "b"))
+    ]
+    with pytest.raises(ConfigurationError, match="proves nothing here"):
+        load(*given)
+    for i in range(3):
+        (tmp_path / "b" / f"{i}.bin").write_bytes(bytes([i + 7]) * 16 * (i + 1))
+    load(*given)
+
+
+def test_two_names_of_one_course(load):
+    course = "{scenes: [cave], seed: 1}"
+    names = ["courses.a=" + course, "courses.b=" + course, "training=[one, a]", "test=[b]"]
+    with pytest.raises(ConfigurationError, match="'b' is the recording of the training"):
+        load(*names)
+    load(*names, "courses.b.seed=2")

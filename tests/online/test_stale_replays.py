@@ -1,0 +1,173 @@
+"""Replays and models whose recordings, odometry or reference have changed since they were made."""
+
+import os
+import shutil
+
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.trajectory import Trajectory, write_tum
+from offline.offline_study import load_study
+from offline.train import train
+from offline.validate import validate
+from online.comparison import compare
+from online.run_replays import run_replays
+from online.stored_replays import StoredReplayError
+from online.switch_cost import measure_switching
+
+
+@pytest.fixture(scope="module")
+def replayed(study_file, trained_folder, tmp_path_factory):
+    """A folder with recordings, a study, and its run and replays; not to be changed."""
+    folder = tmp_path_factory.mktemp("replayed")
+    shutil.copytree(study_file.parent, folder, dirs_exist_ok=True)
+    shutil.copytree(trained_folder, folder / "run")
+    truth = load_study(study_file).sequences.open("three").reference()
+    write_tum(folder / "three.tum", truth)
+    text = study_file.read_text().replace(
+        "{bag: three.bag, points: /points, reference: /truth}",
+        "{bag: three.bag, points: /points, reference: three.tum}",
+    )
+    (folder / "small.yaml").write_text(text + "online: {rules: [paired]}\n")
+    run(load_at(folder))
+    return folder
+
+
+def load_at(folder, *overrides):
+    return load_study(folder / "small.yaml", overrides, folder / "run")
+
+
+def run(study, **given):
+    return run_replays(study, study.model_path, **given)
+
+
+@pytest.fixture
+def load(replayed, tmp_path, caplog):
+    caplog.set_level("INFO")
+    folder = shutil.copytree(replayed, tmp_path / "copy")
+    for path in folder.glob("run/replays/*/*/replay.json"):
+        path.write_text(path.read_text().replace(str(replayed), str(folder)))
+    return lambda *overrides: load_at(folder, *overrides)
+
+
+def change(path):
+    """Put another bag of the same size and time in its place."""
+    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
+    data = bytearray(path.read_bytes())
+    at = len(data) // 2
+    data[at] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=times)
+
+
+def test_a_test_recording_that_was_replaced(load, caplog):
+    study = load()
+    assert run(study) == 0
+    compare(study)
+    change(study.folder.parent / "three.bag")
+    with pytest.raises(StoredReplayError, match=r"another recording; run `adaptune online`"):
+        compare(study)
+    assert run(study) == 3
+    assert "three, fixed: replayed again, with another recording" in caplog.text
+    compare(study)
+
+
+def test_another_reference_replays_nothing(load, caplog):
+    study = load()
+    before = {row.mode: row.rte for row in compare(study)}
+    path = study.folder.parent / "three.tum"
+    truth = study.sequences.open("three").reference()
+    T = truth.T_world_sensor.copy()
+    T[:, 0, 3] *= 1.1
+    write_tum(path, Trajectory(truth.stamps, T))
+    with pytest.raises(StoredReplayError, match=r"three: was judged by another reference; run"):
+        compare(study)
+    assert run(study) == 0
+    assert "three: the reference has changed; no replay depends on it" in caplog.text
+    after = {row.mode: row.rte for row in compare(study)}
+    assert all(abs(after[mode] - before[mode]) > 1.0 for mode in before)
+    shifted = load("sequences.three.clock_offset=0.05")
+    with pytest.raises(StoredReplayError, match="another reference"):
+        compare(shifted)
+    assert run(shifted) == 0
+
+
+def test_another_health_check_replays_all(load, caplog):
+    study = load("health.max_speed=20")
+    assert run(study) == 3
+    assert "three, baseline: replayed again, with another health.max_speed" in caplog.text
+
+
+def test_a_training_recording_that_was_replaced(load):
+    study = load()
+    change(study.folder.parent / "one.bag")
+    words = r"one\.bag has other content .* the model, 2 replays\. `adaptune offline --again`"
+    for use in (run, validate, measure_switching):
+        with pytest.raises(AdaptuneError, match=words):
+            use(study)
+    train(study, again=True)
+    validate(study)
+    if ErrorModel.load(study.model_path).fixed == 0:
+        assert run(study) == 1
+    else:
+        with pytest.raises(StoredReplayError, match="run `adaptune online`"):
+            compare(study)
+        assert run(study) >= 1
+    compare(study)
+
+
+def test_another_version_of_the_odometry(load, monkeypatch):
+    study = load()
+    monkeypatch.setattr("importlib.metadata.version", lambda _: "99.0")
+    for use in (run, validate, measure_switching):
+        with pytest.raises(AdaptuneError, match=r"version of small_gicp is 99\.0, .* 3 replays"):
+            use(study)
+    with pytest.raises(StoredReplayError, match="was replayed with another odometry"):
+        compare(study)
+
+
+def test_a_model_of_other_training_sequences(load):
+    fewer = load("training=[one]")
+    for use in (run, validate):
+        with pytest.raises(AdaptuneError, match=r"was fitted to other training sequences .* run"):
+            use(fewer)
+    # A model of another study is the user's choice.
+    other = shutil.copy(fewer.model_path, fewer.folder / "other.safetensors")
+    assert run_replays(fewer, fewer.folder / other) == 0
+
+
+def test_a_model_that_is_older_than_the_trials(load):
+    study = load()
+    note = study.folder / "trials/one/inputs.json"
+    note.write_text(note.read_text().replace('"recording": [', '"recording": [ "x",', 1))
+    change_back = note.read_text().replace(' "x",', "")
+    with pytest.raises(AdaptuneError, match="has other content"):
+        run(study)
+    note.write_text(change_back)
+    model = ErrorModel.load(study.model_path)
+    model.provenance["inputs"] = "of other trials"
+    model.save(study.model_path)
+    with pytest.raises(AdaptuneError, match=r"was fitted to other trials than .* run `adaptune of"):
+        run(study)
+
+
+@pytest.mark.parametrize("file", ["trajectory.tum", "frames.csv"])
+def test_a_file_that_was_removed_is_made_again(load, file):
+    study = load()
+    (study.folder / "replays/three/fixed" / file).unlink()
+    with pytest.raises(StoredReplayError, match=rf"{file}.* run `adaptune online --again`"):
+        compare(study)
+    assert run(study) == 1
+    compare(study)
+
+
+def test_the_switch_cost_of_another_recording_does_not_count(load, caplog):
+    study = load("online.switching.mechanism=live", "training=[one]")
+    measure_switching(study)
+    path = study.folder / "switching.json"
+    path.write_text(path.read_text().replace('"switch_cost": ', '"switch_cost": 7'))
+    assert study.switch_cost() > 0.0
+    change(study.folder.parent / "one.bag")
+    assert study.switch_cost() == 0.0
+    assert "run `adaptune switching` again" in caplog.text
