@@ -159,13 +159,13 @@ def test_the_last_path_is_the_reference(tmp_path: Path) -> None:
     messages: list[Any] = []
     for i in range(5):
         t = START + i * 10**8
-        poses = [pose(START + j * 10**8, 8.0 * j) for j in range(i + 1)]
+        poses = [pose(START + j * 10**8, (4.0 + i) * j) for j in range(i + 1)]
         path = STORE.types["nav_msgs/msg/Path"](header(t), poses)
         messages += [("/points", t, cloud(t)), ("/path", t, path)]
     inspection = inspect(write(tmp_path / "a.bag", messages))
     assert inspection.faults == ()
     assert inspection.reference is not None
-    assert len(inspection.reference) == 5
+    assert inspection.reference.T_world_sensor[:, 0, 3].tolist() == [0, 8, 16, 24, 32]
 
 
 def test_an_imu_that_is_not_finite_is_reported(tmp_path: Path) -> None:

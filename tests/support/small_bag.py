@@ -35,7 +35,7 @@ def bad_cloud(stamp: int, of: str) -> Any:
     if of == "cut":
         made.data = made.data[:-1]
         return made
-    values = {"NaN": np.nan, "zero": 0.0, "far": 1e30, "few": 0.0}
+    values = {"NaN": np.nan, "zero": 0.0, "far": 2000.0, "few": 0.0}
     raw = made.data.view("<f4").reshape(-1, 4)
     raw[19 if of == "few" else 0 :, :3] = values[of]
     if of == "few":
