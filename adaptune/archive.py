@@ -75,7 +75,9 @@ class Trial:
         the first run, and errors the mean of the capped errors of all runs.
     unhealthy : dict
         Faults that the health check would have found in the first run, and how often, see
-        `adaptune.odometry.health.Guard.check`.
+        `adaptune.odometry.health.Guard.check`. In a whole run, those that it found.
+    health : dict
+        Of a whole run, the bounds of the health check that restarted it.
     """
 
     parameters: ParameterSet
@@ -89,6 +91,7 @@ class Trial:
     usage: dict[str, float] = field(default_factory=dict)
     repeats: tuple[dict[str, float], ...] = ()
     unhealthy: dict[str, int] = field(default_factory=dict)
+    health: dict[str, float] = field(default_factory=dict)
 
     @property
     def mean_error(self) -> float:
@@ -155,7 +158,7 @@ class _Entry(NamedTuple):
 
 
 INDEX = "index.jsonl"
-_PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy")
+_PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy", "health")
 """Parts of a trial that are stored as JSON, as its parameters are."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
@@ -174,7 +177,7 @@ class Archive:
         self._finished: dict[str, dict[int, Summary]] | None = None
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
-        """File of a trial, or of its whole run, which never restarts at the reference."""
+        """File of a trial, or of its whole run, which is driven as a replay is."""
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
     def tidy(self) -> None:
@@ -282,7 +285,7 @@ class Archive:
         path = self.trial_path(sequence, number, whole)
         data = _read(path)
         # Older files have none.
-        data.setdefault("unhealthy", _packed({}))
+        data = {"unhealthy": _packed({}), "health": _packed({})} | data
         try:
             plain = {name: _unpacked(data[name]) for name in _PLAIN}
             plain |= {name: tuple(plain[name]) for name in ("faults", "repeats")}
