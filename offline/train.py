@@ -10,21 +10,32 @@ import numpy as np
 from adaptune import report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
+from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
 from adaptune.parameter_sets import ParameterSets
-from adaptune.space import ParameterSet
+from adaptune.study.run_folder import CONFIGURATION
+from offline.baseline import run_baseline
 from offline.budget import BUDGETS
-from offline.campaign import Progress, run_batches, run_tasks
+from offline.campaign import Progress, run_batches
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
 from offline.fit import fit, tuned
 from offline.labelled import labelled_data
-from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
+from offline.objective import (
+    Verdict,
+    best_by_trials,
+    candidates,
+    choose_fixed,
+    judge,
+    label,
+    pareto_front,
+)
 from offline.offline_study import OfflineStudy
 from offline.search import Finished
 from offline.trial import TrialSettings, TrialSetup
-from offline.workers import Pool, Task, Workers
+from offline.whole_runs import WholeRuns, mean_values, rivalry, run_whole, whole_values
+from offline.workers import Workers
 
 _log = logging.getLogger(__name__)
 
@@ -39,6 +50,7 @@ class Training(NamedTuple):
     fixed: int  # number of the trial of the fixed set
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
+    remark: str | None  # see `rivalry`
 
 
 def train(
@@ -60,7 +72,8 @@ def train(
     Raises
     ------
     AdaptuneError
-        If a sequence cannot be used, or no set keeps the limits.
+        If a sequence cannot be used, the odometry fails with its own parameters, or no set keeps
+        the limits.
     """
     study.open()
     config = study.config.offline
@@ -72,10 +85,21 @@ def train(
     archive = Archive(study.folder / "trials")
     archive.tidy()
     with _workers(study, cluster) as workers:
+        try:
+            run_baseline(study, archive, workers, progress)
+        except AdaptuneError:
+            if not any(archive.folder.glob("*/*.npz")):
+                # Nothing binds the folder to this configuration: it may be mended.
+                (study.folder / CONFIGURATION).unlink(missing_ok=True)
+            raise
         verdicts = run_batches(study, archive, workers, progress)
-        fixed = choose_fixed(config, verdicts)
-        sets = {n: verdicts[n].parameters for n in sorted({0, fixed})}
-        whole = _run_whole(study.training, sets, archive, workers, progress)
+        best = candidates(config, verdicts)
+        sets = {n: verdicts[n].parameters for n in sorted({0, *best})}
+        health = study.config.health
+        whole = run_whole(study.training, sets, health, archive, workers, progress)
+    rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
+    values = mean_values(list(whole_values(config, rivals).values()))
+    fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
     model = _fit(study, archive, verdicts, fixed)
     model.save(study.model_path)
     finished = {
@@ -93,7 +117,8 @@ def train(
         _write_pareto(study.folder, config.objective, verdicts, table)
     rows = _training_rows(config, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
-    return Training(model, means, fixed, rows)
+    remark = rivalry(config, values, best[0], fixed)
+    return Training(model, means, fixed, rows, remark)
 
 
 def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
@@ -155,12 +180,12 @@ def _training_rows(
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
-    whole: Mapping[str, Mapping[int, float]],
+    whole: WholeRuns,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
     for name, runs in finished.items():
-        best = choose_fixed(config, {n: judge(config, [run]) for n, run in runs.items()})
+        best = best_by_trials(config, {n: judge(config, [run]) for n, run in runs.items()})
         rows.append(
             {
                 "sequence": name,
@@ -169,8 +194,8 @@ def _training_rows(
                 "own best": runs[best].mean_error,
                 "lost, baseline": runs[0].lost,
                 "lost, fixed": runs[fixed].lost,
-                "baseline, whole run": whole[name][0],
-                "fixed, whole run": whole[name][fixed],
+                "baseline, whole run": whole[name][0].mean_error,
+                "fixed, whole run": whole[name][fixed].mean_error,
                 "_own best trial": best,
             }
             | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
@@ -192,25 +217,3 @@ def _write_pareto(
     names = [label(weights) for weights in objective]
     on_front = np.array([verdicts[n].values for n in front])
     report.draw_front(folder / "pareto.png", names, values, on_front)
-
-
-def _run_whole(
-    names: Sequence[str],
-    sets: Mapping[int, ParameterSet],
-    archive: Archive,
-    workers: Pool[Any],
-    progress: Progress,
-) -> dict[str, dict[int, float]]:
-    """Mean RTE of some sets on the training sequences, in one go from end to end."""
-    tasks = [
-        Task(name, (n,), (parameters,), whole=True)
-        for name in names
-        for n, parameters in sets.items()
-        if not archive.trial_path(name, n, whole=True).exists()
-    ]
-    for done, _ in enumerate(run_tasks(archive, workers, tasks), start=1):
-        progress("whole runs", done, len(tasks), "")
-    return {
-        name: {n: float(np.nanmean(archive.read(name, n, whole=True).errors)) for n in sets}
-        for name in names
-    }

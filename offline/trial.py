@@ -15,14 +15,14 @@ from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
-from adaptune.odometry.base import prepared_bytes
+from adaptune.odometry.base import OdometryInstance, prepared_bytes
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.health import HealthCheck, unhealthy
 from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
-from offline.trial_run import DrivenRun, TrialRun
+from offline.trial_run import DrivenRun, TrialRun, fault_of
 
 MIN_POINTS = 20
 """No odometry can use a scan with fewer points."""
@@ -83,7 +83,8 @@ class PreparedSequence:
     ):
         self.name = name
         self._scans = scans
-        self._odometry = odometry(isolated=settings.isolated)
+        self._make = partial(odometry, isolated=settings.isolated)
+        self._odometry: OdometryInstance | None = None
         self._kept: list[Any] = []
         self.nbytes = 0
         describe = Describer(settings.descriptors)
@@ -95,7 +96,7 @@ class PreparedSequence:
             elevations.append(lowest_elevation(scan))
             if full:
                 continue
-            prepared = self._odometry.prepare(scan)
+            prepared = self._prepare(scan)
             full = self.nbytes + prepared_bytes(prepared) > memory
             if not full:
                 self._kept.append(prepared)
@@ -118,7 +119,19 @@ class PreparedSequence:
         if len(self._kept) < len(self.frames.stamps):
             for i, scan in enumerate(self._scans):
                 if i >= len(self._kept):
-                    yield self._odometry.prepare(scan)
+                    yield self._prepare(scan)
+
+    def _prepare(self, scan: sequence.Scan) -> Any:
+        try:
+            if self._odometry is None:
+                self._odometry = self._make()
+            return self._odometry.prepare(scan)
+        except Exception as error:
+            raise AdaptuneError(
+                f"sequences.{self.name}: the odometry fails with its own parameters, the baseline, "
+                f"when it is to prepare a scan: {fault_of(error)}; mend the odometry "
+                f"(odometry in the study), and run the same command again"
+            ) from error
 
 
 def _described(describe: Describer, scan: sequence.Scan, name: str) -> NDArray[np.float32]:
