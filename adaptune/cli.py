@@ -152,6 +152,7 @@ def offline(
     """
     loaded = _load(study, override, folder)
     from adaptune import report
+    from adaptune.study.driven import driven
     from offline.train import train
 
     say(f"Seed {loaded.config.offline.seed}.")
@@ -163,8 +164,8 @@ def offline(
             f"RTE [%] over {model.length:g} m in training, "
             f"{len(next(iter(training.means.values())))} parameter sets",
             training.rows,
-            "A trial that loses track restarts at the reference, which counts as 30 %; a whole run "
-            "does not restart.",
+            "A trial that loses track restarts at the reference, which counts as 30 %. A whole run "
+            "is driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
         )
     )
     say(f"Baseline: {_short(loaded.odometry.space.baseline)}")
@@ -172,13 +173,9 @@ def offline(
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
-    if loaded.mechanism == "bank" and model.bank_adapts:
-        say(f"Bank: trials {', '.join(map(str, model.bank))}")
-    elif not model.paired.adapt:
-        say(
-            "Leaving out one training sequence after the other did not show that adapting pays "
-            "(this needs six sequences or more): `paired` will always take the fixed set."
-        )
+    if training.remark:
+        say(training.remark)
+    say(driven(loaded, model).words)
     say(f"Error model: {loaded.model_path}")
 
 
@@ -253,7 +250,8 @@ def validate(
     from offline.validate import validate as validate_study
 
     with progress() as show:
-        validation, rows, learning, banks = validate_study(loaded, curve, sizes, show)
+        found = validate_study(loaded, curve, sizes, show)
+    validation, rows, learning, banks, verdicts = found
     console.print(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",
@@ -272,8 +270,8 @@ def validate(
         if found:
             caption = "Ratio to the fixed set's error on left-out sequences; 95 % interval."
             console.print(report.table(title, found, caption))
-    for mode in validation.modes:
-        say(validation.verdict(mode))
+    for verdict in verdicts:
+        say(verdict)
     say(f"Tables and picture: {loaded.folder / 'validation'}.*")
 
 
@@ -322,11 +320,11 @@ def switching(
 
     Replays the training sequences with the odometry's own parameters, and switches every 5 s to the
     same parameters: with every mechanism that the odometry supports, and several warm-ups. The
-    study keeps the switch cost of its own mechanism, which selections take into account.
+    study keeps the switch cost of one set at a time, which selections take into account.
     """
     loaded = _load(study, override, folder)
     from adaptune import report
-    from online.switch_cost import measure_switching
+    from online.switch_cost import measure_switching, switch_cost_in_words
 
     with progress() as show:
         rows = measure_switching(loaded, seconds, show)
@@ -334,10 +332,10 @@ def switching(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
             rows,
-            f"This study uses {loaded.mechanism}, with a switch cost of "
-            f"{loaded.switch_cost():.1%}; kept in {loaded.folder / 'switching.json'}.",
+            f"Kept in {loaded.folder / 'switching.json'}.",
         )
     )
+    say(switch_cost_in_words(loaded))
 
 
 @app.command()
@@ -355,6 +353,7 @@ def compare(
     loaded = _load(study, override, folder)
     from adaptune import report
     from online.comparison import compare as compare_replays
+    from online.comparison import remark
 
     loaded.check()
     rows = compare_replays(loaded)
@@ -366,6 +365,8 @@ def compare(
             "`all`: mean RTE, and geometric mean of the ratios.",
         )
     )
+    if said := remark(rows):
+        say(said)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
 
 

@@ -10,11 +10,9 @@ import numpy as np
 from adaptune import report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
-from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
 from adaptune.parameter_sets import ParameterSets
-from adaptune.study.run_folder import CONFIGURATION
 from offline.baseline import run_baseline
 from offline.budget import BUDGETS
 from offline.campaign import Progress, run_batches
@@ -85,13 +83,7 @@ def train(
     archive = Archive(study.folder / "trials")
     archive.tidy()
     with _workers(study, cluster) as workers:
-        try:
-            run_baseline(study, archive, workers, progress)
-        except AdaptuneError:
-            if not any(archive.folder.glob("*/*.npz")):
-                # Nothing binds the folder to this configuration: it may be mended.
-                (study.folder / CONFIGURATION).unlink(missing_ok=True)
-            raise
+        run_baseline(study, archive, workers, progress)
         verdicts = run_batches(study, archive, workers, progress)
         best = candidates(config, verdicts)
         sets = {n: verdicts[n].parameters for n in sorted({0, *best})}

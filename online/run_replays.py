@@ -15,6 +15,7 @@ from adaptune.model import ErrorModel
 from adaptune.selection import Selection
 from adaptune.sequence.sequence import Sequence
 from adaptune.study.config import StudyConfig
+from adaptune.study.driven import bank_members
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, write_tum
 from online.modes import Mode, ReplaySetup
@@ -64,7 +65,7 @@ def run_replays(
     model.check_study(study.odometry.identity, study.odometry.space, model_path)
     setup = ReplaySetup.of(study)
     if setup.mechanism == "bank":
-        setup.members(model)  # refuses another bank before anything runs
+        bank_members(setup.switching, model)  # refuses another bank before anything runs
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     study.open()

@@ -14,7 +14,7 @@ from offline import tuning
 from offline.bank_simulation import BankSimulation
 from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, LabelledSequence
-from offline.leave_one_out import BANK, LeftOut, Validation, ValidationError, leave_one_out
+from offline.leave_one_out import ONE_SET, LeftOut, Validation, ValidationError, leave_one_out
 from offline.offline_study import load_study
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings, tune, tune_bank
 from offline.validate import validate
@@ -237,13 +237,16 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
 
 def test_validates_a_study(study_file, trained_folder, tmp_path):
     study = load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
-    validation, rows, learning, banks = validate(study, curve=True, sizes=True)
+    validation, rows, learning, banks, verdicts = validate(study, curve=True, sizes=True)
+    # Two sequences show nothing: the fixed set is driven.
+    assert verdicts[0].startswith("`online` will drive the fixed set")
+    assert "Adapt" not in "".join(verdicts)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
     # Four sub-trajectories tell nothing; a dozen would.
-    assert rows[0]["bank, 95 %"] is None
-    summary = validation.summary("bank")
-    assert rows[2]["bank, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert rows[0]["paired, 95 %"] is None
+    summary = validation.summary("paired")
+    assert rows[2]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert [row["sequences"] for row in learning] == [1]
     n_sets = len(ErrorModel.load(study.model_path).sets)
@@ -302,20 +305,28 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     rng = np.random.default_rng(6)
     sequences = [with_motions(f"s{i}", rng, 200) for i in range(7)]
     validation = leave_one_out(labelled(sequences), {}, bank=3)
-    assert validation.modes == ["bank"]
-    assert validation.summary("bank")["geometric"] < 0.5
-    assert validation.verdict("bank").startswith("Adapt by `bank`")
-    assert all(0.2 < left_out.adapted["bank"] < 1.0 for left_out in validation.left_out)
+    assert validation.modes == ["paired"]
+    assert validation.summary("paired")["geometric"] < 0.5
+    assert validation.verdict("paired").startswith("Adapt by `paired` with the bank")
+    assert all(0.2 < left_out.adapted["paired"] < 1.0 for left_out in validation.left_out)
     # Members that are named: what cancels is not among them.
     named = leave_one_out(labelled(sequences), {}, bank=[0, 3])
-    assert 0.5 < named.summary("bank")["geometric"] < 0.9
+    assert 0.5 < named.summary("paired")["geometric"] < 0.9
     banks = bank_curve(labelled(sequences))
     assert [row["instances"] for row in banks] == [2, 3, 4, 5]
-    assert banks[1] == {"instances": 3} | validation.summary("bank")
-    assert BANK not in leave_one_out(labelled(sequences), {}, bank=0).ratios
+    assert banks[1] == {"instances": 3} | validation.summary("paired")
+    assert not leave_one_out(labelled(sequences), {}, bank=0).modes
     rows = learning_curve(labelled(sequences[:6]), bank=2)
     assert [row["sequences"] for row in rows] == [3, 5]
-    assert all(row["geometric"] == 1.0 for row in rows)  # too few to show anything
+    assert rows[0]["geometric"] == 1.0  # too few to show anything
+    # Five others are enough, as the six sequences of a study are.
+    assert rows[1]["geometric"] < 0.9
+    six = leave_one_out(labelled(sequences[:6]), bank=2)
+    assert six.modes == ["paired", ONE_SET, "paper"]
+    assert six.summary("paired") == {k: v for k, v in rows[1].items() if k != "sequences"}
+    assert "dapt by `paired` with the bank" in six.verdict("paired")
+    assert "over 6 sequences left out it has" in six.verdict("paired")
+    assert leave_one_out(labelled(sequences[:5]), {}, bank=2).ratios["paired"].tolist() == [1.0] * 5
 
 
 def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
@@ -361,7 +372,7 @@ def test_a_bank_that_does_not_pay_keeps_the_fixed_set():
     ]
     assert tune_bank(labelled(alike), [0, 3, 4], 0) == NO_BANK
     validation = leave_one_out(labelled(alike), {})
-    np.testing.assert_array_equal(validation.ratios["bank"], 1.0)
-    assert "kept the fixed set" in validation.verdict("bank")
+    np.testing.assert_array_equal(validation.ratios["paired"], 1.0)
+    assert "kept the fixed set" in validation.verdict("paired")
     assert tune_bank(labelled(sequences[:5]), [0, 8], 0).adapt is False
     assert tune_bank(labelled(sequences), [0, 8], 0).adapt
