@@ -250,8 +250,8 @@ def validate(
     from offline.validate import validate as validate_study
 
     with progress() as show:
-        found = validate_study(loaded, curve, sizes, show)
-    validation, rows, learning, banks, verdicts = found
+        validated = validate_study(loaded, curve, sizes, show)
+    validation, rows, learning, banks, verdicts = validated
     console.print(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",

@@ -72,8 +72,7 @@ def validate(
     online = driven(study, model)
     bank = _bank(study, model) if online.mechanism == "bank" else 0
     try:
-        step = partial(progress, "sequences left out")
-        validation = leave_one_out(data, progress=step, bank=bank)
+        validation = leave_one_out(data, None, partial(progress, "sequences left out"), bank)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online.words}") from error
     rows = _rows(validation)
@@ -97,10 +96,10 @@ def validate(
             banks,
         ),
     )
-    found = {mode: validation.summary(mode) for mode in validation.modes}
-    replace(model, validation=found).save(study.model_path)
-    verdicts = [*_verdicts(study, online, validation), *_rivalry(study, data)]
-    return Validated(validation, rows, learning, banks, verdicts)
+    summaries = {mode: validation.summary(mode) for mode in validation.modes}
+    replace(model, validation=summaries).save(study.model_path)
+    said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
+    return Validated(validation, rows, learning, banks, said)
 
 
 def _bank(study: OfflineStudy, model: ErrorModel) -> int | list[int]:

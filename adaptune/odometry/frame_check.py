@@ -137,5 +137,5 @@ def _turned(degrees: float, T_odom_sensor: Poses, T_ref_sensor: Poses) -> str:
 def _alike(own: Sequence[NDArray[np.float64]], true: Sequence[NDArray[np.float64]]) -> float:
     """Sum of the correlations between these series."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        each = [np.corrcoef(pair)[0, 1] for pair in zip(own, true, strict=True)]
+        each = [np.asarray(np.corrcoef(pair))[0, 1] for pair in zip(own, true, strict=True)]
     return float(np.nan_to_num(each).sum())

@@ -10,9 +10,13 @@ from adaptune.metrics import sub_trajectory_vectors
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.base import Rule
 from adaptune.selection import Selection
+from adaptune.study.config import SwitchingConfig
+from adaptune.study.driven import driven
 from offline import tuning
+from offline import validate as validation_of_study
 from offline.bank_simulation import BankSimulation
 from offline.curves import bank_curve, learning_curve
+from offline.fit import fit, tuned
 from offline.labelled import LabelledData, LabelledSequence
 from offline.leave_one_out import ONE_SET, LeftOut, Validation, ValidationError, leave_one_out
 from offline.offline_study import load_study
@@ -327,6 +331,64 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     assert "dapt by `paired` with the bank" in six.verdict("paired")
     assert "over 6 sequences left out it has" in six.verdict("paired")
     assert leave_one_out(labelled(sequences[:5]), {}, bank=2).ratios["paired"].tolist() == [1.0] * 5
+
+
+def judged(data, study, monkeypatch, given=()):
+    """What `validate` says of a model that is fitted to these data, and the model."""
+    switching = SwitchingConfig(size=3)
+    model = fit(data, data.fixed(), {}, 10.0, 1, {})
+    model = tuned(replace(model, blocks={"ndt": 90}), data, switching)
+    model = replace(model, **dict(given))
+    monkeypatch.setattr(validation_of_study, "_checked_model", lambda _: model)
+    monkeypatch.setattr(validation_of_study, "_labelled", lambda *_: data)
+    return model, validate(study)
+
+
+def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
+    rng = np.random.default_rng(6)
+    six = labelled([with_motions(f"s{i}", rng, 200) for i in range(6)])
+    given = ["online.switching.mechanism=bank", "online.switching.size=3"]
+    study = load_study(study_file, given, tmp_path)
+    model, found = judged(six, study, monkeypatch)
+    # Six sequences are enough for a bank; with one left out, five are.
+    assert model.bank_adapts
+    bank = ", ".join(map(str, model.bank))
+    assert found.verdicts[0] == f"`online` will drive the bank of trials {bank} as `paired`."
+    assert found.verdicts[0] == driven(study, model).words
+    assert found.verdicts[1].startswith("Adapt by `paired` with the bank: over 6 sequences left")
+    assert found.validation.bank
+    assert {"paired", "one set"} <= set(found.rows[0])
+    # The same model without a bank: one set at a time, or the fixed set alone.
+    given = [("paired", PairedSettings()), ("bank_settings", NO_BANK)]
+    _, found = judged(six, study, monkeypatch, given)
+    assert found.verdicts[0] == "`online` will drive one set at a time as `paired`, changed live."
+    assert "`paired` kept the fixed set" in found.verdicts[1]
+    _, found = judged(six, study, monkeypatch, [("paired", DO_NOT_ADAPT), given[1]])
+    assert found.verdicts[0].startswith("`online` will drive the fixed set (trial ")
+    assert found.verdicts[1].startswith("The baseline has ")
+    assert not found.validation.bank
+    assert "one set" not in found.rows[0]
+    # Where it cannot be judged it says what is driven.
+    alone = labelled(six.sequences[:1])
+    with pytest.raises(ValidationError, match=r"one sequence cannot .* will drive the fixed set"):
+        judged(alone, study, monkeypatch)
+
+
+def test_validate_says_that_the_baseline_is_better(study_file, tmp_path, monkeypatch):
+    data = labelled(two_kinds(np.random.default_rng(0)))
+    whole = {0: 1.0, 3: 4.0, 4: 3.0}
+    data = data._replace(sequences=[replace(s, whole=whole) for s in data.sequences])
+    assert data.fixed() == 0
+    study = load_study(study_file, ["online.switching.mechanism=live"], tmp_path)
+    monkeypatch.setattr(validation_of_study, "_checked_model", lambda _: model)
+    monkeypatch.setattr(validation_of_study, "_labelled", lambda *_: data)
+    model = replace(fit(data, 0, {}, 10.0, 1, {}), blocks={"ndt": 90})
+    said = validate(study).verdicts[-1]
+    assert said == (
+        "In whole runs with the health check, the baseline is better than the trials suggested: "
+        "its rte is 1, that of trial 4, the best by its trials, 3. "
+        "So the fixed set is the baseline."
+    )
 
 
 def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
