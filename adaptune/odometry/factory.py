@@ -1,6 +1,6 @@
 """Make an odometry from its name, wherever it runs."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -31,9 +31,6 @@ class OdometryFactory:
         Limits of odometries in processes of their own.
     program_input : callable, optional
         Gives the recording of a sequence, for programs that run whole recordings.
-    strict_sequences : collection of str
-        Sequences on which such a program must not fail with the baseline's parameters: there its
-        failure is an error, not a fault.
     """
 
     name: str
@@ -41,7 +38,6 @@ class OdometryFactory:
     space: ParameterSpace
     limits: Limits
     program_input: Callable[[str], ProgramInput] | None = None
-    strict_sequences: Collection[str] = ()
 
     def __post_init__(self) -> None:
         settings = self.odometry_class.settings_type.model_validate(self.settings)
@@ -87,12 +83,10 @@ class OdometryFactory:
         """
         cls, given = self.odometry_class, self.space.baseline | (parameters or {})
         if issubclass(cls, Command):
-            # A failure with the baseline's parameters means that something is missing.
-            strict = sequence in self.strict_sequences and given == self.space.baseline
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            return cls(given, self.settings, self.limits, read, strict)
+            return cls(given, self.settings, self.limits, read)
         if issubclass(cls, Process):
             return cls(given, self.settings, self.limits)
         if cls.clean and not isolated:

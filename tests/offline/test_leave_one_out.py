@@ -18,7 +18,7 @@ from offline.bank_simulation import BankSimulation
 from offline.curves import bank_curve, learning_curve
 from offline.fit import fit, tuned
 from offline.labelled import LabelledData, LabelledSequence
-from offline.leave_one_out import ONE_SET, LeftOut, Validation, ValidationError, leave_one_out
+from offline.leave_one_out import LeftOut, Validation, ValidationError, leave_one_out
 from offline.offline_study import load_study
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings, tune, tune_bank
 from offline.validate import validate
@@ -325,8 +325,7 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     assert rows[0]["geometric"] == 1.0  # too few to show anything
     # Five others are enough, as the six sequences of a study are.
     assert rows[1]["geometric"] < 0.9
-    six = leave_one_out(labelled(sequences[:6]), bank=2)
-    assert six.modes == ["paired", ONE_SET, "paper"]
+    six = leave_one_out(labelled(sequences[:6]), {}, bank=2)
     assert six.summary("paired") == {k: v for k, v in rows[1].items() if k != "sequences"}
     assert "dapt by `paired` with the bank" in six.verdict("paired")
     assert "over 6 sequences left out it has" in six.verdict("paired")
@@ -357,6 +356,7 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     assert found.verdicts[0] == driven(study, model).words
     assert found.verdicts[1].startswith("Adapt by `paired` with the bank: over 6 sequences left")
     assert found.validation.bank
+    assert found.validation.modes == ["paired", "one set", "paper"]
     assert {"paired", "one set"} <= set(found.rows[0])
     # The same model without a bank: one set at a time, or the fixed set alone.
     given = [("paired", PairedSettings()), ("bank_settings", NO_BANK)]
