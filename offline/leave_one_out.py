@@ -151,7 +151,7 @@ class Validation:
         if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
             return (
                 f"{what} kept the fixed set wherever a sequence was left out: the others did not "
-                f"show that it pays."
+                f"show that it pays; so there is no estimate of it."
             )
         if s["worst"] > NO_WORSE:
             return f"Do not adapt by {what}: {s['worst']:.2f} times on {worst}; {ratio}."

@@ -32,6 +32,7 @@ SLOW = [
     "offline/test_objective.py",
     "adaptune/simulation/test_recording.py",
     "offline/test_search.py",
+    "offline/test_baseline.py",
     "offline/samplers/test_conformance.py",
     "test_readme.py",
     "offline/test_budget.py",

@@ -35,7 +35,8 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     ModeError
         If the model does not go with the study's bank.
     """
-    fixed = f"`online` will drive the fixed set (trial {model.fixed}), because"
+    number = f"trial {model.fixed}" + ("" if model.fixed else ", the baseline")
+    fixed = f"`online` will drive the fixed set ({number}), because"
     if "paired" not in study.rules:
         why = "the study does not name the rule `paired` (online.rules)"
         if study.odometry.description.whole:

@@ -14,8 +14,9 @@ from adaptune.study.driven import ModeError, bank_members
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.offline_study import load_study
-from online.comparison import compare
+from online.comparison import compare, remark
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
+from online.statistics import ComparisonRow
 from online.stored_replays import StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
@@ -283,3 +284,18 @@ def test_a_warning_of_selections_that_rest_on_one_sequence(caplog):
     assert not caplog.messages
     warn_of_scant_evidence("b", [selection(0, 1.0), selection(1, 1.2), selection(1, 3.0)], 0)
     assert caplog.messages[0].startswith("b: 1 of 2 selections of another set")
+
+
+def test_a_baseline_that_is_better_is_told():
+    rows = [
+        ComparisonRow("a", mode, 1.0, ratio, 0, 0, 0)
+        for mode, ratio in (("baseline", 0.5), ("fixed", 1.0), ("paired", 0.4))
+    ]
+    assert (
+        remark(rows) == "The baseline is better than the fixed set here: on a it has 0.50 times "
+        "its error."
+    )
+    # All sequences together decide.
+    assert remark([*rows, replace(rows[0], sequence="all 2", vs_fixed=1.1)]) is None
+    assert remark([replace(rows[0], vs_fixed=1.0), *rows[1:]]) is None
+    assert remark([replace(rows[0], rte=None, vs_fixed=None)]) is None
