@@ -33,6 +33,7 @@ SLOW = [
     "adaptune/simulation/test_recording.py",
     "offline/test_search.py",
     "offline/test_baseline.py",
+    "adaptune/odometry/test_frame_check.py",
     "offline/samplers/test_conformance.py",
     "test_readme.py",
     "offline/test_budget.py",

@@ -66,8 +66,11 @@ def test_a_single_fault_is_told(caplog):
             check_baseline("mine", "one", replace(run, **failed))
 
 
-def test_a_fault_in_other_trials_is_theirs(study_file, tmp_path):
-    study = study_of(study_file, tmp_path / "study", "offline.trials=12", fault="large")
+@pytest.mark.parametrize("name", ["Stumbling", "Apart"])
+@pytest.mark.parametrize("fault", ["large", "'large, constructor'"])
+def test_a_fault_in_other_trials_is_theirs(study_file, tmp_path, name, fault):
+    given = "offline.trials=12"
+    study = study_of(study_file, tmp_path / "study", given, name=name, fault=fault)
     train(study)
     trials = Archive(study.folder / "trials").finished("one")
     assert {trial.faults > 0 for n, trial in trials.items() if n} == {True, False}

@@ -26,7 +26,8 @@ class Stumbling(Odometry):
     def __init__(self, *args):
         super().__init__(*args)
         self.scan, self.lost = 0, 0
-        if self.settings.fault == "constructor":
+        large = self.settings.fault == "large, constructor" and self.parameters["x"] > 0.9
+        if self.settings.fault == "constructor" or large:
             raise RuntimeError("no licence")
 
     def prepare(self, scan):
