@@ -75,7 +75,9 @@ class Trial:
         the first run, and errors the mean of the capped errors of all runs.
     unhealthy : dict
         Faults that the health check would have found in the first run, and how often, see
-        `adaptune.odometry.health.Guard.check`.
+        `adaptune.odometry.health.Guard.check`. In a whole run, those that it found.
+    health : dict
+        Of a whole run, the bounds of the health check that restarted it.
     """
 
     parameters: ParameterSet
@@ -89,6 +91,7 @@ class Trial:
     usage: dict[str, float] = field(default_factory=dict)
     repeats: tuple[dict[str, float], ...] = ()
     unhealthy: dict[str, int] = field(default_factory=dict)
+    health: dict[str, float] = field(default_factory=dict)
 
     @property
     def mean_error(self) -> float:
@@ -159,7 +162,7 @@ SLOTS = "slots.json"
 """Of each sequence that is searched for sets of its own, the hundred thousand of its trials."""
 OF_SLOT = 100_000
 """Trial numbers of a slot; the first hundred thousand are of sets that all sequences share."""
-_PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy")
+_PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy", "health")
 """Parts of a trial that are stored as JSON, as its parameters are."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
@@ -186,7 +189,7 @@ class Archive:
         self._finished: dict[str, dict[int, Summary]] | None = None
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
-        """File of a trial, or of its whole run, which never restarts at the reference."""
+        """File of a trial, or of its whole run, which is driven as a replay is."""
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
     def frames_path(self, sequence: str) -> Path:
@@ -343,7 +346,7 @@ class Archive:
         path = self.trial_path(sequence, number, whole)
         data = _read(path)
         # Older files have none.
-        data.setdefault("unhealthy", _packed({}))
+        data = {"unhealthy": _packed({}), "health": _packed({})} | data
         _check_place(path, data, [sequence, number, whole])
         try:
             plain = {name: _unpacked(data[name]) for name in _PLAIN}

@@ -172,8 +172,8 @@ def offline(
     """
     loaded = _load(study, override, folder)
     from adaptune import report
+    from adaptune.study.driven import driven
     from offline.train import train
-    from offline.tuning import MIN_SEQUENCES
 
     with progress() as show:
         training = train(loaded, show, cluster, again)
@@ -183,8 +183,8 @@ def offline(
             f"RTE [%] over {model.length:g} m in training, "
             f"{len(next(iter(training.means.values())))} parameter sets",
             training.rows,
-            "A trial that loses track restarts at the reference, which counts as 30 %; a whole run "
-            "does not restart.",
+            "A trial that loses track restarts at the reference, which counts as 30 %. A whole run "
+            "is driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
         )
     )
     own, fixed = (
@@ -200,12 +200,9 @@ def offline(
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
-    if loaded.mechanism == "bank" and model.bank_adapts:
-        say(f"Bank: trials {', '.join(map(str, model.bank))}")
-    elif not model.paired.adapt:
-        few = len(loaded.config.training) < MIN_SEQUENCES
-        why = f"Fewer than {MIN_SEQUENCES} training sequences do" if few else "Training did"
-        say(f"{why} not show that adapting pays: `paired` will always take the fixed set.")
+    if training.remark:
+        say(training.remark)
+    say(driven(loaded, model).words)
     say(f"Error model: {loaded.model_path}")
     if len(loaded.training) > 1:
         say_next_of_study("would adapting pay elsewhere?", "validate", study, override, folder)
@@ -289,7 +286,8 @@ def validate(
     from offline.validate import validate as validate_study
 
     with progress() as show:
-        validation, rows, learning, banks = validate_study(loaded, curve, sizes, show)
+        validated = validate_study(loaded, curve, sizes, show)
+    validation, rows, learning, banks, verdicts = validated
     console.print(
         report.table(
             "Error as a ratio to the fixed set's, each sequence left out in turn",
@@ -308,8 +306,8 @@ def validate(
         if found:
             caption = "Ratio to the fixed set's error on left-out sequences; 95 % interval."
             console.print(report.table(title, found, caption))
-    for mode in validation.modes:
-        say(validation.verdict(mode))
+    for verdict in verdicts:
+        say(verdict)
     say(f"Tables and picture: {loaded.folder / 'validation'}.*")
     say_next_online(loaded.config.test, study, override, folder)
 
@@ -361,11 +359,11 @@ def switching(
 
     Replays the training sequences with the odometry's own parameters, and switches every 5 s to the
     same parameters: with every mechanism that the odometry supports, and several warm-ups. The
-    study keeps the switch cost of its own mechanism, which selections take into account.
+    study keeps the switch cost of one set at a time, which selections take into account.
     """
     loaded = _load(study, override, folder)
     from adaptune import report
-    from online.switch_cost import measure_switching
+    from online.switch_cost import measure_switching, switch_cost_in_words
 
     with progress() as show:
         rows = measure_switching(loaded, seconds, show)
@@ -375,10 +373,8 @@ def switching(
             rows,
         )
     )
-    say(
-        f"This study uses {loaded.mechanism}, with a switch cost of {loaded.switch_cost():.1%}; "
-        f"kept in {loaded.folder / 'switching.json'}."
-    )
+    say(switch_cost_in_words(loaded))
+    say(f"Kept in {loaded.folder / 'switching.json'}.")
     say_next_online(loaded.config.test, study, override, folder)
 
 
@@ -398,6 +394,7 @@ def compare(
     from adaptune import report
     from offline.tuning import MIN_SEQUENCES
     from online.comparison import compare as compare_replays
+    from online.comparison import remark
 
     loaded.check()
     begin_work()
@@ -420,6 +417,8 @@ def compare(
                 "the sub-trajectories of all sequences.",
             )
         )
+    if said := remark(rows):
+        say(said)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
     last = {row.mode: row.rte for row in rows if row.sequence == rows[-1].sequence}
     if None not in last.values():

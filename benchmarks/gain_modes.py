@@ -76,7 +76,7 @@ def by_descriptor(data: LabelledData, paths: list[Path], described: list[Path], 
             sequences.append(changed)
         print(f"by {' and '.join(names)}: ", end="")
         validation = leave_one_out(data._replace(sequences=sequences), {}, bank=size)
-        print_summary(validation, ["bank"])
+        print_summary(validation, ["paired"])
 
 
 def curve(data: LabelledData) -> None:

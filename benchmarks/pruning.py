@@ -19,7 +19,7 @@ from adaptune import yaml
 from adaptune.archive import Archive
 from adaptune.simulation.recording import record
 from offline.campaign import run_batches
-from offline.objective import choose_fixed
+from offline.objective import best_by_trials
 from offline.offline_study import OfflineStudy, load_study
 from offline.train import train
 from offline.workers import Outcome, Task, TaskResult
@@ -109,7 +109,7 @@ def main() -> None:
                 pruned.folder.mkdir()
                 pool = Recorded(Archive(full.folder / "trials"))
                 verdicts = run_batches(pruned, Archive(pruned.folder / "trials"), pool)
-                best = verdicts[choose_fixed(pruned.config.offline, verdicts)].values[0]
+                best = verdicts[best_by_trials(pruned.config.offline, verdicts)].values[0]
                 print(
                     f"  {rule:10} scans {scans(pruned) / scans(full):.2f}   "
                     f"RTE of the fixed set {best / value:.3f}",

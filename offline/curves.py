@@ -7,8 +7,8 @@ import numpy as np
 from adaptune.sequence.names import origin
 from offline.labelled import LabelledData
 from offline.leave_one_out import (
-    BANK,
     BANK_SIZE,
+    PAIRED,
     Maker,
     Progress,
     Validation,
@@ -43,7 +43,7 @@ def learning_curve(
     most = len(folds) - 1
     # Only one of them is reported.
     alone = not bank or data.sequences[0].simulation is None
-    rules: dict[str, Maker] = {"paired": tuned_rules()["paired"]} if alone else {}
+    rules: dict[str, Maker] = {PAIRED: tuned_rules()[PAIRED]} if alone else {}
     sizes = sorted({n for n in (3, 5, 8, 11, 16, 24, 32) if n < most} | {most})
     rows = []
     for i, size in enumerate(sizes):
@@ -78,5 +78,5 @@ def bank_curve(data: LabelledData, progress: Progress = lambda *_: None) -> list
             progress(i * n + j, len(few) * n)
 
         validation = leave_one_out(data, {}, step, size)
-        rows.append({"instances": size} | validation.summary(BANK))
+        rows.append({"instances": size} | validation.summary(PAIRED))
     return rows

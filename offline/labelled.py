@@ -18,8 +18,9 @@ from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.names import origin, places
 from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
 from offline.config import Metric, OfflineStudyConfig
-from offline.objective import margin, mean_value, repeated, weighted
+from offline.objective import choose_fixed, few, margin, mean_value, repeated, weighted
 from offline.search import owner
+from offline.whole_runs import mean_values, read_whole_runs, whole_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,8 @@ class LabelledSequence:
     elevation: float = np.nan  # degrees, see `adaptune.descriptor.base.lowest_elevation`
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
+    # By trial number, the objective in whole runs of the candidates for the fixed set.
+    whole: Mapping[int, float] = field(default_factory=dict)
     # With all frames; without it there is no bank.
     simulation: BankSimulation | None = None
 
@@ -92,8 +95,8 @@ class LabelledData(NamedTuple):
             if origin(one.name) == one.name
         ]
 
-    def fixed(self) -> int:
-        """Trial number of the fixed set: the one that `offline.objective.choose_fixed` chooses."""
+    def bounds(self) -> dict[int, float]:
+        """The objective of every set in trials on these sequences, see `Verdict.bound`."""
         values = [
             mean_errors(s.errors, np.zeros(len(s.errors), np.intp))
             if s.values is None
@@ -104,7 +107,23 @@ class LabelledData(NamedTuple):
         bounds = mean_value(np.stack(values, axis=-1))
         if len(repeats) == len(values):
             bounds = bounds + np.nan_to_num(margin(np.stack(repeats, axis=-2)))
-        return self.sets.trials[int(np.argmin(bounds))]
+        return dict(zip(self.sets, bounds.tolist(), strict=True))
+
+    def whole(self) -> dict[int, float]:
+        """The objective in whole runs on these sequences, of those candidates that have them."""
+        values = mean_values([s.whole for s in self.sequences])
+        return {n: value for n, value in values.items() if n in self.sets}
+
+    def fixed(self) -> int:
+        """Trial number of the fixed set, see `offline.objective.choose_fixed`.
+
+        Where no candidate but the baseline has whole runs on all these sequences, the trials alone
+        decide.
+        """
+        bounds, whole = self.bounds(), self.whole()
+        if set(whole) - {0}:
+            return choose_fixed(whole, bounds)
+        return min(bounds, key=lambda n: bounds[n])
 
     def training_data(self) -> tuple[TrainingData, ScaledPCA]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
@@ -210,7 +229,10 @@ def labelled_data(
         }
         own = [one is not None and origin(one) == origin(name) for one in owners]
         labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
-    return LabelledData(labelled, sets)
+    rivals = few(LabelledData(labelled, sets).bounds())
+    runs = read_whole_runs(archive, list(run), rivals, config.health)
+    whole = whole_values(config.offline, runs)
+    return LabelledData([replace(s, whole=whole[s.name]) for s in labelled], sets)
 
 
 def _labelled(

@@ -19,6 +19,7 @@ from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
 from adaptune.model.base import complementary
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 from offline.tuning import (
+    MIN_OTHERS,
     MIN_SEQUENCES,
     NO_WORSE,
     TINY,
@@ -34,8 +35,10 @@ from offline.tuning import (
 
 MOST_SETS = 6
 """Complementary sets whose worth is reported."""
-BANK = "bank"
-"""Name of the mode with a simulated bank."""
+PAIRED = RULES[0]
+"""The mode that `adaptune online` drives: a bank, if one is simulated, or one set at a time."""
+ONE_SET = "one set"
+"""Beside a bank, the mode with one set at a time."""
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
 
@@ -80,6 +83,7 @@ class Validation:
     """All sequences left out, and the conclusion."""
 
     left_out: list[LeftOut]
+    bank: bool = False  # whether a bank was simulated
     # For every mode its mean error over the fixed set's, a number for each sequence.
     ratios: dict[str, NDArray[np.float64]] = field(init=False)
 
@@ -92,8 +96,8 @@ class Validation:
 
     @property
     def modes(self) -> list[str]:
-        """The bank, if one was simulated, and the rules."""
-        return [mode for mode in (BANK, *RULES) if mode in self.ratios]
+        """`PAIRED`, and what it is compared with."""
+        return [mode for mode in dict.fromkeys((PAIRED, ONE_SET, *RULES)) if mode in self.ratios]
 
     @property
     def default(self) -> str:
@@ -134,23 +138,28 @@ class Validation:
     def verdict(self, rule: str) -> str:
         """What to do, in a sentence or two."""
         s = self.summary(rule)
+        weighs = self.bank and rule == PAIRED
+        what = f"`{rule}` with the bank" if weighs else f"`{rule}`"
         worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
         weight = f"{share:.0f} % of the weight on other members than the fixed set"
         ratio = (
             f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
             f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
-            + (f"with {weight}" if rule == BANK else f"adapting {share:.0f} % of the time")
+            + (f"with {weight}" if weighs else f"adapting {share:.0f} % of the time")
         )
         if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
-            return f"`{rule}` kept the fixed set: what it was fitted on did not show that it pays."
+            return (
+                f"{what} kept the fixed set wherever a sequence was left out: the others did not "
+                f"show that it pays; so there is no estimate of it."
+            )
         if s["worst"] > NO_WORSE:
-            return f"Do not adapt by `{rule}`: {s['worst']:.2f} times on {worst}; {ratio}."
+            return f"Do not adapt by {what}: {s['worst']:.2f} times on {worst}; {ratio}."
         if len(self.left_out) < MIN_SEQUENCES:
-            return f"Too few sequences to advise for `{rule}`: {ratio}."
+            return f"Too few sequences to advise for {what}: {ratio}."
         if s["high"] >= 1.0:
-            return f"Nothing shows that `{rule}` pays, nor that it harms: {ratio}."
-        return f"Adapt by `{rule}`: {ratio}, and on none more than {s['worst']:.2f} times."
+            return f"Nothing shows that {what} pays, nor that it harms: {ratio}."
+        return f"Adapt by {what}: {ratio}, and on none more than {s['worst']:.2f} times."
 
 
 def leave_one_out(
@@ -192,7 +201,7 @@ def leave_one_out(
             leave_out(sequence, others, tuned_rules() if rules is None else rules, bank)
         )
     progress(len(folds), len(folds))
-    return Validation(left_out)
+    return Validation(left_out, bool(bank) and data.sequences[0].simulation is not None)
 
 
 def tuned_rules() -> dict[str, Maker]:
@@ -201,7 +210,7 @@ def tuned_rules() -> dict[str, Maker]:
     def paper(_: LabelledData) -> Rule:
         return make_rule("paper", PairedSettings())
 
-    return {"paired": lambda data: make_rule("paired", tune(data)), "paper": paper}
+    return {PAIRED: lambda data: make_rule(PAIRED, tune(data, MIN_OTHERS)), "paper": paper}
 
 
 def leave_out(
@@ -233,7 +242,12 @@ def leave_out(
     if bank and sequence.simulation is not None:
         if not isinstance(bank, int) and len(data.sets) < n_sets:
             bank = len(bank)
-        errors[BANK], adapted[BANK] = _simulate(sequence, others, data, pca, bank)
+        # Where the bank is not shown to pay, one set at a time is driven.
+        instead = errors.pop(PAIRED, fixed), adapted.pop(PAIRED, 0.0)
+        if PAIRED in rules:
+            errors[ONE_SET], adapted[ONE_SET] = instead
+        simulated = _simulate(sequence, others, data, pca, bank)
+        errors[PAIRED], adapted[PAIRED] = simulated or instead
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
     errors["oracle, period"] = capped[frames, of_periods.argmin(axis=1)[period]]
@@ -249,12 +263,15 @@ def _simulate(
     data: TrainingData,
     pca: ScaledPCA,
     bank: int | Sequence[int],
-) -> tuple[NDArray[np.float64], float]:
-    """A bank's errors on the sequence left out, and the weight that the fixed set did not have."""
+) -> tuple[NDArray[np.float64], float] | None:
+    """A bank's errors on the sequence left out, and the weight that the fixed set did not have.
+
+    None if it was not shown to pay.
+    """
     members = choose_bank(others, data.fixed, bank) if isinstance(bank, int) else bank
-    settings = tune_bank(others, members, data.fixed)
+    settings = tune_bank(others, members, data.fixed, MIN_OTHERS)
     if not settings.adapt:
-        return cap(sequence.errors[:, data.sets.column(data.fixed)]), 0.0
+        return None
     near = bank_evidence(sequence, bank_data(others, data, members), pca, settings)
     weights = weights_along(near, settings)
     return bank_errors(sequence, weights), float(1.0 - weights.weights[:, 0].mean())

@@ -40,6 +40,10 @@ UNITS: dict[Metric, str] = {
 }
 BOUND = 1e6
 """The largest value of a metric, also where it cannot be computed: sums stay finite."""
+CANDIDATES = 4
+"""So many sets, the best by their trials, are candidates for the fixed set beside the baseline."""
+NEARLY = 1.02
+"""Whole runs whose values differ by no larger factor count as equal."""
 SEVERITY = 10.0
 """A set that breaks a limit is worse by so many times the baseline's value."""
 
@@ -65,6 +69,11 @@ class Verdict(NamedTuple):
     def excess(self) -> float:
         """Sum of the excesses over all limits, each as a share of the limit."""
         return exceeded(self.constraints)
+
+    @property
+    def bound(self) -> float:
+        """What the first value surely is below: the upper end of its interval."""
+        return self.values[0] + self.margin
 
     @property
     def feasible(self) -> bool:
@@ -195,11 +204,20 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
     return made
 
 
-def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
+def best_by_trials(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
     """Trial number of the set with the least first objective among those that keep all limits.
 
-    If trials are repeated, the upper end of the confidence interval counts. Of equal sets, the
-    first one is chosen.
+    See `candidates`, of which it is the first.
+    """
+    return candidates(config, verdicts)[0]
+
+
+def candidates(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> list[int]:
+    """Trial numbers of the candidates for the fixed set, the best by their trials first.
+
+    These are the `CANDIDATES` sets with the least first objective among those that keep all limits,
+    and the baseline if it keeps them. If trials are repeated, the upper end of the confidence
+    interval counts. Of equal sets, the first one comes first.
 
     Raises
     ------
@@ -217,7 +235,31 @@ def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
             f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the "
             f"parameters, or run more trials"
         )
-    return min(feasible, key=lambda n: verdicts[n].values[0] + verdicts[n].margin)
+    return few({n: verdicts[n].bound for n in feasible})
+
+
+def few(bounds: Mapping[int, float]) -> list[int]:
+    """The `CANDIDATES` trials with the least values, the least first, and the baseline."""
+    finite = [n for n, bound in bounds.items() if np.isfinite(bound)]
+    best = sorted(finite, key=lambda n: bounds[n])[:CANDIDATES]
+    return best if 0 in best or 0 not in bounds else [*best, 0]
+
+
+def choose_fixed(whole: Mapping[int, float], trials: Mapping[int, float]) -> int:
+    """Trial number of the fixed set: the candidate with the least value in whole runs.
+
+    Of candidates that are nearly as good, the one with the best trials is chosen: the best of a few
+    runs owes something to chance.
+
+    Parameters
+    ----------
+    whole
+        By trial number, the first objective in whole runs: its mean over the sequences.
+    trials
+        The same in trials, see `Verdict.bound`.
+    """
+    most = NEARLY * min(whole.values())
+    return min((n for n, value in whole.items() if value <= most), key=lambda n: trials[n])
 
 
 def label(weights: Mapping[Metric, float], units: bool = False) -> str:

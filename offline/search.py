@@ -10,7 +10,7 @@ from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.budget import max_trials, spent
 from offline.config import OfflineConfig
-from offline.objective import Verdict, choose_fixed, judge, sampler_results, weighted
+from offline.objective import Verdict, best_by_trials, judge, sampler_results, weighted
 from offline.pruning import estimate, survivors
 from offline.samplers import make_sampler
 from offline.samplers.base import Sampler
@@ -220,7 +220,7 @@ def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
     best = {}
     for search in stage.searches:
         if any(verdict.feasible for verdict in search.verdicts):
-            number = choose_fixed(config, search.done)
+            number = best_by_trials(config, search.done)
             best[number] = search.done[number]
     return best
 

@@ -16,18 +16,27 @@ from adaptune.cores import available
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
 from adaptune.parameter_sets import ParameterSets
-from adaptune.space import ParameterSet
 from adaptune.study.inputs import InputNotes, digest, resume
+from offline.baseline import run_baseline
 from offline.budget import BUDGETS
-from offline.campaign import Progress, run_batches, watch_tasks
+from offline.campaign import Progress, run_batches
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
-from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
+from offline.objective import (
+    Verdict,
+    best_by_trials,
+    candidates,
+    choose_fixed,
+    judge,
+    label,
+    pareto_front,
+)
 from offline.offline_study import OfflineStudy
 from offline.pictures import draw_front
 from offline.search import Finished
 from offline.trial import TrialSettings, TrialSetup
-from offline.workers import Pool, Task, Workers
+from offline.whole_runs import WholeRuns, mean_values, rivalry, run_whole, whole_values
+from offline.workers import Workers
 
 _log = logging.getLogger(__name__)
 
@@ -42,6 +51,7 @@ class Training(NamedTuple):
     fixed: int  # number of the trial of the fixed set
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
+    remark: str | None  # see `rivalry`
 
 
 def train(
@@ -68,8 +78,8 @@ def train(
     Raises
     ------
     AdaptuneError
-        If a sequence cannot be used, or no set keeps the limits, or stored trials depend on
-        something that has changed.
+        If a sequence cannot be used, the odometry fails with its own parameters, no set keeps the
+        limits, or stored trials depend on something that has changed.
     """
     resume(study, again)
     config = study.config.offline
@@ -81,10 +91,15 @@ def train(
     archive = Archive(study.folder / "trials", InputNotes(study))
     archive.tidy()
     with _workers(study, cluster) as workers:
+        run_baseline(study, archive, workers, progress)
         verdicts = run_batches(study, archive, workers, progress)
-        fixed = choose_fixed(config, verdicts)
-        sets = {n: verdicts[n].parameters for n in sorted({0, fixed})}
-        whole = _run_whole(study.training, sets, archive, workers, progress)
+        best = candidates(config, verdicts)
+        sets = {n: verdicts[n].parameters for n in sorted({0, *best})}
+        health = study.config.health
+        whole = run_whole(study.training, sets, health, archive, workers, progress)
+    rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
+    values = mean_values(list(whole_values(config, rivals).values()))
+    fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
     model = _fitted(study, archive, verdicts, fixed)
     finished = {
         name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
@@ -101,7 +116,8 @@ def train(
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     rows = _training_rows(config, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
-    return Training(model, means, fixed, rows)
+    remark = rivalry(config, values, best[0], fixed)
+    return Training(model, means, fixed, rows, remark)
 
 
 def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
@@ -218,12 +234,12 @@ def _training_rows(
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
-    whole: Mapping[str, Mapping[int, float]],
+    whole: WholeRuns,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
     for name, runs in finished.items():
-        best = choose_fixed(config, {n: judge(config, [run]) for n, run in runs.items()})
+        best = best_by_trials(config, {n: judge(config, [run]) for n, run in runs.items()})
         rows.append(
             {
                 "sequence": name,
@@ -232,8 +248,8 @@ def _training_rows(
                 "own best": runs[best].mean_error,
                 "lost, baseline": runs[0].lost,
                 "lost, fixed": runs[fixed].lost,
-                "baseline, whole run": whole[name][0],
-                "fixed, whole run": whole[name][fixed],
+                "baseline, whole run": whole[name][0].mean_error,
+                "fixed, whole run": whole[name][fixed].mean_error,
                 "_own best trial": best,
             }
             | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
@@ -260,24 +276,3 @@ def _write_pareto(
         np.array([verdicts[n].values for n in front]),
         {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
     )
-
-
-def _run_whole(
-    names: Sequence[str],
-    sets: Mapping[int, ParameterSet],
-    archive: Archive,
-    workers: Pool[Any],
-    progress: Progress,
-) -> dict[str, dict[int, float]]:
-    """Mean RTE of some sets on the training sequences, in one go from end to end."""
-    tasks = [
-        Task(name, (n,), (parameters,), whole=True)
-        for name in names
-        for n, parameters in sets.items()
-        if not archive.trial_path(name, n, whole=True).exists()
-    ]
-    watch_tasks(archive, workers, tasks, "whole runs", progress)
-    return {
-        name: {n: float(np.nanmean(archive.read(name, n, whole=True).errors)) for n in sets}
-        for name in names
-    }

@@ -1,8 +1,8 @@
 """One parameter set on one sequence, or several at once on one pass over it."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -22,6 +22,7 @@ from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
+from offline.trial_run import DrivenRun, TrialRun, fault_of
 
 Advance = Callable[[int, int], None]
 """Called with how many scans of a sequence are done, and how many there are."""
@@ -86,7 +87,8 @@ class PreparedSequence:
     ):
         self.name = name
         self._scans = scans
-        self._odometry = odometry(isolated=settings.isolated)
+        self._make = partial(odometry, isolated=settings.isolated)
+        self._odometry: OdometryInstance | None = None
         self._kept: list[Any] = []
         self.nbytes = 0
         describe = Describer(settings.descriptors)
@@ -98,7 +100,7 @@ class PreparedSequence:
             elevations.append(lowest_elevation(scan))
             if full:
                 continue
-            prepared = self._odometry.prepare(scan)
+            prepared = self._prepare(scan)
             full = self.nbytes + prepared_bytes(prepared) > memory
             if not full:
                 self._kept.append(prepared)
@@ -122,7 +124,19 @@ class PreparedSequence:
         if len(self._kept) < len(self.frames.stamps):
             for i, scan in enumerate(self._scans):
                 if i >= len(self._kept):
-                    yield self._odometry.prepare(scan)
+                    yield self._prepare(scan)
+
+    def _prepare(self, scan: sequence.Scan) -> Any:
+        try:
+            if self._odometry is None:
+                self._odometry = self._make()
+            return self._odometry.prepare(scan)
+        except Exception as error:
+            raise AdaptuneError(
+                f"sequences.{self.name}: the odometry fails with its own parameters, the baseline, "
+                f"when it is to prepare a scan: {fault_of(error)}; mend the odometry "
+                f"(odometry in the study), and run the same command again"
+            ) from error
 
 
 def _watched(scans: Iterable[Any], n: int, advance: Advance) -> Iterator[Any]:
@@ -179,63 +193,6 @@ def reference_poses(
     return T_ref_sensor
 
 
-class _Run:
-    """A run of an odometry on a piece of a sequence, from frame `begin` to before `end`."""
-
-    def __init__(
-        self,
-        odometry: OdometryInstance,
-        frames: Frames,
-        lost_track: float | None,
-        begin: int,
-        end: int,
-    ):
-        n = len(frames.stamps)
-        self.odometry = odometry
-        self.begin, self.end = begin, end
-        self.T_odom_sensor = np.empty((n, 4, 4))
-        self.restarted = np.zeros(n, bool)
-        self.registered = np.ones(n, bool)
-        self.seconds = np.zeros(n)
-        self.lost_steps: dict[int, Poses] = {}
-        self._T_ref_sensor = frames.T_ref_sensor
-        self._T_ref_steps = steps(frames.T_ref_sensor)
-        self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
-
-    def step(self, i: int, prepared: Any) -> None:
-        if i == self.begin:
-            T = self._T_ref_sensor[i]
-            T = np.eye(4) if np.isnan(T[0, 0]) else T
-            self.odometry.start(prepared, T)
-            self.T_odom_sensor[i] = T
-            return
-        begin = time.perf_counter()
-        T, self.registered[i] = self.odometry.register(prepared)
-        self.seconds[i] = time.perf_counter() - begin
-        finite = np.isfinite(T).all()
-        # An odometry without a pose counts as not moved.
-        T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
-        if self._lost(i, T_step if finite else None):
-            self.lost_steps[i] = T_step
-            T = self._T_ref_sensor[i]
-            self.odometry.start(prepared, T, self._T_ref_steps[i - 1])
-            self.restarted[i] = True
-        elif not finite:
-            # There is no reference at which to restart.
-            T = self.T_odom_sensor[i - 1]
-            self.odometry.start(prepared, T)
-        self.T_odom_sensor[i] = T
-
-    def _lost(self, i: int, T_step: Poses | None) -> bool:
-        T_ref_step = self._T_ref_steps[i - 1]
-        if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
-            return False
-        if T_step is None:
-            return True
-        departure = T_step[:3, 3] - T_ref_step[:3, 3]
-        return bool(np.linalg.norm(departure) > self._bounds[i - 1])
-
-
 def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
     """Overlapping pieces of a sequence: every sub-trajectory lies within one of them.
 
@@ -274,36 +231,36 @@ def run_trials(
 
     With ``runs: restart``, an odometry that loses track restarts at the reference with that scan.
     The sub-trajectories across that frame count as failures; later ones are judged on their own.
-    `OfflineConfig` describes other kinds; with `whole`, there is one run from end to end.
+    `OfflineConfig` describes other kinds. With `whole`, it is driven from end to end as a replay
+    drives it: without reference, and restarted by the health check.
     """
     frames = scans.frames
-    kind, repeats = ("whole", 1) if whole else (settings.runs, settings.repeats)
     pieces = [(0, len(frames.stamps))]
-    if kind == "episodes":
+    if settings.runs == "episodes":
         pieces = episodes(frames.T_ref_sensor, settings.sub_trajectory)
-    lost_track = settings.lost_track if kind == "restart" else None
+    lost_track = settings.lost_track if settings.runs == "restart" else None
 
-    def make(parameters: ParameterSet) -> OdometryInstance:
-        return odometry(parameters, scans.name, isolated=settings.isolated)
+    def repeat(parameters: ParameterSet) -> list[TrialRun]:
+        make = partial(odometry, parameters, scans.name, isolated=settings.isolated)
+        if whole:
+            return [DrivenRun(make, frames, settings.health)]
+        return [TrialRun(make, frames, lost_track, *piece) for piece in pieces]
 
     # For every set every repeat, and for every repeat every piece.
-    runs = [
-        [[_Run(make(s), frames, lost_track, *piece) for piece in pieces] for _ in range(repeats)]
-        for s in sets
-    ]
-    each = [run for of_set in runs for repeat in of_set for run in repeat]
+    runs = [[repeat(s) for _ in range(settings.repeats)] for s in sets]
+    each = [run for of_set in runs for of_repeat in of_set for run in of_repeat]
     for i, prepared in enumerate(_watched(scans, len(frames.stamps), advance)):
         for run in each:
             if run.begin <= i < run.end:
                 run.step(i, prepared)
     return [
-        _mean(s, [_trial(settings, s, frames, repeat) for repeat in of_set])
+        _mean(s, [_trial(settings, s, frames, pieces) for pieces in of_set])
         for s, of_set in zip(sets, runs, strict=True)
     ]
 
 
 def _trial(
-    settings: TrialSettings, parameters: ParameterSet, frames: Frames, pieces: Sequence[_Run]
+    settings: TrialSettings, parameters: ParameterSet, frames: Frames, pieces: Sequence[TrialRun]
 ) -> Trial:
     """Make one trial of pieces: each frame belongs to the last piece that begins before it."""
     n = len(frames.stamps)
@@ -323,16 +280,17 @@ def _trial(
             run.restarted[piece],
         )[: own.stop - own.start]
         restarted[own], registered[own] = run.restarted[own], run.registered[own]
-        apart = run.odometry.usage.seconds
+        apart = run.usage.seconds
         seconds[own] = run.seconds[own] if apart is None else apart
         lost_steps |= run.lost_steps
-        cpu += run.odometry.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
+        cpu += run.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
         if after is not None:
             T = run.T_odom_sensor
             lost_steps[after.begin] = invert(T[after.begin - 1]) @ T[after.begin]
     T_steps = steps(T_odom_sensor)
     for i, T_step in lost_steps.items():
         T_steps[i - 1] = T_step
+    driven = pieces[0] if isinstance(pieces[0], DrivenRun) else None
     return Trial(
         parameters,
         T_odom_sensor,
@@ -340,17 +298,20 @@ def _trial(
         restarted,
         registered,
         seconds,
-        tuple(fault for run in pieces for fault in run.odometry.faults),
+        tuple(fault for run in pieces for fault in run.faults),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
         _usage(cpu, (frames.stamps[-1] - frames.stamps[0]) * 1e-9, pieces),
-        unhealthy=unhealthy(settings.health, T_steps, frames.stamps, registered),
+        unhealthy=dict(driven.unhealthy)
+        if driven
+        else unhealthy(settings.health, T_steps, frames.stamps, registered),
+        health=settings.health.model_dump() if driven else {},
     )
 
 
-def _usage(cpu: float, duration: float, pieces: Sequence[_Run]) -> dict[str, float]:
+def _usage(cpu: float, duration: float, pieces: Sequence[TrialRun]) -> dict[str, float]:
     """Percent of a core, and megabytes where the odometry has a process of its own."""
     usage = {"cpu": 100.0 * cpu / duration}
-    memory = [run.odometry.usage.memory for run in pieces]
+    memory = [run.usage.memory for run in pieces]
     if known := [megabytes for megabytes in memory if megabytes is not None]:
         usage["memory"] = max(known)
     return usage
@@ -372,6 +333,7 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         {m: float(np.mean([t.usage[m] for t in repeats])) for m in repeats[0].usage},
         tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
         repeats[0].unhealthy,
+        repeats[0].health,
     )
 
 

@@ -21,6 +21,8 @@ from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 MIN_SEQUENCES = 6
 """With fewer training sequences, a rule does not adapt: they say too little about other places."""
+MIN_OTHERS = MIN_SEQUENCES - 1
+"""As many remain where one of them is left out: what holds for the study holds there, too."""
 NO_WORSE = 1.05
 """Largest ratio to the fixed set's error that is allowed on a sequence left out."""
 TINY = 1e-6
@@ -49,20 +51,22 @@ def interval_margin(logs: NDArray[np.float64]) -> float:
     return float(stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs))
 
 
-def tune(data: LabelledData) -> PairedSettings:
+def tune(data: LabelledData, fewest: int = MIN_SEQUENCES) -> PairedSettings:
     """Choose the settings of the paired rule, leaving each of these sequences out in turn.
 
     Among the settings with which the rule was nowhere worse than `NO_WORSE` times the fixed set,
     the least geometric mean wins, if its 95 % interval lies below 1. If it does not, or no settings
-    are left, or there are fewer than `MIN_SEQUENCES` sequences, the rule does not adapt.
+    are left, or there are fewer than `fewest` sequences, the rule does not adapt.
 
     Parameters
     ----------
     data
         The sequences that the rule will be fitted on, and no others.
+    fewest
+        `MIN_OTHERS` where one sequence of a study is left out.
     """
     folds = data.folds()
-    if len(folds) < MIN_SEQUENCES:
+    if len(folds) < fewest:
         return DO_NOT_ADAPT
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
@@ -106,7 +110,9 @@ def choose_bank(data: LabelledData, fixed: int, size: int) -> list[int]:
     return choose_members(vectors, errors, data.sets, fixed, size)
 
 
-def tune_bank(data: LabelledData, members: Sequence[int], fixed: int) -> BankSettings:
+def tune_bank(
+    data: LabelledData, members: Sequence[int], fixed: int, fewest: int = MIN_SEQUENCES
+) -> BankSettings:
     """Choose how a bank's weights are found, leaving each of these sequences out in turn.
 
     The criterion is that of `tune`.
@@ -120,9 +126,11 @@ def tune_bank(data: LabelledData, members: Sequence[int], fixed: int) -> BankSet
         fixed one.
     fixed
         Trial number of the fixed set, which the bank is compared with.
+    fewest
+        See `tune`.
     """
     folds = data.folds()
-    if len(folds) < MIN_SEQUENCES or len(members) < 2:
+    if len(folds) < fewest or len(members) < 2:
         return NO_BANK
     with threadpool_limits(1, "blas"):
         logs = np.array([_bank_logs(one, others, members, fixed) for one, others in folds])

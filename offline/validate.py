@@ -1,5 +1,6 @@
 """Validate a study: find whether adapting would pay in places that it was not trained on."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,12 +13,22 @@ from adaptune import report
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.paired import ERROR_FLOOR
+from adaptune.study.driven import Driven, driven
 from adaptune.study.inputs import check_model
 from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, labelled_data
-from offline.leave_one_out import Interval, Validation, leave_one_out
+from offline.leave_one_out import (
+    PAIRED,
+    Interval,
+    Validation,
+    ValidationError,
+    leave_one_out,
+)
 from offline.offline_study import OfflineStudy
 from offline.pictures import LeftOutResults, draw_validation
+from offline.whole_runs import rivalry
+
+_log = logging.getLogger(__name__)
 
 
 class Validated(NamedTuple):
@@ -28,6 +39,7 @@ class Validated(NamedTuple):
     rows: list[dict[str, Any]]
     learning: list[dict[str, Any]]  # see `learning_curve`; empty if not asked for
     banks: list[dict[str, Any]]  # see `bank_curve`; empty if not asked for
+    verdicts: list[str]  # sentences: what `adaptune online` will drive, and its estimate
 
 
 def validate(
@@ -59,10 +71,12 @@ def validate(
     """
     model = _checked_model(study)
     data = _labelled(study, model)
-    switching = study.config.online.switching
-    named = switching.sets is not None and set(model.bank) <= set(data.sets)
-    bank = model.bank if named else switching.size
-    validation = leave_one_out(data, progress=partial(progress, "sequences left out"), bank=bank)
+    online = driven(study, model)
+    bank = _bank(study, model) if online.mechanism == "bank" else 0
+    try:
+        validation = leave_one_out(data, None, partial(progress, "sequences left out"), bank)
+    except ValidationError as error:
+        raise ValidationError(f"{error}. {online.words}") from error
     rows = _rows(validation)
     report.write_rows(study.folder, "validation", rows)
     learning = banks = []
@@ -84,9 +98,47 @@ def validate(
             banks,
         ),
     )
-    found = {mode: validation.summary(mode) for mode in validation.modes}
-    replace(model, validation=found).save(study.model_path)
-    return Validated(validation, rows, learning, banks)
+    summaries = {mode: validation.summary(mode) for mode in validation.modes}
+    replace(model, validation=summaries).save(study.model_path)
+    said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
+    return Validated(validation, rows, learning, banks, said)
+
+
+def _bank(study: OfflineStudy, model: ErrorModel) -> int | list[int]:
+    """How many members a bank has where a sequence is left out, or which."""
+    switching = study.config.online.switching
+    return switching.size if switching.sets is None else model.bank
+
+
+def _rivalry(study: OfflineStudy, data: LabelledData) -> list[str]:
+    bounds = data.bounds()
+    best = min(bounds, key=lambda n: bounds[n])
+    said = rivalry(study.config.offline, data.whole(), best, data.fixed())
+    return [] if said is None else [said]
+
+
+def _verdicts(study: OfflineStudy, online: Driven, validation: Validation) -> list[str]:
+    """What `adaptune online` will drive, then the estimate for it, then for what else it drives."""
+    baseline = validation.summary("baseline")
+    estimate = (
+        f"The baseline has {baseline['geometric']:.2f} times the error of the fixed set, over "
+        f"{len(validation.left_out)} sequences left out (95 % interval {baseline['low']:.2f}-"
+        f"{baseline['high']:.2f})"
+    )
+    if baseline["geometric"] < 1.0:
+        estimate += (
+            ": there the baseline is better than the fixed set, which is chosen without them"
+        )
+    said = [online.words]
+    if online.mechanism is not None:
+        said.append(validation.verdict(PAIRED))
+    said.append(f"{estimate}.")
+    if "paper" not in study.rules:
+        return said
+    if study.mechanism == "bank":
+        why = "`online` lets it choose among the bank's members, here it chooses among all sets"
+        return [*said, f"`paper` has no verdict: {why}."]
+    return [*said, validation.verdict("paper")]
 
 
 def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
@@ -95,7 +147,13 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     sets = model.sets.subset([model.sets.trials[column] for column in complete])
     run = {name: list(sets) for name in model.sequences}
     archive = Archive(study.folder / "trials")
-    return labelled_data(archive, run, sets, study.config, study.window)
+    data = labelled_data(archive, run, sets, study.config, study.window)
+    if not set(data.whole()) - {0} and model.fixed != 0:
+        _log.warning(
+            "the candidates for the fixed set have no whole runs with this health check: with a "
+            "sequence left out, it is chosen by trials alone; run `adaptune offline` again"
+        )
+    return data
 
 
 def _checked_model(study: OfflineStudy) -> ErrorModel:

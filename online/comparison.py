@@ -1,5 +1,7 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,6 +62,18 @@ def compare(study: Study) -> list[ComparisonRow]:
         rows += pooled(rows)
     report.write_rows(study.folder / "comparison", "comparison", [row.columns() for row in rows])
     return rows
+
+
+def remark(rows: Sequence[ComparisonRow]) -> str | None:
+    """In words where the baseline has less error than the fixed set."""
+    of_baseline = [row for row in rows if row.mode == "baseline" and row.vs_fixed is not None]
+    # The last row is that over all sequences.
+    if not of_baseline or not (ratio := of_baseline[-1].vs_fixed) or ratio >= 1.0:
+        return None
+    return (
+        f"The baseline is better than the fixed set here: on {of_baseline[-1].sequence} it has "
+        f"{ratio:.2f} times its error."
+    )
 
 
 def _track(replay: StoredReplay, reference: Reference) -> Track:

@@ -4,9 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-import numpy as np
-
-from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import OdometryInstance, WarmUp
@@ -15,11 +12,8 @@ from adaptune.odometry.hand_over import HandOver
 from adaptune.selector import Selector
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
+from adaptune.study.driven import bank_members, mechanism_of
 from adaptune.study.study import Mechanism, Study
-
-
-class ModeError(AdaptuneError):
-    """A mode that the model does not allow."""
 
 
 class Mode(NamedTuple):
@@ -66,7 +60,7 @@ class ReplaySetup:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.descriptors, path)
         if self.mechanism == "bank":
-            self.members(model)
+            bank_members(self.switching, model)
 
     def identity(self, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:
         """What a mode depends on, as plain data; `digest` is the model's."""
@@ -74,12 +68,13 @@ class ReplaySetup:
             parameters = self.parameters(mode, model)
             return {"mode": mode, "parameters": parameters, "model": None, "switching": None}
         used = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
-        settings = self.switching.model_dump(mode="json", include=used[self.mechanism])
-        if self.mechanism != "live":
+        mechanism = self._mechanism(mode, model)
+        settings = self.switching.model_dump(mode="json", include=used[mechanism])
+        if mechanism != "live":
             settings["warm_up"] = self.warm_up._asdict()
-        if self.mechanism != "bank":
+        if mechanism != "bank":
             settings["switch_cost"] = self.switch_cost
-        settings["mechanism"] = self.mechanism
+        settings["mechanism"] = mechanism
         return {"mode": mode, "parameters": None, "model": digest, "switching": settings}
 
     def parameters(self, mode: str, model: ErrorModel) -> ParameterSet | None:
@@ -106,60 +101,17 @@ class ReplaySetup:
         """
         if mode not in self.rules:
             return Mode(self.odometry(self.parameters(mode, model), sequence), None)
-        if self.mechanism == "bank" and (mode != "paired" or model.bank_adapts):
-            sets = self.members(model)
+        mechanism = self._mechanism(mode, model)
+        if mechanism == "bank":
+            sets = bank_members(self.switching, model)
             bank = Bank(self.odometry, sets, self.warm_up, self.lost_track)
             return Mode(bank, Selector(model, mode, list(sets), descriptors=self.descriptors))
         fixed = model.sets[model.fixed]
         selector = Selector(model, mode, (), self.switch_cost, self.descriptors)
-        # A bank that was not shown to pay would only cost.
-        if self.mechanism != "hand_over" and self.odometry.description.live:
+        if mechanism == "live":
             return Mode(self.odometry(fixed), selector)
         scans = self.switching.catch_up_scans
         return Mode(HandOver(self.odometry, fixed, self.warm_up, scans), selector)
 
-    def members(self, model: ErrorModel) -> dict[int, ParameterSet]:
-        """The members of the study's bank by their trial numbers, the fixed set first.
-
-        Raises
-        ------
-        ModeError
-            If the study names a set that the model does not know, or one twice, or the model was
-            fitted for another bank.
-        """
-        if self.switching.sets is None:
-            size = self.switching.size
-            complete = int((~np.isnan(model.errors).any(axis=0)).sum())
-            if len(model.bank) < min(size, complete):
-                raise _another_bank("size")
-            if model.bank[0] != model.fixed:
-                raise _another_bank("sets")
-            return {trial: model.sets[trial] for trial in model.bank[:size]}
-        members: dict[int, ParameterSet] = {}
-        for i, named in enumerate(self.switching.sets):
-            trial = model.trial(named)
-            where = f"online.switching.sets.{i}"
-            if trial is None:
-                raise ModeError(
-                    f"{where}: is none of the {len(model.sets)} parameter sets of the model, so "
-                    f"its errors are unknown; name the number of a trial, or the parameters of one "
-                    f"(trials.csv lists them)"
-                )
-            if trial in members:
-                raise ModeError(f"{where}: is in the bank already")
-            if np.isnan(model.errors[:, model.sets.column(trial)]).any():
-                raise ModeError(
-                    f"{where}: was not run on every training sequence, so it cannot be compared "
-                    f"with the others; name another set (trials.csv lists them)"
-                )
-            members[trial] = model.sets[trial]
-        if list(members) != model.bank:
-            raise _another_bank("sets")
-        return members
-
-
-def _another_bank(key: str) -> ModeError:
-    return ModeError(
-        f"online.switching.{key}: the model was fitted for another bank; run `adaptune offline` "
-        f"again, which fits it to the finished trials"
-    )
+    def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:
+        return mechanism_of(mode, model, self.mechanism, self.odometry.description.live)

@@ -3,16 +3,16 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses, invert
 from adaptune.odometry.base import Motions, OdometryInstance
-from adaptune.odometry.health import Guard, HealthCheck
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
@@ -80,55 +80,6 @@ class Schedule:
             return False
         self._n_periods = int(since // self._period) + 1
         return True
-
-
-class RegisteredScan(NamedTuple):
-    """What became of a scan."""
-
-    stamp: int
-    T_odom_sensor: Poses
-    registered: bool
-    unhealthy: str | None
-    prepare_seconds: float
-    register_seconds: float
-
-
-@dataclass
-class Tracker:
-    """Registers scan after scan, and restarts the odometry where its motion is not healthy."""
-
-    odometry: OdometryInstance  # a new instance
-    health: HealthCheck
-    _last: RegisteredScan | None = field(default=None, init=False)
-
-    def __post_init__(self) -> None:
-        self._guard = Guard(self.health)
-
-    def register(self, scan: Scan) -> RegisteredScan:
-        """Find the pose of the next scan."""
-        begin = time.perf_counter()
-        prepared = self.odometry.prepare(scan)
-        ready = time.perf_counter()
-        registered, unhealthy = True, None
-        if self._last is None:
-            T_odom_sensor = np.eye(4)
-            self.odometry.start(prepared, T_odom_sensor)
-        else:
-            T_odom_previous = self._last.T_odom_sensor
-            T_odom_sensor, registered = self.odometry.register(prepared)
-            elapsed = (scan.stamp - self._last.stamp) * 1e-9
-            with np.errstate(invalid="ignore"):  # the pose may be infinite
-                T_previous_current = invert(T_odom_previous) @ T_odom_sensor
-            unhealthy = self._guard.check(T_previous_current, elapsed, registered)
-            if unhealthy is not None:
-                T_healthy = self._guard.go_on(elapsed)
-                T_odom_sensor = T_odom_previous @ T_healthy
-                self.odometry.start(prepared, T_odom_sensor, T_healthy)
-        end = time.perf_counter()
-        self._last = RegisteredScan(
-            scan.stamp, T_odom_sensor, registered, unhealthy, ready - begin, end - ready
-        )
-        return self._last
 
 
 def replay(

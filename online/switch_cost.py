@@ -11,6 +11,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
+from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
 from adaptune.odometry.factory import OdometryFactory
@@ -19,6 +20,7 @@ from adaptune.odometry.health import HealthCheck
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
+from adaptune.study.driven import driven
 from adaptune.study.inputs import check_inputs
 from adaptune.study.study import Study
 from online.replay import replay
@@ -108,7 +110,9 @@ def measure_switching(
         | dict(zip(study.config.training, ratios[what], strict=True))
         for what, mean in means.items()
     ]
-    own = _name(warm_up) if study.mechanism == "hand_over" else study.mechanism
+    # A bank never switches: where it was not shown to pay, one set follows another.
+    live = study.mechanism != "hand_over" and study.odometry.description.live
+    own = "live" if live else _name(warm_up)
     found = {
         "of": study.switching_identity(),
         "switch_cost": means[own] - 1.0,
@@ -117,6 +121,20 @@ def measure_switching(
     }
     write_text(study.folder / "switching.json", json.dumps(found, indent=2) + "\n")
     return rows
+
+
+def switch_cost_in_words(study: Study) -> str:
+    """The switch cost of what `adaptune online` drives with the study's model."""
+    cost = f"a switch costs {study.switch_cost():.1%} of the RTE"
+    if not study.model_path.exists():
+        return (
+            f"If `online` will drive one set at a time, {cost}; a bank and the fixed set never "
+            f"switch. `adaptune offline` decides which."
+        )
+    online = driven(study, ErrorModel.load(study.model_path))
+    if online.switches:
+        return f"{online.words} Then {cost}."
+    return f"{online.words} It never switches, so there is no switch cost."
 
 
 def _read(study: Study, name: str, seconds: float) -> Recording:

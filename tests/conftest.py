@@ -35,6 +35,8 @@ SLOW = [
     "offline/test_search.py",
     "online/test_stale_replays.py",
     "adaptune/test_inputs.py",
+    "offline/test_baseline.py",
+    "adaptune/odometry/test_frame_check.py",
     "offline/samplers/test_conformance.py",
     "test_readme.py",
     "offline/test_budget.py",

@@ -95,8 +95,6 @@ class Command(OdometryInstance):
         What it may use: memory, and time for all scans together.
     read
         Gives the recording at the first start; None if scans are only prepared.
-    strict
-        Whether a run that fails is an error, not a fault, which quotes the program's last lines.
     """
 
     faults: Sequence[str] = ()
@@ -108,10 +106,9 @@ class Command(OdometryInstance):
         settings: CommandSettings,
         limits: Limits,
         read: Callable[[], ProgramInput] | None = None,
-        strict: bool = False,
     ):
         self.parameters, self.settings = dict(parameters), settings
-        self._limits, self._read_input, self._strict = limits, read, strict
+        self._limits, self._read_input = limits, read
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_odom_own = np.eye(4)
         self._usage = Usage(0.0, None)
@@ -269,8 +266,6 @@ class Command(OdometryInstance):
         return f"{message}: {words}" if words else message
 
     def _fault(self, what: str, words: str) -> None:
-        if self._strict:
-            raise OdometryError(self._message(what, words))
         what = f"{what}: {words}" if words else what
         self.faults = [*self.faults, what]
         _log.warning("%s with %s: %s", self.settings.command[0], self.parameters, what)

@@ -1,6 +1,6 @@
 """Make an odometry from its name, wherever it runs."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -33,9 +33,6 @@ class OdometryFactory:
         Limits of odometries in processes of their own.
     program_input : callable, optional
         Gives the recording of a sequence, for programs that run whole recordings.
-    strict_sequences : collection of str
-        Sequences on which such a program must not fail with the baseline's parameters: there its
-        failure is an error, not a fault.
     user_code : bool
         Whether classes of the user may run in this process, if they are clean. Only processes that
         the user can do without may allow it.
@@ -48,7 +45,6 @@ class OdometryFactory:
     space: ParameterSpace
     limits: Limits
     program_input: Callable[[str], ProgramInput] | None = None
-    strict_sequences: Collection[str] = ()
     user_code: bool = False
     description: Description = field(init=False)
     _clean: bool = field(init=False)
@@ -93,12 +89,10 @@ class OdometryFactory:
         """
         given = self.space.baseline | (parameters or {})
         if self.name == "command":
-            # A failure with the baseline's parameters means that something is missing.
-            strict = sequence in self.strict_sequences and given == self.space.baseline
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            return Command(given, self.settings, self.limits, read, strict)
+            return Command(given, self.settings, self.limits, read)
         if self.name == "process":
             return Process(given, self.settings, self.limits)
         if isolated or not self._clean or (is_user_class(self.name) and not self.user_code):

@@ -66,7 +66,6 @@ class Study(Generic[C_co]):
             tuned_space(config, described),
             self.config.isolation,
             self.sequences.program_input if described.whole else None,
-            self.config.training,
         )
 
     @property

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -6,7 +8,7 @@ from tables import table
 from adaptune.archive import Summary
 from offline.config import OfflineConfig
 from offline.labelled import LabelledData, LabelledSequence
-from offline.objective import choose_fixed, judge
+from offline.objective import best_by_trials, judge
 
 
 def labelled(runs):
@@ -45,10 +47,30 @@ def test_the_fixed_set_is_surely_good_here_as_in_the_campaign():
     runs = [[[1.0, 1.0, 1.1], [0.1, 0.2, 2.3], [0.9, 0.91, 0.92]]] * 2
     config, found = verdicts(runs)
     assert min(found, key=lambda trial: found[trial].values) == 2
-    assert choose_fixed(config, found) == 5
+    assert best_by_trials(config, found) == 5
     data = labelled(runs)
     assert data.fixed() == 5
     assert data.training_data()[0].fixed == 5
+
+
+def test_whole_runs_decide_where_there_are_some():
+    data = labelled([[[1.0], [2.0], [3.0]]] * 2)
+    # The baseline alone decides nothing.
+    for known, fixed in (
+        ([{0: 1.0, 2: 9.0, 5: 3.0}, {0: 9.0, 2: 1.0, 5: 1.0}], 5),
+        ([{0: 1.0, 5: 3.0}, {0: 9.0, 2: 1.0}], 0),
+        ([{5: 9.0}, {5: 9.0}], 5),
+        ([{2: 1.0}, {5: 1.0}], 0),
+    ):
+        whole = [replace(s, whole=w) for s, w in zip(data.sequences, known, strict=True)]
+        found = data._replace(sequences=whole)
+        assert found.fixed() == fixed
+        assert found.subset((0, 2)).fixed() == 0
+    # With a sequence left out, the whole runs on the others decide.
+    (_, others), _ = data._replace(
+        sequences=[replace(s, whole={0: 3.0, 2: 2.0 + i, 5: 3.0 - i}) for i, s in enumerate(whole)]
+    ).folds()
+    assert others.fixed() == 5
 
 
 values = st.lists(
@@ -63,7 +85,7 @@ def test_there_is_one_definition_of_fixed(runs):
     config, found = verdicts(runs)
     bounds = [verdict.values[0] + verdict.margin for verdict in found.values()]
     if len(np.unique(np.round(bounds, 9))) == 3:
-        assert labelled(runs).fixed() == choose_fixed(config, found)
+        assert labelled(runs).fixed() == best_by_trials(config, found)
 
 
 def test_a_sequence_is_left_out_with_its_views():

@@ -10,11 +10,15 @@ from adaptune.metrics import sub_trajectory_vectors
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.base import Rule
 from adaptune.selection import Selection
+from adaptune.study.config import SwitchingConfig
+from adaptune.study.driven import driven
 from offline import tuning
+from offline import validate as validation_of_study
 from offline.bank_simulation import BankSimulation
 from offline.curves import bank_curve, learning_curve
+from offline.fit import fit, tuned
 from offline.labelled import LabelledData, LabelledSequence
-from offline.leave_one_out import BANK, LeftOut, Validation, ValidationError, leave_one_out
+from offline.leave_one_out import LeftOut, Validation, ValidationError, leave_one_out
 from offline.offline_study import load_study
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings, tune, tune_bank
 from offline.validate import validate
@@ -235,15 +239,18 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
         assert data.fixed == labelled(judged).fixed() == TRIALS[expected]
 
 
-def test_validates_a_study(study_file, trained_folder, tmp_path):
+def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     study = load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
-    validation, rows, learning, banks = validate(study, curve=True, sizes=True)
+    validation, rows, learning, banks, verdicts = validate(study, curve=True, sizes=True)
+    # Two sequences show nothing: the fixed set is driven.
+    assert verdicts[0].startswith("`online` will drive the fixed set")
+    assert "Adapt" not in "".join(verdicts)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
     # Four sub-trajectories tell nothing; a dozen would.
-    assert rows[0]["bank, 95 %"] is None
-    summary = validation.summary("bank")
-    assert rows[2]["bank, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert rows[0]["paired, 95 %"] is None
+    summary = validation.summary("paired")
+    assert rows[2]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert [row["sequences"] for row in learning] == [1]
     n_sets = len(ErrorModel.load(study.model_path).sets)
@@ -260,6 +267,9 @@ def test_validates_a_study(study_file, trained_folder, tmp_path):
     ):
         with pytest.raises(ModelError, match=text):
             validate(load_study(study_file, [other], study.folder))
+    assert "no whole runs" not in caplog.text
+    validate(load_study(study_file, ["health.max_speed=30"], study.folder))
+    assert "have no whole runs with this health check" in caplog.text
     archive = study.folder / "trials/one"
     (archive / "00003.npz").rename(archive / "gone")
     with pytest.raises(ModelError, match=r"lacks trial 3 on one.*adaptune offline"):
@@ -302,20 +312,86 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     rng = np.random.default_rng(6)
     sequences = [with_motions(f"s{i}", rng, 200) for i in range(7)]
     validation = leave_one_out(labelled(sequences), {}, bank=3)
-    assert validation.modes == ["bank"]
-    assert validation.summary("bank")["geometric"] < 0.5
-    assert validation.verdict("bank").startswith("Adapt by `bank`")
-    assert all(0.2 < left_out.adapted["bank"] < 1.0 for left_out in validation.left_out)
+    assert validation.modes == ["paired"]
+    assert validation.summary("paired")["geometric"] < 0.5
+    assert validation.verdict("paired").startswith("Adapt by `paired` with the bank")
+    assert all(0.2 < left_out.adapted["paired"] < 1.0 for left_out in validation.left_out)
     # Members that are named: what cancels is not among them.
     named = leave_one_out(labelled(sequences), {}, bank=[0, 3])
-    assert 0.5 < named.summary("bank")["geometric"] < 0.9
+    assert 0.5 < named.summary("paired")["geometric"] < 0.9
     banks = bank_curve(labelled(sequences))
     assert [row["instances"] for row in banks] == [2, 3, 4, 5]
-    assert banks[1] == {"instances": 3} | validation.summary("bank")
-    assert BANK not in leave_one_out(labelled(sequences), {}, bank=0).ratios
+    assert banks[1] == {"instances": 3} | validation.summary("paired")
+    assert not leave_one_out(labelled(sequences), {}, bank=0).modes
     rows = learning_curve(labelled(sequences[:6]), bank=2)
     assert [row["sequences"] for row in rows] == [3, 5]
-    assert all(row["geometric"] == 1.0 for row in rows)  # too few to show anything
+    assert rows[0]["geometric"] == 1.0  # too few to show anything
+    # Five others are enough, as the six sequences of a study are.
+    assert rows[1]["geometric"] < 0.9
+    six = leave_one_out(labelled(sequences[:6]), {}, bank=2)
+    assert six.summary("paired") == {k: v for k, v in rows[1].items() if k != "sequences"}
+    assert "dapt by `paired` with the bank" in six.verdict("paired")
+    assert "over 6 sequences left out it has" in six.verdict("paired")
+    assert leave_one_out(labelled(sequences[:5]), {}, bank=2).ratios["paired"].tolist() == [1.0] * 5
+
+
+def judged(data, study, monkeypatch, given=()):
+    """What `validate` says of a model that is fitted to these data, and the model."""
+    switching = SwitchingConfig(size=3)
+    model = fit(data, data.fixed(), {}, 10.0, 1, {})
+    model = tuned(replace(model, blocks={"ndt": 90}), data, switching)
+    model = replace(model, **dict(given))
+    monkeypatch.setattr(validation_of_study, "_checked_model", lambda _: model)
+    monkeypatch.setattr(validation_of_study, "_labelled", lambda *_: data)
+    return model, validate(study)
+
+
+def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
+    rng = np.random.default_rng(6)
+    six = labelled([with_motions(f"s{i}", rng, 200) for i in range(6)])
+    given = ["online.switching.mechanism=bank", "online.switching.size=3"]
+    study = load_study(study_file, given, tmp_path)
+    model, found = judged(six, study, monkeypatch)
+    # Six sequences are enough for a bank; with one left out, five are.
+    assert model.bank_adapts
+    bank = ", ".join(map(str, model.bank))
+    assert found.verdicts[0] == f"`online` will drive the bank of trials {bank} as `paired`."
+    assert found.verdicts[0] == driven(study, model).words
+    assert found.verdicts[1].startswith("Adapt by `paired` with the bank: over 6 sequences left")
+    assert found.validation.bank
+    assert found.validation.modes == ["paired", "one set", "paper"]
+    assert {"paired", "one set"} <= set(found.rows[0])
+    # The same model without a bank: one set at a time, or the fixed set alone.
+    given = [("paired", PairedSettings()), ("bank_settings", NO_BANK)]
+    _, found = judged(six, study, monkeypatch, given)
+    assert found.verdicts[0] == "`online` will drive one set at a time as `paired`, changed live."
+    assert "`paired` kept the fixed set" in found.verdicts[1]
+    _, found = judged(six, study, monkeypatch, [("paired", DO_NOT_ADAPT), given[1]])
+    assert found.verdicts[0].startswith("`online` will drive the fixed set (trial ")
+    assert found.verdicts[1].startswith("The baseline has ")
+    assert not found.validation.bank
+    assert "one set" not in found.rows[0]
+    # Where it cannot be judged it says what is driven.
+    alone = labelled(six.sequences[:1])
+    with pytest.raises(ValidationError, match=r"one sequence cannot .* will drive the fixed set"):
+        judged(alone, study, monkeypatch)
+
+
+def test_validate_says_that_the_baseline_is_better(study_file, tmp_path, monkeypatch):
+    data = labelled(two_kinds(np.random.default_rng(0)))
+    whole = {0: 1.0, 3: 4.0, 4: 3.0}
+    data = data._replace(sequences=[replace(s, whole=whole) for s in data.sequences])
+    assert data.fixed() == 0
+    study = load_study(study_file, ["online.switching.mechanism=live"], tmp_path)
+    monkeypatch.setattr(validation_of_study, "_checked_model", lambda _: model)
+    monkeypatch.setattr(validation_of_study, "_labelled", lambda *_: data)
+    model = replace(fit(data, 0, {}, 10.0, 1, {}), blocks={"ndt": 90})
+    said = validate(study).verdicts[-1]
+    assert said == (
+        "In whole runs with the health check, the baseline is better than the trials suggested: "
+        "its rte is 1, that of trial 4, the best by its trials, 3. "
+        "So the fixed set is the baseline."
+    )
 
 
 def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
@@ -361,7 +437,7 @@ def test_a_bank_that_does_not_pay_keeps_the_fixed_set():
     ]
     assert tune_bank(labelled(alike), [0, 3, 4], 0) == NO_BANK
     validation = leave_one_out(labelled(alike), {})
-    np.testing.assert_array_equal(validation.ratios["bank"], 1.0)
-    assert "kept the fixed set" in validation.verdict("bank")
+    np.testing.assert_array_equal(validation.ratios["paired"], 1.0)
+    assert "kept the fixed set" in validation.verdict("paired")
     assert tune_bank(labelled(sequences[:5]), [0, 8], 0).adapt is False
     assert tune_bank(labelled(sequences), [0, 8], 0).adapt

@@ -22,6 +22,8 @@ from offline.objective import (
     SEVERITY,
     SamplerResult,
     Verdict,
+    best_by_trials,
+    candidates,
     choose_fixed,
     joined,
     judge,
@@ -80,10 +82,27 @@ def test_a_sum_is_a_mean_over_sequences_and_a_limit_holds_on_each():
 
 def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
     verdicts = [Verdict({}, (2.0,)), Verdict({}, (1.0,), (0.1,)), Verdict({}, (2.0,), (-0.1,))]
-    assert choose_fixed(config(), dict(enumerate(verdicts))) == 0
+    assert best_by_trials(config(), dict(enumerate(verdicts))) == 0
     of = config(limits={"ms_per_scan": {"max": 20}})
     with pytest.raises(AdaptuneError, match=r"none of 1 .* keeps ms_per_scan <= 20 .* 10% beyond"):
-        choose_fixed(of, {7: verdicts[1]})
+        best_by_trials(of, {7: verdicts[1]})
+
+
+def test_the_best_few_and_the_baseline_are_candidates():
+    verdicts = {n: Verdict({}, (float(value),)) for n, value in enumerate([9, 7, 5, 3, 4, 6])}
+    assert candidates(config(), verdicts) == [3, 4, 2, 5, 0]
+    verdicts[3] = verdicts[3]._replace(complete=False)
+    verdicts[0] = verdicts[0]._replace(constraints=(0.1,))
+    assert candidates(config(), verdicts) == [4, 2, 5, 1]
+
+
+def test_the_fixed_set_is_the_best_in_whole_runs():
+    trials = {3: 1.0, 4: 1.1, 0: 2.0}
+    assert choose_fixed({3: 1.0, 4: 1.1, 0: 2.0}, trials) == 3
+    assert choose_fixed({3: 3.0, 4: 1.1, 0: 2.0}, trials) == 4
+    assert choose_fixed({3: 3.0, 4: 2.1, 0: 2.0}, trials) == 0
+    # Of those that are nearly equal, the one with the best trials.
+    assert choose_fixed({3: 3.0, 4: 2.03, 0: 2.0}, trials) == 4
 
 
 def test_of_repeated_trials_the_surely_best_is_taken():
@@ -98,7 +117,7 @@ def test_of_repeated_trials_the_surely_best_is_taken():
     error = np.sqrt(np.var([0.2, 0.9, 1.9], ddof=1) / 3) / 2
     assert verdicts[1].margin == pytest.approx(2.1318 * error, rel=1e-4)
     assert verdicts[1].values < verdicts[0].values
-    assert choose_fixed(config(), dict(enumerate(verdicts))) == 0
+    assert best_by_trials(config(), dict(enumerate(verdicts))) == 0
     assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
 
 

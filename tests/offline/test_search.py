@@ -16,7 +16,7 @@ from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
 from offline.labelled import labelled_data
 from offline.leave_one_out import leave_one_out
-from offline.objective import choose_fixed
+from offline.objective import best_by_trials
 from offline.offline_study import load_study
 from offline.search import make_stages, owner
 from offline.train import train
@@ -108,7 +108,7 @@ def test_each_sequence_searches_for_itself(study_of):
         assert names == (NAMES if everywhere else [owner_of(archive, n)])
         assert verdicts[n].complete == everywhere
         assert list(verdicts[n].sequences) == names
-    fixed = choose_fixed(study.config.offline, verdicts)
+    fixed = best_by_trials(study.config.offline, verdicts)
     assert fixed in {0, *best.values()}
     means = {
         n: np.mean([archive.finished(name)[n].mean_error for name in NAMES]) for n in (0, fixed)
@@ -224,7 +224,7 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     assert np.isnan(data.sequences[0].errors).any()
     complete = data.complete()
     assert list(complete.sets) == [n for n, v in verdicts.items() if v.complete]
-    assert complete.fixed() == choose_fixed(study.config.offline, verdicts)
+    assert complete.fixed() == best_by_trials(study.config.offline, verdicts)
     for sequence in complete.sequences:
         assert sequence.own.tolist() == [
             owner_of(archive, n) == sequence.name for n in complete.sets

@@ -14,6 +14,7 @@ from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.sequence import SequenceConfig
 from offline.offline_study import load_study
 from offline.trial import episodes
+from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 
@@ -132,8 +133,58 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study):
     assert trial.unhealthy == {"max_speed": 1}
     (whole,) = setup.run(sequence, [GOOD], whole=True)
     assert not whole.restarted.any()
-    assert whole.unhealthy == {"max_speed": 2}
     assert np.isfinite(whole.errors[:29]).all()
+    # It is driven as a replay drives it.
+    scans = study.sequences.open("one")
+    replayed = replay(scans, made_of(Lost, study)(GOOD), study.config.health)
+    assert whole.unhealthy == replayed.unhealthy == {"max_speed": 1}
+    np.testing.assert_array_equal(whole.T_odom_sensor, replayed.trajectory.T_world_sensor)
+    assert whole.health == study.config.health.model_dump()
+
+
+class Unable(KeyframeGicp):
+    """Raises with one set, in its constructor or later."""
+
+    where = "__init__"
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.scan = 0
+        self.may_raise("__init__")
+
+    def start(self, *args):
+        self.may_raise("start")
+        super().start(*args)
+
+    def register(self, prepared):
+        self.scan += 1
+        if self.scan == 20:
+            self.may_raise("register")
+        return super().register(prepared)
+
+    def may_raise(self, where):
+        if self.where == where and self.parameters["keyframe_interval"] == 7.0:
+            raise ValueError("seven planes")
+
+
+@pytest.mark.parametrize("where", ["__init__", "start", "register"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_an_exception_is_a_fault_of_its_trial(study, where, whole):
+    unable = type("Unable", (Unable,), {"where": where})
+    setup = setup_of(study, made_of(unable, study))
+    sequence = setup.prepare("one", 1e9)
+    sets = [GOOD | {"keyframe_interval": 7.0}, GOOD]
+    bad, good = setup.run(sequence, sets, whole)
+    (fault,) = bad.faults
+    assert "ValueError: seven planes" in fault
+    assert not good.faults
+    first = 20 if where == "register" else 1
+    assert not bad.registered[first:].any()
+    if whole:
+        assert bad.unhealthy["no_pose"] == len(bad.errors) - first + (where != "register")
+    else:
+        assert np.isinf(bad.errors[first:29]).all()
+        assert bad.mean_error > good.mean_error
 
 
 def test_repeats_are_averaged_and_kept(study):

@@ -12,12 +12,13 @@ from pictures import texts
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.selection import Selection
+from adaptune.study.driven import ModeError, bank_members
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.offline_study import load_study
-from online.comparison import compare
-from online.modes import ModeError, ReplaySetup
+from online.comparison import compare, remark
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
+from online.statistics import ComparisonRow
 from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
@@ -113,9 +114,15 @@ def test_an_odometry_that_is_not_live_adapts_too(own, study_file, mechanism):
     row = next(row for row in compare(study) if row.mode == "paired")
     assert row.rte < 3.0
     folder = study.folder / "replays/three/paired"
-    about = json.loads((folder / "replay.json").read_text())["about"]
-    assert about["switching"]["mechanism"] == mechanism
-    assert about["switching"]["warm_up"]["seconds"] == 0.5
+    about = {
+        mode: json.loads((folder.with_name(mode) / "replay.json").read_text())["about"]["switching"]
+        for mode in ("paired", "paper")
+    }
+    assert about["paper"]["mechanism"] == mechanism
+    assert about["paper"]["warm_up"]["seconds"] == 0.5
+    # Two training sequences do not show that a bank pays: one set at a time is driven.
+    assert about["paired"]["mechanism"] == ("live" if mechanism == "bank" else mechanism)
+    assert about["paired"]["switch_cost"] == 0.0
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
     members = model.bank if mechanism == "bank" else model.sets
@@ -154,9 +161,9 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     assert {f"trial {n}" for n in model.bank} | {"weight [%]"} <= said
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
-        ReplaySetup.of(more).members(replace(model, bank=model.bank[:3]))
+        bank_members(more.config.online.switching, replace(model, bank=model.bank[:3]))
     with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
-        ReplaySetup.of(more).members(replace(model, bank=model.bank[::-1]))
+        bank_members(more.config.online.switching, replace(model, bank=model.bank[::-1]))
 
 
 def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file):
@@ -164,29 +171,29 @@ def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file)
     bank = "online.switching.mechanism=bank"
     named = load_study(study_file, [bank, "online.switching.sets=[3, 0]"], trained.folder)
     of_two = replace(model, bank=[3, 0])
-    members = ReplaySetup.of(named).members(of_two)
+    members = bank_members(named.config.online.switching, of_two)
     assert list(members.items()) == [(3, model.sets[3]), (0, model.sets[0])]
     values = "{" + ", ".join(f"{k}: {v!r}" for k, v in model.sets[4].items()) + "}"
     named = load_study(study_file, [bank, f"online.switching.sets=[{values}, 1]"], trained.folder)
-    assert list(ReplaySetup.of(named).members(replace(model, bank=[4, 1]))) == [4, 1]
+    assert list(bank_members(named.config.online.switching, replace(model, bank=[4, 1]))) == [4, 1]
     # They go by their trials, whatever sets were left out of the model.
     some = replace(model, sets=model.sets.subset(model.sets.trials[2:]), bank=[3, 2])
     some = replace(some, errors=model.errors[:, 2:], fixed=2)
     by_number = load_study(study_file, [bank, "online.switching.sets=[3, 2]"], trained.folder)
-    assert list(ReplaySetup.of(by_number).members(some)) == [3, 2]
+    assert list(bank_members(by_number.config.online.switching, some)) == [3, 2]
     twice = load_study(study_file, [bank, "online.switching.sets=[3, 3]"], trained.folder)
     with pytest.raises(ModeError, match=r"switching\.sets\.1: is in the bank already"):
         run_replays(twice, trained.folder / "model.safetensors")
     with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
-        ReplaySetup.of(named).members(replace(model, bank=[0, 1, 2]))
+        bank_members(named.config.online.switching, replace(model, bank=[0, 1, 2]))
     errors = model.errors.copy()
     errors[:3, 4] = np.nan
     with pytest.raises(ModeError, match=r"switching\.sets\.0: was not run on every"):
-        ReplaySetup.of(named).members(replace(model, errors=errors))
+        bank_members(named.config.online.switching, replace(model, errors=errors))
     for unknown in ("[0, 10]", "[{keyframe_interval: 1.2345}, 0]"):
         study = load_study(study_file, [bank, f"online.switching.sets={unknown}"], trained.folder)
         with pytest.raises(ModeError, match=r"switching\.sets\..: is none of the 10"):
-            ReplaySetup.of(study).members(model)
+            bank_members(study.config.online.switching, model)
 
 
 def test_replays_are_made_once(replayed, study_file):
@@ -306,3 +313,18 @@ def test_a_warning_of_selections_that_rest_on_one_sequence(caplog):
     assert not caplog.messages
     warn_of_scant_evidence("b", [selection(0, 1.0), selection(1, 1.2), selection(1, 3.0)], 0)
     assert caplog.messages[0].startswith("b: 1 of 2 selections of another set")
+
+
+def test_a_baseline_that_is_better_is_told():
+    rows = [
+        ComparisonRow("a", mode, 1.0, ratio, 0, 0, 0)
+        for mode, ratio in (("baseline", 0.5), ("fixed", 1.0), ("paired", 0.4))
+    ]
+    assert (
+        remark(rows) == "The baseline is better than the fixed set here: on a it has 0.50 times "
+        "its error."
+    )
+    # All sequences together decide.
+    assert remark([*rows, replace(rows[0], sequence="all 2", vs_fixed=1.1)]) is None
+    assert remark([replace(rows[0], vs_fixed=1.0), *rows[1:]]) is None
+    assert remark([replace(rows[0], rte=None, vs_fixed=None)]) is None

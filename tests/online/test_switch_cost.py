@@ -1,8 +1,11 @@
 import json
+import shutil
+from dataclasses import replace
 
 import pytest
 
 from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
 from offline.offline_study import load_study
 from online import switch_cost
 
@@ -34,6 +37,34 @@ def test_the_switch_cost_of_every_mechanism(study_file, tmp_path, monkeypatch):
     kept = json.loads((tmp_path / "switching.json").read_text())
     assert kept["switch_cost"] == pytest.approx(ratios["hand_over, 0.3 s"] - 1.0)
     assert study.switch_cost() == max(0.0, kept["switch_cost"])
+
+
+def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_path, monkeypatch):
+    folder = shutil.copytree(trained_folder, tmp_path / "study")
+    study = load_study(study_file, ["online.switching.cores=2"], folder)
+    found = {"of": study.switching_identity(), "switch_cost": 0.25}
+    (folder / "switching.json").write_text(json.dumps(found))
+    model = ErrorModel.load(study.model_path)
+
+    def said(adapts=False, bank_adapts=False, study=study):
+        settings = model.bank_settings.model_copy(update={"adapt": bank_adapts})
+        paired = model.paired.model_copy(update={"adapt": adapts})
+        made = replace(model, paired=paired, bank_settings=settings)
+        monkeypatch.setattr(ErrorModel, "load", lambda _: made)
+        return switch_cost.switch_cost_in_words(study)
+
+    assert said().startswith(f"`online` will drive the fixed set (trial {model.fixed}), because")
+    assert said().endswith("It never switches, so there is no switch cost.")
+    members = ", ".join(map(str, model.bank))
+    bank = said(bank_adapts=True)
+    assert bank.startswith(f"`online` will drive the bank of trials {members} as `paired`. It")
+    assert bank.endswith("no switch cost.")
+    assert said(adapts=True) == (
+        "`online` will drive one set at a time as `paired`, changed live. "
+        "Then a switch costs 25.0% of the RTE."
+    )
+    study.model_path.unlink()
+    assert "If `online` will drive one set at a time, a switch costs 25.0%" in said()
 
 
 def test_a_sequence_can_be_too_short(study_file, tmp_path):

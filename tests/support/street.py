@@ -33,7 +33,7 @@ def make(name, parameters=None):
         given = space_of(name).baseline | (parameters or {})
         settings, recording = command_on_the_street()
         Command.check(settings, given)
-        return Command(given, settings, Limits(seconds=10.0), lambda: recording, strict=True)
+        return Command(given, settings, Limits(seconds=10.0), lambda: recording)
     return InProcess(odometry_class(name)(parameters))
 
 

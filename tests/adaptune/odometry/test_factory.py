@@ -54,13 +54,7 @@ def test_it_pickles_with_and_without_what_it_has_looked_up():
         assert copy({"keyframe_interval": 3.0}).odometry.parameters["keyframe_interval"] == 3.0
 
 
-@pytest.mark.parametrize(
-    ("sequence", "parameters", "strict"),
-    [("one", {}, True), ("one", {"x": 0.7}, False), ("two", {}, False)],
-)
-def test_a_program_must_not_fail_on_strict_sequences_with_the_baseline(
-    tmp_path, sequence, parameters, strict
-):
+def test_a_program_that_fails_is_a_fault(tmp_path):
     asked = []
 
     def program_input(name):
@@ -72,14 +66,9 @@ def test_a_program_must_not_fail_on_strict_sequences_with_the_baseline(
         {"command": [sys.executable, "-c", "raise SystemExit(3)"]},
         ParameterSpace({"x": Float(low=0.0, high=1.0, baseline=0.5)}),
         program_input=program_input,
-        strict_sequences=("one",),
     )
-    instance = command(parameters, sequence)
+    instance = command({"x": 0.7}, "one")
     scan = instance.prepare(Scan(0, np.zeros((0, 3), np.float32)))
-    if strict:
-        with pytest.raises(OdometryError, match="ended with code 3"):
-            instance.start(scan, np.eye(4))
-    else:
-        instance.start(scan, np.eye(4))
-        assert "ended with code 3" in instance.faults[0]
-    assert asked == [sequence]
+    instance.start(scan, np.eye(4))
+    assert "ended with code 3" in instance.faults[0]
+    assert asked == ["one"]

@@ -1,0 +1,119 @@
+"""What `adaptune online` drives with a model, in the mode `paired`."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.space import ParameterSet
+from adaptune.study.config import SwitchingConfig
+from adaptune.study.study import Mechanism, Study
+
+
+class ModeError(AdaptuneError):
+    """A mode that the model does not allow."""
+
+
+class Driven(NamedTuple):
+    """What is driven, and by what."""
+
+    mechanism: Mechanism | None  # None if the fixed set is never left
+    words: str  # a sentence
+
+    @property
+    def switches(self) -> bool:
+        """Whether one set follows another; a bank changes weights only."""
+        return self.mechanism in ("live", "hand_over")
+
+
+def driven(study: Study, model: ErrorModel) -> Driven:
+    """What `adaptune online` will drive with the study's model.
+
+    Raises
+    ------
+    ModeError
+        If the model does not go with the study's bank.
+    """
+    number = f"trial {model.fixed}" + ("" if model.fixed else ", the baseline")
+    fixed = f"`online` will drive the fixed set ({number}), because"
+    if "paired" not in study.rules:
+        why = "the study does not name the rule `paired` (online.rules)"
+        if study.odometry.description.whole:
+            why = "a program that runs whole recordings cannot change its parameters"
+        return Driven(None, f"{fixed} {why}.")
+    mechanism = mechanism_of("paired", model, study.mechanism, study.odometry.description.live)
+    if mechanism == "bank":
+        members = ", ".join(map(str, bank_members(study.config.online.switching, model)))
+        return Driven("bank", f"`online` will drive the bank of trials {members} as `paired`.")
+    if model.paired.adapt:
+        how = "changed live" if mechanism == "live" else "by hand-over"
+        return Driven(mechanism, f"`online` will drive one set at a time as `paired`, {how}.")
+    why = "leaving out one training sequence after the other did not show that adapting pays"
+    return Driven(None, f"{fixed} {why} (this needs six sequences or more).")
+
+
+def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool) -> Mechanism:
+    """How a mode that adapts changes parameters.
+
+    Parameters
+    ----------
+    mode
+        A selection rule.
+    model
+        The error model. A bank that was not shown to pay would only cost.
+    mechanism
+        The study's.
+    live
+        Whether the odometry changes its parameters between scans.
+    """
+    if mechanism == "bank" and (mode != "paired" or model.bank_adapts):
+        return "bank"
+    return "live" if mechanism != "hand_over" and live else "hand_over"
+
+
+def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, ParameterSet]:
+    """The members of the study's bank by their trial numbers, the fixed set first.
+
+    Raises
+    ------
+    ModeError
+        If the study names a set that the model does not know, or one twice, or the model was
+        fitted for another bank.
+    """
+    if switching.sets is None:
+        size = switching.size
+        complete = int((~np.isnan(model.errors).any(axis=0)).sum())
+        if len(model.bank) < min(size, complete):
+            raise _another_bank("size")
+        if model.bank[0] != model.fixed:
+            raise _another_bank("sets")
+        return {trial: model.sets[trial] for trial in model.bank[:size]}
+    members: dict[int, ParameterSet] = {}
+    for i, named in enumerate(switching.sets):
+        trial = model.trial(named)
+        where = f"online.switching.sets.{i}"
+        if trial is None:
+            raise ModeError(
+                f"{where}: is none of the {len(model.sets)} parameter sets of the model, so "
+                f"its errors are unknown; name the number of a trial, or the parameters of one "
+                f"(trials.csv lists them)"
+            )
+        if trial in members:
+            raise ModeError(f"{where}: is in the bank already")
+        if np.isnan(model.errors[:, model.sets.column(trial)]).any():
+            raise ModeError(
+                f"{where}: was not run on every training sequence, so it cannot be compared "
+                f"with the others; name another set (trials.csv lists them)"
+            )
+        members[trial] = model.sets[trial]
+    if list(members) != model.bank:
+        raise _another_bank("sets")
+    return members
+
+
+def _another_bank(key: str) -> ModeError:
+    return ModeError(
+        f"online.switching.{key}: the model was fitted for another bank; run `adaptune offline` "
+        f"again, which fits it to the finished trials"
+    )

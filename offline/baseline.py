@@ -1,0 +1,99 @@
+"""Run the baseline before anything else: a setup in which it fails is stopped at once."""
+
+import logging
+from typing import Any
+
+from adaptune.archive import Archive, Trial
+from adaptune.errors import AdaptuneError
+from adaptune.odometry.frame_check import contradiction
+from adaptune.odometry.isolation import MOST_FAULTS
+from adaptune.study.run_folder import CONFIGURATION
+from offline.campaign import Progress
+from offline.offline_study import OfflineStudy
+from offline.whole_runs import whole_run
+from offline.workers import Pool, Task, run
+
+MOST_WITHOUT_POSE = 0.1
+"""Share of the scans from which an odometry that gives no pose for them has failed."""
+
+_log = logging.getLogger(__name__)
+
+
+class BaselineError(AdaptuneError):
+    """An odometry that fails with its own parameters."""
+
+
+def run_baseline(
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
+) -> None:
+    """Run the baseline from end to end on every training sequence, unless that was done before.
+
+    Nothing is stored before it has done well on all of them. Where the reference contradicts its
+    motion, a warning says what the reference looks like.
+
+    Raises
+    ------
+    BaselineError
+        If it fails on one of them.
+    """
+    names, health = study.config.descriptor.names, study.config.health
+    tasks = [
+        Task(
+            name, (0,), (study.odometry.space.baseline,), True, not archive.has_frames(name, names)
+        )
+        for name in study.training
+        if whole_run(archive, name, 0, health) is None
+    ]
+    done = []
+    try:
+        for task, result, _ in run(workers, tasks):
+            check_baseline(study.odometry.name, task.sequence, result.trials[0])
+            done.append((task, result))
+            progress("baseline", len(done), len(tasks), "")
+    except AdaptuneError:
+        if not any(archive.folder.glob("*/*.npz")):
+            # Nothing binds the folder to this configuration: it may be mended.
+            (study.folder / CONFIGURATION).unlink(missing_ok=True)
+        raise
+    for task, result in done:
+        if result.frames is not None:
+            archive.write_frames(task.sequence, result.frames)
+        archive.write(task.sequence, 0, result.trials[0], whole=True)
+        T_ref_sensor = archive.read_frames(task.sequence).T_ref_sensor
+        if what := contradiction(result.trials[0].T_odom_sensor, T_ref_sensor):
+            _log.warning(
+                "sequences.%s: the reference contradicts the odometry's motion nearly everywhere: "
+                "%s; check the file or topic (reference), the LiDAR's pose in its frame "
+                "(extrinsic) and its clock (clock_offset)",
+                task.sequence,
+                what,
+            )
+
+
+def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
+    """Refuse a whole run of the baseline that failed; a fault now and then is only told.
+
+    Raises
+    ------
+    BaselineError
+    """
+    n, missing = len(run.errors), run.unhealthy.get("no_pose", 0)
+    if not run.faults and missing < MOST_WITHOUT_POSE * n:
+        return
+    failed = missing >= MOST_WITHOUT_POSE * n
+    gave_up = len(run.faults) >= MOST_FAULTS * max(1, len(run.repeats))
+    last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
+    if failed or gave_up:
+        raise BaselineError(
+            f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: no "
+            f"pose for {missing} of {n} scans; {last}; nothing of it is stored: mend the odometry "
+            f"(odometry in the study), or leave the sequence out, and run the same command again"
+        )
+    _log.warning(
+        "sequences.%s: %s with its own parameters, the baseline: %d fault%s, the last: %s",
+        sequence,
+        odometry,
+        len(run.faults),
+        "s" if len(run.faults) > 1 else "",
+        last,
+    )
