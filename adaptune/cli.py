@@ -10,7 +10,8 @@ import typer
 
 from adaptune import tools
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import Commands, console, errors, progress, say
+from adaptune.next_command import say_next, say_next_of_study, say_next_online
+from adaptune.terminal import Commands, begin_work, console, errors, progress, say
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
@@ -48,6 +49,17 @@ models.command()(tools.show)
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study's YAML.", show_default=False)
 ]
+
+
+def _complete_override(incomplete: str) -> list[str]:
+    """Keys and values for `-o`, when the shell asks."""
+    from adaptune.study.keys import complete
+    from offline.config import OfflineStudyConfig
+    from offline.samplers.settings import NAMES
+
+    return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
+
+
 Override = Annotated[
     list[str],
     typer.Option(
@@ -56,6 +68,7 @@ Override = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the YAML, as in `-o offline.trials=128`. May be repeated.",
         show_default=False,
+        autocompletion=_complete_override,
     ),
 ]
 Folder = Annotated[
@@ -87,13 +100,15 @@ def _main(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
+    from rich.highlighter import NullHighlighter
     from rich.logging import RichHandler
 
+    plain: Any = {"markup": False, "highlighter": NullHighlighter(), "keywords": []}
     logging.basicConfig(
         level=logging.DEBUG if verbose else logging.INFO,
         format="%(message)s",
         datefmt="[%X]",
-        handlers=[RichHandler(console=errors, show_path=False, show_level=False, markup=False)],
+        handlers=[RichHandler(console=errors, show_path=False, show_level=False, **plain)],
     )
     for chatty in ("matplotlib", "numba", "asyncio"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
@@ -115,19 +130,21 @@ def simulate(
     from adaptune.simulation.recording import record
 
     if not loaded.config.courses:
-        raise AdaptuneError(f"{study}: courses: there is none to simulate")
+        help_ = "add one, as in courses: {demo: {scenes: [cave]}}"
+        raise AdaptuneError(f"{study}: courses: there is none to simulate; {help_}")
     loaded.open()
     with progress() as show:
-        for name, course in loaded.config.courses.items():
-            path = loaded.sequences.recording(name)
-            if path.exists() and not overwrite:
-                continue
+        courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
+        due = [n for n in courses if overwrite or not loaded.sequences.recording(n).exists()]
+        for name in due:
 
             def step(done: int, total: int, name: str = name) -> None:
                 show(name, done, total)
 
-            record(course, path, overwrite=overwrite, progress=step)
-    say(f"Recordings are in {loaded.sequences.recording('*').parent}/")
+            path = loaded.sequences.recording(name)
+            record(courses[name], path, overwrite=overwrite, progress=step)
+    say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
+    say_next_of_study("run trials, fit the error model", "offline", study, override, folder)
 
 
 @app.command()
@@ -153,8 +170,8 @@ def offline(
     loaded = _load(study, override, folder)
     from adaptune import report
     from offline.train import train
+    from offline.tuning import MIN_SEQUENCES
 
-    say(f"Seed {loaded.config.offline.seed}.")
     with progress() as show:
         training = train(loaded, show, cluster, again)
     model = training.model
@@ -167,19 +184,30 @@ def offline(
             "does not restart.",
         )
     )
-    say(f"Baseline: {_short(loaded.odometry.space.baseline)}")
-    say(f"Fixed: {_short(model.sets[model.fixed])}")
+    own, fixed = (
+        sum(row[f"{mode}, whole run"] for row in training.rows) / len(training.rows)
+        for mode in ("baseline", "fixed")
+    )
+    say(
+        f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % in whole runs in training "
+        f"({_sequences(len(training.rows))})."
+    )
+    say(f"Parameters of the fixed set: {_short(model.sets[model.fixed])}")
+    say(f"Parameters of the baseline: {_short(loaded.odometry.space.baseline)}")
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
     if loaded.mechanism == "bank" and model.bank_adapts:
         say(f"Bank: trials {', '.join(map(str, model.bank))}")
     elif not model.paired.adapt:
-        say(
-            "Leaving out one training sequence after the other did not show that adapting pays "
-            "(this needs six sequences or more): `paired` will always take the fixed set."
-        )
+        few = len(loaded.config.training) < MIN_SEQUENCES
+        why = f"Fewer than {MIN_SEQUENCES} training sequences do" if few else "Training did"
+        say(f"{why} not show that adapting pays: `paired` will always take the fixed set.")
     say(f"Error model: {loaded.model_path}")
+    if len(loaded.training) > 1:
+        say_next_of_study("would adapting pay elsewhere?", "validate", study, override, folder)
+    else:
+        say_next_online(loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -224,9 +252,14 @@ def trials(
     else:
         title = f"{len(chosen)} of {len(finished)} trials, RTE [%]"
         console.print(report.table(title, chosen))
+        if judged := [row for row in finished if row["mean"] is not None]:
+            best = min(judged, key=lambda row: row["mean"])
+            say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
+        say_next_of_study("run the trials that are left, fit", "offline", study, override, folder)
     if export is not None:
+        begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
-        errors.print(f"{n} trajectories: {export}/", highlight=False)
+        errors.print(f"{n} trajectories: {export}/")
 
 
 @app.command()
@@ -275,6 +308,7 @@ def validate(
     for mode in validation.modes:
         say(validation.verdict(mode))
     say(f"Tables and picture: {loaded.folder / 'validation'}.*")
+    say_next_online(loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -306,7 +340,9 @@ def online(
             made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
-    say(f"{made} replays made; all replays are in {loaded.folder / 'replays'}/")
+    test = _sequences(len(loaded.config.test))
+    say(f"{made} replays made, of {test} in every mode: {loaded.folder / 'replays'}/")
+    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
 
 
 @app.command()
@@ -334,10 +370,13 @@ def switching(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
             rows,
-            f"This study uses {loaded.mechanism}, with a switch cost of "
-            f"{loaded.switch_cost():.1%}; kept in {loaded.folder / 'switching.json'}.",
         )
     )
+    say(
+        f"This study uses {loaded.mechanism}, with a switch cost of {loaded.switch_cost():.1%}; "
+        f"kept in {loaded.folder / 'switching.json'}."
+    )
+    say_next_online(loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -354,9 +393,11 @@ def compare(
     """
     loaded = _load(study, override, folder)
     from adaptune import report
+    from offline.tuning import MIN_SEQUENCES
     from online.comparison import compare as compare_replays
 
     loaded.check()
+    begin_work()
     rows = compare_replays(loaded)
     console.print(
         report.table(
@@ -366,7 +407,31 @@ def compare(
             "`all`: mean RTE, and geometric mean of the ratios.",
         )
     )
+    if any(row.standard for row in rows):
+        console.print(
+            report.table(
+                "Errors as evo and KITTI's benchmark define them",
+                [row.standard_columns() for row in rows],
+                "APE after alignment, RPE from scan to scan: root mean squares. KITTI: mean over "
+                "the lengths in the last column; needs 100 m. `all`: mean APE and RPE; KITTI over "
+                "the sub-trajectories of all sequences.",
+            )
+        )
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    last = {row.mode: row.rte for row in rows if row.sequence == rows[-1].sequence}
+    if None not in last.values():
+        found = ", ".join(f"{mode} {rte:.3f} %" for mode, rte in last.items())
+        say(f"Mean RTE of {rows[-1].sequence}: {found}.")
+    if (n := len(loaded.config.training)) < MIN_SEQUENCES:
+        first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
+        say_next_of_study("find out whether to adapt", "offline", study, override, folder, first)
+    else:
+        why = "what it has learned; docs/adapting-live.md brings it to the robot"
+        say_next(why, "model", "show", loaded.model_path)
+
+
+def _sequences(n: int) -> str:
+    return f"{n} sequence{'' if n == 1 else 's'}"
 
 
 def _short(parameters: dict[str, Any]) -> str:
@@ -378,7 +443,7 @@ def _short(parameters: dict[str, Any]) -> str:
 
 def main() -> None:
     """Run the command line."""
-    app()
+    app(prog_name="adaptune")
 
 
 if __name__ == "__main__":

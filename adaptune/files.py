@@ -18,6 +18,14 @@ DAMAGED_NPZ = (
 """What numpy and zipfile raise on damaged ``.npz`` files."""
 
 
+def expand_user(path: str) -> Path:
+    """Replace ``~`` and ``~user``; an AdaptuneError if there is no such user."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise AdaptuneError(f"{path}: there is no such user; give the whole path") from error
+
+
 class FullError(AdaptuneError, OSError):
     """There is no room for a file."""
 

@@ -7,40 +7,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adaptune import geometry, yaml
+from adaptune import faults, yaml
 from adaptune.errors import AdaptuneError
+from adaptune.faults import Fault, Parts
 from adaptune.sequence import Scan, SequenceConfig, SequenceError
-from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, BagSource
-from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.bag_files import SUFFIXES as BAG_SUFFIXES
+from adaptune.sequence.config import REFERENCE_FILES
 from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.pointcloud2 import DATATYPES
-from adaptune.sequence.pose_messages import POSES
 from adaptune.sequence.recorded import RecordedSequence
-from adaptune.sequence.serialized import header_stamp
-from adaptune.trajectory import Trajectory
+from adaptune.survey import Reading, Show, Survey, n_valid, survey
+from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 Layout = tuple[tuple[str, str, int], ...]
 """Name, type and offset of the fields of a point."""
 
 _KITTI_FOLDERS = ("velodyne", "velodyne_points")
+# Scan files that are read, unless all are to be.
+_FILES = 40
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic, or the scans of a folder."""
+    """A topic, the scans of a folder, or the poses of a file."""
 
     name: str
     type: str
     count: int  # messages
     # Messages per second of their stamps; for topics without stamps, of their recording.
     rate: float | None = None
-    # Nanoseconds of the first and the last stamp.
+    # Nanoseconds of the first and the last stamp that was read.
     first: int | None = None
     last: int | None = None
     gap: float | None = None  # longest time between one message and the next, in seconds
-    oddities: tuple[str, ...] = ()  # what is wrong with the stamps
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,52 +60,56 @@ class Inspection:
 
     path: Path
     topics: tuple[Topic, ...]
+    complete: bool  # whether it was read to its end or damage, and not only a sample of it
+    n_read: tuple[int, int]  # messages that were read, and clouds among them
     layout: Layout  # of the first cloud
     scan: ScanSummary | None  # none where no scan could be read
-    reference: Trajectory | None
-    problems: tuple[str, ...]  # what is odd or unreadable
+    reference: Trajectory | None  # as far as it was read
+    faults: tuple[Fault, ...]
     # What each stage still needs, by stage; empty if it can run.
     missing: dict[str, tuple[str, ...]]
-    entry: str  # YAML for the `sequences:` of a study
+    entry: str  # YAML for a study
+
+    @property
+    def n_messages(self) -> int:
+        """How many messages, scans or poses there are."""
+        return sum(topic.count for topic in self.topics)
+
+    def doubts(self, stage: str) -> bool:
+        """Whether a fault concerns a stage that can run."""
+        return any(fault.of in _INPUTS[stage] for fault in self.faults)
 
 
-def inspect(path: Path) -> Inspection:
-    """Read a whole recording and report what it holds.
+# What each stage uses.
+_INPUTS = {
+    "offline": ("points", "reference"),
+    "online": ("points",),
+    "comparison with the reference": ("points", "reference"),
+    "motion compensation": ("points", "imu"),
+}
 
-    It is a bag, a folder with bags, a KITTI sequence or drive, or a folder of scans. A
-    SequenceError says that it cannot be opened at all. Later failures are among the problems.
+
+def _silent(what: str, done: int, total: int) -> None:
+    """Show no progress."""
+
+
+def inspect(path: Path, deep: bool = False, show: Show | None = None) -> Inspection:
+    """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
+
+    It is a bag, a folder with bags, a KITTI sequence or drive, a folder of scans, or a file of
+    poses. An AdaptuneError says that it cannot be opened at all. What fails later is among the
+    faults.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
-    topics: tuple[Topic, ...] = ()
-    layout: Layout = ()
-    problems: list[str] = []
+    # The study that names it may lie in any folder.
+    path = path.resolve()
+    if path.suffix in REFERENCE_FILES and path.is_file():
+        return _inspect_poses(path)
     kind = _kind(path)
-    given: dict[str, Any] = {kind: str(path)}
     if kind == "bag":
-        source = _any_bag(path)
-        topics, read = _topics(source)
-        problems += read
-        clouds = [t for t in topics if t.type in POINTS_TYPES and t.count]
-        if clouds:
-            # The densest of several: the others are parts of it, or filtered.
-            given["points"] = max(clouds, key=lambda t: (t.count, t.name)).name
-        poses = [t for t in topics if t.type in POSES and t.count and "tf" not in t.type.lower()]
-        if poses:
-            given["reference"] = max(poses, key=lambda t: t.count).name
-        if imus := [t.name for t in topics if t.type in IMU_TYPES]:
-            given["imu"] = {"topic": imus[0]}
-    scan, reference = None, None
-    if kind != "bag" or "points" in given:
-        scan, reference, layout, found, more = _first_scan(given)
-        topics = topics or found
-        problems += more
-    for topic in topics:
-        problems += [f"{topic.name}: {oddity}" for oddity in topic.oddities]
-    if reference is not None:
-        problems += _reference_problems(reference)
-    missing, entry = _missing(scan, reference), _entry(path, given, reference)
-    return Inspection(path, topics, layout, scan, reference, tuple(problems), missing, entry)
+        return _inspect_bag(path, survey(path, deep, show or _silent))
+    return _inspect_scans(path, kind, deep, show or _silent)
 
 
 def _kind(path: Path) -> str:
@@ -114,121 +118,179 @@ def _kind(path: Path) -> str:
         return "bag"
     if any((path / name).is_dir() for name in _KITTI_FOLDERS):
         return "kitti"
-    suffixes = {p.suffix for p in path.iterdir()}
-    return "bag" if suffixes & {".bag", ".mcap", ".db3"} else "folder"
+    # Files of a ROS 2 folder may be compressed, and then have other suffixes.
+    bags = {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES}
+    return "bag" if bags or (path / "metadata.yaml").exists() else "folder"
 
 
-def _any_bag(path: Path) -> BagSource:
-    """Open the bag without looking for point clouds."""
-    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
-    return BagSource(bag_paths([str(path)]), about=about)
-
-
-def _topics(source: BagSource) -> tuple[tuple[Topic, ...], list[str]]:
-    """Every topic with its stamps, and the problems of reading them."""
-    problems = []
-    with source.open() as reader:
-        kinds = {c.topic: c.msgtype for c in reader.connections}
-        stamps: dict[str, list[int]] = {topic: [] for topic in kinds}
-        recorded: dict[str, list[int]] = {topic: [] for topic in kinds}
-        first = {kind: fields[:1] for kind, (_, fields) in reader.typestore.fielddefs.items()}
-        stamped = {
-            topic
-            for topic, kind in kinds.items()
-            if [field[1][1] for field in first.get(kind, ())] == ["std_msgs/msg/Header"]
-        }
-        try:
-            for connection, when, data in source.read(reader):
-                topic = connection.topic
-                recorded[topic].append(when)
-                stamp = header_stamp(data, reader.is2) if topic in stamped else None
-                if stamp is not None:
-                    stamps[topic].append(stamp)
-        except SequenceError as error:
-            problems.append(str(error))
-    topics = tuple(
-        _topic(name, kinds[name], stamps[name], recorded[name]) for name in sorted(kinds)
+def _inspect_bag(path: Path, found: Survey) -> Inspection:
+    given: dict[str, Any] = {"bag": str(path)}
+    used = {"points": found.points, "reference": found.reference, "imu": found.imu}
+    given |= {key: name for key, name in used.items() if name is not None}
+    if found.imu is not None:
+        given["imu"] = {"topic": found.imu}
+    reference, problems = found.trajectory(), found.faults
+    for topic in found.topics.values():
+        of = next((key for key, name in used.items() if name == topic.name), "")
+        problems += _topic_faults(topic, of, found.complete)
+    if found.points is not None:
+        problems += faults.of_clouds(found.points, found.topics[found.points].count, found.valid)
+    layout: Layout = ()
+    summary = None
+    if found.first is not None:
+        layout, count = _layout(found.first[1])
+        summary = _summary(found.first[0], count)
+    if reference is not None and found.reference is not None:
+        alone = found.topics[found.reference].count == 1
+        problems += faults.of_reference(reference, found.complete or alone)
+        if (scans := _scan_span(found)) is not None and (found.complete or len(reference) > 1):
+            problems += faults.of_overlap(reference, scans, found.slack)
+    readings = found.topics.values()
+    return Inspection(
+        path,
+        topics=tuple(_topic(reading) for reading in readings),
+        complete=found.complete,
+        n_read=(sum(reading.n_read for reading in readings), len(found.valid)),
+        layout=layout,
+        scan=summary,
+        reference=reference,
+        faults=tuple(problems),
+        missing=_missing(summary, reference, problems),
+        entry=_entry(path, given, found),
     )
-    return topics, problems
 
 
-def _topic(name: str, kind: str, stamps: Items[int], recorded: Items[int] = ()) -> Topic:
-    """Topic of messages with these stamps, recorded at these times if they are of a bag."""
-    times, count = np.array(stamps or recorded, np.int64), len(recorded or stamps)
-    if not count:
-        return Topic(name, kind, count)
-    steps = np.diff(times) * 1e-9
+def _inspect_scans(path: Path, kind: str, deep: bool, show: Show) -> Inspection:
+    given = {kind: str(path)}
+    sequence = open_sequence(SequenceConfig(**given, cache=False))
+    assert isinstance(sequence, RecordedSequence)
+    frames = list(sequence.source.frames())
+    number = len(frames) if deep else min(_FILES, len(frames))
+    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, number).astype(int)]
+    reading = Reading(str(path), "scans", len(frames), stamped=True)
+    reading.stamps = [[frame.stamp for frame in frames]]
+    reading.recorded = [[frame.stamp for frame in chosen]]
+    valid, summary, reference = [], None, None
+    for done, frame in enumerate(chosen, start=1):
+        try:
+            scan = frame.load()
+        except AdaptuneError as error:
+            reading.undecoded.append(((frame.stamp - frames[0].stamp) * 1e-9, str(error)))
+            continue
+        valid.append(n_valid(scan))
+        summary = summary or _summary(scan, 0)
+        show("reading", done, number)
+    problems = [
+        *_topic_faults(reading, "points", complete=True),
+        *faults.of_clouds(str(path), len(frames), valid),
+    ]
+    try:
+        reference = sequence.source.poses(None, None)
+    except AdaptuneError as error:
+        problems.append(Fault(str(error), "reference", "a reference trajectory"))
+    if reference is not None:
+        problems += faults.of_reference(reference, complete=True)
+        problems += faults.of_overlap(reference, (frames[0].stamp, frames[-1].stamp), 0.0)
+    return Inspection(
+        path,
+        topics=(_topic(reading),),
+        complete=number == len(frames),
+        n_read=(number, number),
+        layout=(),
+        scan=summary,
+        reference=reference,
+        faults=tuple(problems),
+        missing=_missing(summary, reference, problems),
+        entry=_entry(path, given),
+    )
+
+
+def _inspect_poses(path: Path) -> Inspection:
+    timed = not is_kitti(path)
+    if timed:
+        reference, kind = read_trajectory(path), "poses with stamps"
+    else:
+        poses, kind = read_kitti(path), "poses, one for each scan"
+        reference = Trajectory(np.arange(len(poses)), poses)
+    stamps = reference.stamps.tolist() if timed else []
+    reading = Reading(path.name, kind, len(reference), timed, [stamps], [[0] * len(reference)])
+    topic = _topic(reading) if timed else Topic(path.name, kind, len(reference))
+    return Inspection(
+        path,
+        topics=(topic,),
+        complete=True,
+        n_read=(len(reference), 0),
+        layout=(),
+        scan=None,
+        reference=reference,
+        faults=tuple(faults.of_reference(reference, complete=True, timed=timed)),
+        missing={},
+        entry=yaml.dump({"reference": str(path)}),
+    )
+
+
+def _topic(reading: Reading) -> Topic:
+    parts: Parts = reading.stamps if any(reading.stamps) else reading.recorded
+    times = [time for part in parts for time in part]
+    if not times:
+        return Topic(reading.name, reading.kind, reading.count)
+    steps = faults.inner_steps(parts)
     positive = steps[steps > 0]
     rate = float(1.0 / np.median(positive)) if len(positive) else None
     gap = float(positive.max()) if len(positive) else None
-    oddities = _oddities(times, recorded, gap, rate) if stamps else ()
-    return Topic(name, kind, count, rate, int(times.min()), int(times.max()), gap, oddities)
+    return Topic(reading.name, reading.kind, reading.count, rate, min(times), max(times), gap)
 
 
-def _oddities(
-    stamps: NDArray[np.int64], recorded: Items[int], gap: float | None, rate: float | None
-) -> tuple[str, ...]:
-    if len(stamps) > 1 and stamps.max() == 0:
-        return ("all stamps are zero",)
-    steps = np.diff(stamps)
-    counts = {
-        "stamps repeat the one before": np.count_nonzero(steps == 0),
-        "stamps go back in time": np.count_nonzero(steps < 0),
-        # Recordings that count from zero begin with it.
-        "stamps are zero": np.count_nonzero(stamps[1:] == 0),
-    }
-    found = [f"{number} {what}" for what, number in counts.items() if number]
-    if gap is not None and rate is not None and gap * rate > 3.5 and gap > 0.2:
-        lost = np.count_nonzero(steps * 1e-9 * rate > 3.5)
-        found.append(f"{lost} gaps, the longest of {gap:.2f} s")
-    if len(recorded) == len(stamps):
-        late = (np.array(recorded, np.int64) - stamps) * 1e-9
-        usual = float(np.median(late))
-        if abs(usual) > 5.0:
-            side = "behind" if usual > 0 else "ahead of"
-            found.append(f"its clock is {abs(usual):.3f} s {side} the recorder's")
-        if leaps := np.count_nonzero(np.abs(late - usual) > 5.0):
-            found.append(f"{leaps} stamps leap by more than 5 s against the recorder's clock")
-    return tuple(found)
+_UNDECODED = {
+    "points": (
+        "the stages stop there: set `stop` before it or `start` after it, or repair the bag",
+        "point clouds that decode",
+    ),
+    "reference": (
+        "it cannot be the reference: repair the bag, or name another topic or a file of poses",
+        "a reference that decodes",
+    ),
+    "imu": ("leave `imu` out, or repair the bag", ""),
+}
 
 
-def _first_scan(
-    given: dict[str, Any],
-) -> tuple[ScanSummary | None, Trajectory | None, Layout, tuple[Topic, ...], list[str]]:
-    """First scan and reference, read as the stages read them."""
-    problems = []
-    scan, reference, count = None, None, 0
-    layout: Layout = ()
-    topics: tuple[Topic, ...] = ()
-    options = {key: value for key, value in given.items() if key != "imu"}
-    try:
-        sequence = open_sequence(SequenceConfig(**options, cache=False))
-    except SequenceError as error:
-        if "bag" not in given:
-            raise
-        return None, None, (), (), [str(error)]
-    assert isinstance(sequence, RecordedSequence)
-    source = sequence.source
-    try:
-        if isinstance(source, BagSource):
-            layout, count = _layout(source)
+def _topic_faults(topic: Reading, of: str, complete: bool) -> Iterator[Fault]:
+    if topic.undecoded:
+        (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
+        help_, lacks = _UNDECODED[of]
+        many = f"all {n}" if n == topic.n_read else f"{n} of {topic.n_read}"
+        what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
+        yield Fault(f"{topic.name}: {what}; {help_}", of, lacks)
+    if of and topic.count and not topic.n_read:
+        if complete:
+            what, lacks = "are listed but cannot be found: repair the bag", _UNDECODED[of][1]
         else:
-            stamps = [frame.stamp for frame in source.frames()]
-            topics = (_topic(str(source.name), "scans", stamps),)
-        scan = _summary(next(iter(sequence)), count)
-    except AdaptuneError as error:
-        problems.append(str(error))
-    try:
-        reference = sequence.reference()
-    except AdaptuneError as error:
-        problems.append(str(error))
-    return scan, reference, layout, topics, problems
+            what, lacks = "are not in the sample, `--deep` reads them", ""
+        yield Fault(f"{topic.name}: its {topic.count} messages {what}", of, lacks)
+    if any(topic.stamps):
+        yield from faults.of_stamps(topic.name, of, topic.stamps, topic.recorded)
+        if not complete:
+            yield from faults.of_count(topic.name, of, topic.stamps, topic.count)
 
 
-def _layout(source: BagSource) -> tuple[Layout, int]:
-    """Fields of a point of the first cloud, and how many points it holds."""
-    message = next(source.messages(source.points), None)
-    if message is None or not hasattr(message, "fields"):
+def _scan_span(found: Survey) -> tuple[int, int] | None:
+    """First and last stamp of the scans that were read, without those that leap."""
+    topic = found.topics.get(found.points or "")
+    if topic is None or not any(topic.stamps):
+        return None
+    stamps, recorded = (
+        np.array([t for part in parts for t in part], np.int64)
+        for parts in (topic.stamps, topic.recorded)
+    )
+    if len(stamps) == len(recorded):
+        late = recorded - stamps
+        stamps = stamps[np.abs(late - np.median(late)) < 5e9]
+    return (int(stamps.min()), int(stamps.max())) if len(np.unique(stamps)) > 1 else None
+
+
+def _layout(message: Any) -> tuple[Layout, int]:
+    """Fields of a point of a cloud, and how many points it holds."""
+    if not hasattr(message, "fields"):
         points = list(getattr(message, "points", ()))
         names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
         return tuple((name, "", 0) for name in names), len(points)
@@ -250,27 +312,19 @@ def _summary(scan: Scan, recorded: int) -> ScanSummary:
     return ScanSummary(scan, max(recorded, len(scan)), ranges, span, rings)
 
 
-def _reference_problems(reference: Trajectory) -> Iterator[str]:
-    if len(reference) < 2:
-        yield "the reference holds a single pose"
-        return
-    steps = np.linalg.norm(geometry.steps(reference.T_world_sensor)[:, :3, 3], axis=1)
-    seconds = np.diff(reference.stamps) * 1e-9
-    if still := np.count_nonzero(steps == 0):
-        yield f"the reference repeats the pose before it {still} times"
-    if jumps := np.count_nonzero(steps > 100.0 * np.maximum(seconds, 1e-3)):
-        yield f"the reference jumps {jumps} times"
-    if gaps := np.count_nonzero(seconds > reference.max_gap):
-        yield (
-            f"the reference has {gaps} gaps beyond {reference.max_gap:g} s, the longest of "
-            f"{seconds.max():.2f} s: scans in them are not labelled"
-        )
-
-
-def _missing(scan: ScanSummary | None, reference: Trajectory | None) -> dict[str, tuple[str, ...]]:
+def _missing(
+    scan: ScanSummary | None, reference: Trajectory | None, problems: Items[Fault]
+) -> dict[str, tuple[str, ...]]:
     """What each stage needs and does not find."""
-    clouds = () if scan is not None else ("point clouds that can be read",)
-    truth = () if reference is not None else ("a reference trajectory",)
+    lacks = {
+        of: tuple({f.lacks: None for f in problems if f.of == of and f.lacks})
+        for of in ("points", "reference")
+    }
+    clouds, truth = lacks["points"], lacks["reference"]
+    if scan is None and not any(f.of == "points" for f in problems):
+        clouds = ("point clouds that can be read",)
+    if reference is None and not any(f.of == "reference" for f in problems):
+        truth = ("a reference trajectory",)
     timeless = scan is not None and scan.scan.times is None
     times = ("a time for each point",) if timeless else ()
     return {
@@ -281,11 +335,13 @@ def _missing(scan: ScanSummary | None, reference: Trajectory | None) -> dict[str
     }
 
 
-def _entry(path: Path, given: dict[str, Any], reference: Trajectory | None) -> str:
+def _entry(path: Path, given: dict[str, Any], found: Survey | None = None) -> str:
     name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in path.stem).lstrip(".-")
     text = yaml.dump({"sequences": {name or "recording": given}})
-    if reference is None and "reference" not in given:
+    if found is None:
+        return text
+    if found.reference is None:
         text += "    # reference: its poses - a topic, or a TUM, KITTI or EuRoC file\n"
-    if "points" in given:
+    if found.points is not None:
         text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
     return text

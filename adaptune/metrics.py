@@ -117,6 +117,18 @@ class KittiError(NamedTuple):
     rotation: float  # degrees a metre
     # The lengths in metres for which there was at least one sub-trajectory.
     lengths: tuple[float, ...]
+    n: int = 0  # number of sub-trajectories
+
+    @classmethod
+    def pooled(cls, errors: Sequence["KittiError"]) -> "KittiError":
+        """The mean over the sub-trajectories of several paths, as the benchmark takes it."""
+        known = [error for error in errors if error.n]
+        if not known:
+            return cls(np.nan, np.nan, ())
+        n = [error.n for error in known]
+        means = [np.average([e[i] for e in known], weights=n) for i in (0, 1)]
+        lengths = sorted({length for error in known for length in error.lengths})
+        return cls(float(means[0]), float(means[1]), tuple(lengths), sum(n))
 
 
 def kitti_error(
@@ -143,10 +155,12 @@ def kitti_error(
         used.append(length)
     if not used:
         return KittiError(np.nan, np.nan, ())
+    translation, rotation = np.concatenate(translations), np.concatenate(rotations)
     return KittiError(
-        100.0 * float(np.mean(np.concatenate(translations))),
-        float(np.degrees(np.mean(np.concatenate(rotations)))),
+        100.0 * float(np.mean(translation)),
+        float(np.degrees(np.mean(rotation))),
         tuple(used),
+        len(translation),
     )
 
 

@@ -13,8 +13,8 @@ class PluginError(AdaptuneError):
     """A name for which there is no object."""
 
 
-def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> Any:
-    """Import an object by its name.
+def path_of(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> str:
+    """Where an object is, as ``module:attribute``, without importing it.
 
     Parameters
     ----------
@@ -37,6 +37,15 @@ def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -
             help_ = f"{nearest(name, [*ours, *announced])} (a {sort.lower()} of your own is"
             raise PluginError(f"there is no {kind} {name!r}: {help_} module:{sort})")
         path = announced[name]
+    module = path.partition(":")[0]
+    if not all(map(str.isidentifier, module.split("."))):
+        help_ = f"write it as Python imports it, as in my_package.my_module:{sort}"
+        raise PluginError(f"{name}: {module!r} is not the name of a module; {help_}")
+    return path
+
+
+def load(name: str, path: str, sort: str) -> Any:
+    """Import an object by its name from where it is, ``module:attribute``."""
     module, _, attribute = path.partition(":")
     try:
         return getattr(import_module(module), attribute)
@@ -44,4 +53,4 @@ def load(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -
         help_ = "install it, or name its folder in PYTHONPATH"
         raise PluginError(f"{name}: cannot import {module} ({error}); {help_}") from error
     except AttributeError as error:
-        raise PluginError(f"{name}: {module} has no {attribute or sort.lower()}") from error
+        raise PluginError(f"{name}: {module} has no {attribute or sort}") from error

@@ -1,6 +1,7 @@
 """Show an inspected recording, and the cache, on a terminal; draw a recording's first scan."""
 
 import datetime
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,13 +27,31 @@ def render_inspection(inspection: Inspection) -> RenderableType:
     if inspection.scan is not None:
         parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
     if inspection.reference is not None:
-        parts.append(Text(f"reference: {_reference_text(inspection.reference)}"))
-    parts += [Text(f"! {problem}", style="yellow") for problem in inspection.problems]
-    for stage, lacking in inspection.missing.items():
-        state = f"lacks {' and '.join(lacking)}" if lacking else "has all it needs"
-        parts.append(Text(f"{stage}: {state}", style="red" if lacking else "green"))
+        text = _reference_text(inspection.reference, inspection.complete)
+        parts.append(Text(f"reference: {text}"))
+    parts.append(Text(_read_text(inspection)))
+    parts += [Text(f"! {f.text}", "red" if f.lacks else "yellow") for f in inspection.faults]
+    parts += [_stage_text(inspection, stage) for stage in inspection.missing]
     parts.append(Text("\n" + inspection.entry))
     return Group(*parts)
+
+
+def _read_text(inspection: Inspection) -> str:
+    (read, clouds), total = inspection.n_read, inspection.n_messages
+    if inspection.complete:
+        return f"read: {'all' if read >= total else f'{read:,} of'} {total:,} messages"
+    among = f" ({clouds:,} clouds)" if 0 < clouds < read else ""
+    what = "rates, gaps and problems are estimates; `--deep` reads all"
+    return f"read: a sample of {read:,} of {total:,} messages{among}: {what}"
+
+
+def _stage_text(inspection: Inspection, stage: str) -> Text:
+    if lacking := inspection.missing[stage]:
+        return Text(f"{stage}: lacks {' and '.join(lacking)}", style="red")
+    if inspection.doubts(stage):
+        return Text(f"{stage}: can run, but see the lines with ! above", style="yellow")
+    limit = "" if inspection.complete else ", as far as the sample shows"
+    return Text(f"{stage}: has all it needs{limit}", style="green")
 
 
 def _topic_table(inspection: Inspection) -> Table:
@@ -80,14 +99,20 @@ def _scan_text(scan: ScanSummary) -> str:
     return ", ".join(words)
 
 
-def _reference_text(reference: Trajectory) -> str:
+def _reference_text(reference: Trajectory, complete: bool) -> str:
     length = np.linalg.norm(np.diff(reference.T_world_sensor[:, :3, 3], axis=0), axis=1).sum()
     seconds = (reference.stamps[-1] - reference.stamps[0]) * 1e-9
-    return f"{len(reference):,} poses, {length:.1f} m in {seconds:.1f} s"
+    words = "poses, " if complete else "poses in the sample, at least "
+    # Poses without stamps are numbered by nanoseconds.
+    lasted = f" in {seconds:.1f} s" if seconds > 1e-3 else ""
+    return f"{len(reference):,} {words}{length:.1f} m{lasted}"
 
 
-def write_inspection_png(inspection: Inspection, path: Path) -> None:
-    """Draw the first scan from above and from the side; a SequenceError if there is none."""
+def draw_inspection(inspection: Inspection, path: Path) -> None:
+    """Draw the first scan from above and from the side, as SVG if the path says so, else as PNG.
+
+    A SequenceError says that there is none.
+    """
     if inspection.scan is None:
         raise SequenceError(f"{inspection.path}: no scan can be drawn, none could be read")
     from matplotlib.figure import Figure
@@ -95,21 +120,27 @@ def write_inspection_png(inspection: Inspection, path: Path) -> None:
     points = inspection.scan.scan.points
     # Few far points would shrink all others to a dot.
     reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
-    low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
+    low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
     figure = Figure(figsize=(9, 12), layout="constrained")
-    above, side = figure.subplots(2, 1, height_ratios=(3, 1))
-    for axes, (i, j), names in ((above, (0, 1), "xy"), (side, (0, 2), "xz")):
+    above, side = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
+    for axes, j, title in ((above, 1, "from above"), (side, 2, "from the side, z not to scale")):
         order = np.argsort(points[:, 2])
-        x, y, z = points[order, i], points[order, j], points[order, 2]
-        dots = axes.scatter(x, y, c=z, s=0.4, cmap="viridis", vmin=low, vmax=high)
-        axes.set(aspect="equal", xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
-        axes.set_xlim(-reach, reach)
-    above.set_ylim(-reach, reach)
-    above.plot(0, 0, "r+", markersize=10)
-    figure.colorbar(dots, ax=above, label="z (m)", shrink=0.6, extend="both")
-    figure.suptitle(f"{inspection.path.name}: {_scan_text(inspection.scan)}", fontsize=9)
+        x, y, z = points[order, 0], points[order, j], points[order, 2]
+        # As a picture inside an SVG: it would have tens of thousands of shapes.
+        dots = axes.scatter(x, y, c=z, s=0.5, vmin=low, vmax=high, rasterized=True)
+        axes.plot(0, 0, "r+", markersize=12, mew=2, label="LiDAR")
+        axes.set(title=title, xlabel="x (m)", ylabel=f"{'xyz'[j]} (m)", xlim=(-reach, reach))
+        axes.grid(alpha=0.3)
+    above.set(ylim=(-reach, reach), aspect="equal")
+    above.legend(loc="upper right")
+    margin = 0.1 * (high - low) + 0.5
+    side.set_ylim(low - margin, high + margin)
+    figure.colorbar(dots, ax=above, label="height z (m)", shrink=0.6, extend="both")
+    text = textwrap.fill(_scan_text(inspection.scan), 90)
+    figure.suptitle(f"{inspection.path.name}, first scan\n{text}", fontsize=10)
+    kind = "svg" if path.suffix.lower() == ".svg" else "png"
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+        figure.savefig(temporary, format=kind, dpi=110)
 
 
 def render_cache() -> RenderableType:

@@ -2,7 +2,7 @@
 
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,8 @@ class Selector:
         the bank was shown to pay; an empty one is for a single odometry.
     switch_cost
         What a switch must promise, as a share of the fixed set's error.
+    descriptors
+        Descriptors besides adaptune's own that may be used: a model that names another is refused.
 
     Attributes
     ----------
@@ -55,7 +57,8 @@ class Selector:
     Raises
     ------
     ModelError
-        If there is no such rule, or the model's bank lacks a member.
+        If there is no such rule, the model's bank lacks a member, or the model names a descriptor
+        that may not be used.
     DescriptorError
         If a descriptor has changed since the model was fitted.
     """
@@ -66,7 +69,9 @@ class Selector:
         rule: str = RULES[0],
         members: Sequence[int] | None = None,
         switch_cost: float = 0.0,
+        descriptors: Collection[str] = (),
     ):
+        model.check_descriptors(descriptors)
         if members is None:
             members = model.bank if rule == "paired" and model.bank_adapts else ()
         self.members = tuple(members)

@@ -7,9 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from adaptune.errors import AdaptuneError
+from adaptune.strict import StrictModel
 
 Value = float | int | str | bool
 ParameterSet = dict[str, Value]
@@ -29,11 +30,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return f"there is {', '.join(map(repr, names))}" if names else "there is none"
 
 
-class _Parameter(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _Range(_Parameter):
+class _Range(StrictModel):
     """Bounds and scale of a real or whole number."""
 
     _types: ClassVar[tuple[type, ...]] = (int,)
@@ -84,10 +81,6 @@ class Float(_Range):
     _types: ClassVar[tuple[type, ...]] = (int, float)
 
     type: Literal["float"] = "float"
-    low: float = Field(allow_inf_nan=False)
-    high: float = Field(allow_inf_nan=False)
-    baseline: float
-    log: bool = False
 
     def from_unit(self, unit: float) -> float:
         """Map from [0, 1] to a value."""
@@ -95,13 +88,16 @@ class Float(_Range):
         return min(max(self._unscaled(unit), self.low), self.high)
 
 
+_Whole = Annotated[int, Field(ge=-(2**53), le=2**53)]
+
+
 class Integer(_Range):
     """A whole number from `low` to `high`, both included."""
 
     type: Literal["integer"] = "integer"
-    low: int
-    high: int
-    baseline: int
+    low: _Whole
+    high: _Whole
+    baseline: _Whole
     log: bool = False
 
     def from_unit(self, unit: float) -> int:
@@ -113,11 +109,11 @@ class Integer(_Range):
         return self._scale(self.low - 0.5), self._scale(self.high + 0.5)
 
 
-class Categorical(_Parameter):
+class Categorical(StrictModel):
     """One of a list of values, without an order."""
 
     type: Literal["categorical"] = "categorical"
-    choices: tuple[Value, ...] = Field(min_length=2)
+    choices: tuple[Value, ...] = Field(min_length=2, max_length=1000)
     baseline: Value
 
     @model_validator(mode="after")

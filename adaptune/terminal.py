@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,9 +18,12 @@ from adaptune.errors import AdaptuneError
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-# A table in a pipe is not wrapped, unless COLUMNS gives a width.
-console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 200)
-errors = Console(stderr=True)
+# Text of files is printed as it is: no markup, no emoji.
+_literal: Any = {"markup": False, "emoji": False, "highlight": False}
+# In a pipe, tables and logs are not wrapped, unless COLUMNS gives a width.
+_wide = None if "COLUMNS" in os.environ else 200
+console = Console(width=None if sys.stdout.isatty() else _wide, **_literal)
+errors = Console(stderr=True, width=None if sys.stderr.isatty() else _wide, **_literal)
 
 
 class Commands(TyperGroup):
@@ -32,7 +36,7 @@ class Commands(TyperGroup):
         except (AdaptuneError, OSError) as error:
             if isinstance(error, BrokenPipeError):
                 raise  # nobody reads the output any more
-            errors.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+            errors.print(f"error: {error}", style="red", soft_wrap=True)
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             errors.print("interrupted; run the same command again to resume", style="yellow")
@@ -40,20 +44,33 @@ class Commands(TyperGroup):
 
 
 def say(text: str) -> None:
-    """Print plain text."""
-    console.print(text, highlight=False)
+    """Print plain text, on one line however narrow the terminal is."""
+    console.print(text, soft_wrap=True)
+
+
+def begin_work() -> None:
+    """From here on, let Ctrl-C raise an exception, so that what is begun is put in order."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 LOG_EVERY = 5.0
-"""Seconds between two lines of the log."""
+"""Seconds between two lines about progress in a log."""
+
+MOST_FINISHED = 8
+"""Bars that stay on the screen when they are full."""
 
 Show = Callable[..., None]
-"""Called with what is done, how much of it is done, how much there is, and a remark."""
+"""Called with what is done, how much of it is done, how much there is, and a remark.
+
+How much is done may be a fraction: half a run, say.
+"""
 
 
 @contextmanager
 def progress() -> Iterator[Show]:
     """Show a bar for each thing that is done; without a terminal, write a line now and then."""
+    begin_work()
     if not errors.is_terminal:
         yield _logger()
         return
@@ -67,21 +84,24 @@ def progress() -> Iterator[Show]:
     )
 
     bars = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[remark]}"),
+        TextColumn("{task.fields[remark]}", markup=False),
         console=errors,
     )
     tasks: dict[str, TaskID] = {}
     with bars:
 
-        def show(what: str, done: int, total: int, remark: str = "") -> None:
+        def show(what: str, done: float, total: int, remark: str = "") -> None:
             if what not in tasks:
+                over = [task.id for task in bars.tasks if task.finished]
+                for finished in over[:-MOST_FINISHED]:
+                    bars.update(finished, visible=False)
                 tasks[what] = bars.add_task(what, total=total, remark="")
-            bars.update(tasks[what], completed=done, total=total, remark=remark)
+            bars.update(tasks[what], completed=done, total=max(total, done), remark=remark)
 
         yield show
 
@@ -89,11 +109,26 @@ def progress() -> Iterator[Show]:
 def _logger() -> Show:
     log = logging.getLogger("adaptune")
     last = time.monotonic()
+    begun: dict[str, tuple[float, float]] = {}
 
-    def show(what: str, done: int, total: int, remark: str = "") -> None:
+    def show(what: str, done: float, total: int, remark: str = "") -> None:
         nonlocal last
-        if done >= total or time.monotonic() - last > LOG_EVERY:
-            last = time.monotonic()
-            log.info("%s: %d of %d%s", what, done, total, remark and f", {remark}")
+        now = time.monotonic()
+        if done == begun.get(what, (now, done))[1]:
+            begun[what] = now, done
+        start, before = begun[what]
+        if now - last > LOG_EVERY:
+            last = now
+            rate = (done - before) / max(now - start, 1e-9)
+            left = _time_left((total - done) / rate) if rate and done < total else ""
+            words = (f"{what}: {int(done)} of {total}", left, remark)
+            log.info("%s", ", ".join(word for word in words if word))
 
     return show
+
+
+def _time_left(seconds: float) -> str:
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds > 2.0 * length:
+            return f"about {seconds / length:.0f} {unit} left"
+    return f"about {seconds:.0f} s left"

@@ -4,31 +4,74 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from adaptune.errors import AdaptuneError
-from adaptune.terminal import console, say
+from adaptune.next_command import say_next
+from adaptune.terminal import begin_work, console, progress, say
+
+if TYPE_CHECKING:
+    from adaptune.inspect import Inspection
 
 
 def inspect(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A bag, or its folder.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="FILE", help="A bag, a folder, or a file of poses.", show_default=False
+        ),
     ],
     png: Annotated[
-        Path | None, typer.Option(help="Draw the first scan to this PNG.", dir_okay=False)
+        Path | None, typer.Option(help="Draw the first scan to this PNG or SVG.", dir_okay=False)
     ] = None,
+    deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study."""
     from adaptune.inspect import inspect as inspect_file
-    from adaptune.rendering import render_inspection, write_inspection_png
+    from adaptune.rendering import draw_inspection, render_inspection
 
-    found = inspect_file(file)
+    begin_work()
+    if deep:
+        with progress() as show:
+            found = inspect_file(file, deep, show)
+    else:
+        found = inspect_file(file)
     console.print(render_inspection(found))
     if png is not None:
-        write_inspection_png(found, png)
+        draw_inspection(found, png)
         say(f"First scan: {png}")
+    _begin_study(found)
+
+
+LENGTHS = (25.0, 10.0, 5.0, 2.0, 1.0)
+"""Metres of a sub-trajectory: the first of which a path holds ten."""
+
+
+def _begin_study(found: "Inspection") -> None:
+    """Print the rest of a study of this recording alone, and the command that begins it."""
+    from adaptune import yaml
+    from adaptune.metrics import travelled
+
+    named = (yaml.Document(found.entry).data or {}).get("sequences")
+    if not named:
+        return
+    if found.reference is None or found.missing.get("offline"):
+        say(
+            "Next: mend what is lacking, see docs/your-bag.md; a recording without a reference can "
+            "only be a `test` sequence"
+        )
+        return
+    path = travelled(found.reference.T_world_sensor)[-1]
+    length = next((length for length in LENGTHS if length <= path / 10.0), LENGTHS[-1])
+    (name,) = named
+    say(
+        f"training: [{name}: 0-60%]\ntest: [{name}: 60-100%]\nsub_trajectory: {length}\n"
+        "odometry: {name: gicp}    # or another one, see docs/your-odometry.md\n"
+    )
+    first = f"put the lines from `sequences:` on in {name}.yaml; then "
+    say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
 
 
 class CacheAction(StrEnum):
@@ -50,9 +93,10 @@ def cache(
     from adaptune.sequence.cache import clear_cache
 
     if action is CacheAction.CLEAR:
-        say(f"Freed {clear_cache() / 1e9:.2f} GB.")
+        say(f"Freed {clear_cache() / 1e9:.2f} GB. Bags are decoded again when they are read.")
     else:
         console.print(render_cache())
+        say_next("free all of it", "cache", "clear")
 
 
 def serve(
@@ -72,6 +116,7 @@ def serve(
     """
     from adaptune.odometry import serving
 
+    begin_work()
     if listen is not None:
         if odometry is None:
             raise AdaptuneError("--listen serves one odometry: give its name")
@@ -90,4 +135,5 @@ def show(
     from adaptune.model import ErrorModel
     from adaptune.model.show import render
 
-    console.print(render(ErrorModel.load(file), file), highlight=False)
+    console.print(render(ErrorModel.load(file), file))
+    say_next("replay the test sequences of STUDY with it", "online", "STUDY", "--model", file)

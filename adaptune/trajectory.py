@@ -85,7 +85,7 @@ def _rows(path: Path, columns: int, kind: str, or_more: bool = False) -> list[Ro
             raise TrajectoryError(f"{path}, line {number}: {what}")
         rows.append((number, fields[:columns]))
     if not rows:
-        raise TrajectoryError(f"{path}: holds no pose")
+        raise TrajectoryError(f"{path}: holds no pose; give a file of TUM, KITTI or EuRoC")
     return rows
 
 
@@ -97,7 +97,7 @@ def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
         except ValueError as error:
             raise TrajectoryError(f"{path}, line {number}: {error}") from error
         if not np.isfinite(values[i]).all():
-            raise TrajectoryError(f"{path}, line {number}: a number is not finite")
+            raise TrajectoryError(f"{path}, line {number}: a number is not finite; remove the line")
     return values
 
 

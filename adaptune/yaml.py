@@ -13,8 +13,20 @@ class YamlError(AdaptuneError):
     """Text that is not YAML, or gives a key twice."""
 
 
+_TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
+
+
 class _Loader(yaml.SafeLoader):
-    """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string."""
+    """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string.
+
+    Nothing but plain data is made: no dates, no bytes, no sets.
+    """
+
+    yaml_constructors = {  # noqa: RUF012 - that is how PyYAML keeps them
+        tag: constructor
+        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in _TAGS
+    }
 
     yaml_implicit_resolvers = {  # noqa: RUF012 - that is how PyYAML keeps them
         first: [(tag, regexp) for tag, regexp in resolvers if tag.rpartition(":")[2] == "null"]
@@ -47,11 +59,44 @@ _Loader.add_implicit_resolver(_PREFIX + "float", _FLOAT, list("-+0123456789."))
 _Loader.add_implicit_resolver(_PREFIX + "bool", _BOOL, list("tTfF"))
 
 
+_NO_CHARACTER = re.compile("[\0\ud800-\udfff]")
+_LONGEST_INT = 1000
+"""Digits."""
+_MOST = 100_000
+"""Values in a document. Aliases of aliases make more out of a few lines than fit in memory."""
+
+
 def _int(loader: Any, node: Any) -> int:
-    return int(loader.construct_scalar(node))
+    text = loader.construct_scalar(node)
+    if len(text) > _LONGEST_INT:
+        line = node.start_mark.line + 1
+        raise YamlError(f"line {line}: a number of {len(text):,} digits; give a smaller one")
+    return int(text)
+
+
+def _str(loader: Any, node: Any) -> str:
+    text: str = loader.construct_scalar(node)
+    if _NO_CHARACTER.search(text):
+        line = node.start_mark.line + 1
+        raise YamlError(f"line {line}: a text holds a null character or half of one; remove it")
+    return text
 
 
 _Loader.add_constructor(_PREFIX + "int", _int)
+_Loader.add_constructor(_PREFIX + "str", _str)
+
+
+def _count(node: Any, counted: dict[int, int]) -> int:
+    """Number of values in a node, with those that aliases repeat."""
+    if isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in counted:
+        counted[id(node)] = _MOST  # if met again in itself
+        parts = node.value
+        if isinstance(node, yaml.MappingNode):
+            parts = [part for pair in parts for part in pair]
+        counted[id(node)] = 1 + sum(_count(part, counted) for part in parts)
+    return counted[id(node)]
 
 
 class Document:
@@ -64,15 +109,21 @@ class Document:
         try:
             loader = _Loader(text)
             self._node = loader.get_single_node()
+            if self._node is not None and _count(self._node, {}) > _MOST:
+                raise YamlError(f"holds more than {_MOST:,} values, or an alias of itself")
             self.data = None if self._node is None else loader.construct_document(self._node)
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = f"line {mark.line + 1}: " if mark else ""
             what = ", ".join(part for part in (error.context, error.problem) if part)
             raise YamlError(f"{where}{what}") from error
-        except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
-            # PyYAML's constructors raise these on tags that do not fit their values.
-            raise YamlError(f"{type(error).__name__}: {error}") from error
+        except RecursionError as error:
+            raise YamlError("is nested too deeply") from error
+        except yaml.YAMLError as error:
+            raise YamlError(" ".join(str(error).split())) from error
+        except (ValueError, LookupError, AttributeError) as error:
+            # PyYAML's constructors raise these.
+            raise YamlError("a tag (!!...) does not fit its value; leave tags out") from error
 
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""

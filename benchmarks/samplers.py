@@ -29,6 +29,7 @@ from rich.console import Console
 from scipy.stats import wilcoxon
 
 from adaptune import cores, report
+from adaptune.drawing import OTHERS, as_png_and_svg, log_scale, picture
 from adaptune.simulation.recording import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
@@ -230,28 +231,24 @@ def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, A
     return rows, curves
 
 
-def thesis(folder: Path, picture: Path, names: list[str]) -> None:
+def thesis(folder: Path, png: Path, names: list[str]) -> None:
     """Print the table, and draw the curves."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    axes = figure.subplots(1, len(names), squeeze=False)[0]
     console = Console(width=100)
-    for axis, name in zip(axes, names, strict=True):
-        rows, curves = searches(folder, name)
-        console.print(report.table(f"{name}, {THESIS_TRIALS} trials", rows))
-        for sampler, curve in curves.items():
-            n = np.arange(curve.shape[1])
-            (line,) = axis.plot(n, np.median(curve[..., 0], axis=0), label=sampler)
-            low, high = curve[..., 0].min(axis=0), curve[..., 0].max(axis=0)
-            axis.fill_between(n, low, high, color=line.get_color(), alpha=0.15, lw=0)
-        axis.set_title(f"{name}: median and range over {len(THESIS_SEEDS)} seeds", loc="left")
-        axis.set_xlabel("trial")
-        axis.set_ylabel("best RTE over 10 m [%]")
-        axis.set_yscale("log")
-        axis.legend(frameon=False)
-        axis.grid(alpha=0.3)
-    figure.savefig(picture, dpi=110)
+    with picture(as_png_and_svg(png), 10.0, 4.0) as figure:
+        axes = figure.subplots(1, len(names), squeeze=False)[0]
+        for axis, name in zip(axes, names, strict=True):
+            rows, curves = searches(folder, name)
+            console.print(report.table(f"{name}, {THESIS_TRIALS} trials", rows))
+            for (sampler, curve), colour in zip(curves.items(), OTHERS, strict=False):
+                n = np.arange(curve.shape[1])
+                axis.plot(n, np.median(curve[..., 0], axis=0), label=sampler, color=colour)
+                low, high = curve[..., 0].min(axis=0), curve[..., 0].max(axis=0)
+                axis.fill_between(n, low, high, color=colour, alpha=0.15, lw=0)
+            axis.set_title(f"{name}: median and range over {len(THESIS_SEEDS)} seeds")
+            axis.set_xlabel("trial [-]")
+            axis.set_ylabel("best RTE over 10 m [%]")
+            log_scale(axis)
+            axis.legend()
 
 
 if __name__ == "__main__":

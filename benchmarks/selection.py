@@ -28,6 +28,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
 from adaptune import cores
+from adaptune.drawing import POINTS, as_png_and_svg, log_scale, picture
 from adaptune.model import (
     BankRule,
     BankSettings,
@@ -200,8 +201,6 @@ def tpe(
 
 def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
     """Draw the cost of a selection against the number of training frames."""
-    from matplotlib.figure import Figure
-
     rng = np.random.default_rng(2)
     sizes = [1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000]
     medians: dict[str, list[float]] = {"paper": [], "paired": []}
@@ -219,18 +218,18 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
             costs(rule.select, asked[:5])
             medians[name].append(float(np.median(costs(rule.select, asked)[1])))
         print(f"{n:8} frames: " + ", ".join(f"{k} {v[-1]:.3f} ms" for k, v in medians.items()))
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    for name, of_rule in medians.items():
-        axes.loglog(sizes, of_rule, "o-", label=name)
-    axes.set_xlabel(f"training frames, {n_sequences} sequences, {n_sets} sets")
-    axes.set_ylabel("CPU time of a selection [ms]")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
-    figure.savefig(path, dpi=110)
+    with picture(as_png_and_svg(path), 6.0, 4.0) as figure:
+        axes = figure.subplots()
+        for name, of_rule in medians.items():
+            axes.plot(sizes, of_rule, label=name, **POINTS[name])
+        log_scale(axes, "x")
+        log_scale(axes)
+        axes.set_xlabel(f"training frames [-], {n_sequences} sequences, {n_sets} sets")
+        axes.set_ylabel("CPU time of a selection [ms]")
+        axes.legend()
 
 
-def main(picture: Path | None) -> None:
+def main(png: Path | None) -> None:
     """Measure everything."""
     cores.pin(1)
     threadpool_limits(1)
@@ -243,9 +242,9 @@ def main(picture: Path | None) -> None:
         measure_selection(model, "paired", PairedExpectedRatio(), "limit: median 5")
         bank = BankRule(BankSettings(n_frames=BANK_FRAMES))
         measure_selection(model, "bank", bank, "limit: median 5", model.bank)
-    if picture is not None:
+    if png is not None:
         print("\nCPU time of a selection against training frames")
-        draw_growth(picture)
+        draw_growth(png)
 
 
 if __name__ == "__main__":

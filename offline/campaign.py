@@ -16,9 +16,9 @@ from offline.offline_study import OfflineStudy
 from offline.pruning import rungs
 from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
 from offline.storage import MirrorRow, open_mirror
-from offline.workers import Pool, Task, run
+from offline.workers import Pool, Task, TaskProgress, run
 
-Progress = Callable[[str, int, int, str], None]
+Progress = Callable[[str, float, int, str], None]
 """Called with what is being done, how much of it is done, how much there is, and a remark."""
 
 _log = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ class _Campaign:
                 if tasks := self._tasks(missing):
                     begun = True
                     with clock.running(batch):
-                        self._tally.watch(run_tasks(self._archive, self._workers, tasks))
+                        self._tally.watch(self._archive, self._workers, tasks)
                 for search in at_work:
                     search.prune(m)
             numbers = sorted({n for search in at_work for n in search.numbers})
@@ -98,7 +98,7 @@ class _Campaign:
             if begun:
                 self._mirror_trials()
                 self._tally.catch_up()
-                _log.info("trials %d to %d done; %s", numbers[0], numbers[-1], self._tally.best)
+                _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._tally.best)
             batch += 1
         for search in stage.searches:
             where = f" on {search.sequences[0]}" if stage.alone else ""
@@ -109,8 +109,8 @@ class _Campaign:
         """Run the best set of each sequence on the others, to choose the fixed one among them."""
         missing = {name: [n for n in best if n not in self._finished[name]] for name in self._names}
         tasks = self._tasks([Missing(missing, lambda n: best[n].parameters)])
-        for done, _ in enumerate(run_tasks(self._archive, self._workers, tasks), start=1):
-            self._progress("best sets of each on the others", done, len(tasks), "")
+        what = "best sets of each on the others"
+        watch_tasks(self._archive, self._workers, tasks, what, self._progress)
         self._counted |= dict.fromkeys(best, self._names)
 
     def _tasks(self, missing: Sequence["Missing"]) -> list[Task]:
@@ -182,7 +182,8 @@ class _Tally:
         self.best = ""
         self._progress, self._finished = progress, finished
         self._searches = [search for stage in stages for search in stage.searches]
-        self._done = self._failed = 0
+        self._done = self._failed = self._running = 0
+        self._under_way = _UnderWay(progress)
 
     def begin(self, at_work: Iterable[Search]) -> None:
         """Begin a batch; some of its trials may be finished already."""
@@ -191,11 +192,17 @@ class _Tally:
                 self._add(name, [n for n in search.numbers if n in self._finished[name]])
         self._show()
 
-    def watch(self, tasks: Iterable[tuple[Task, int]]) -> None:
-        """Count trials as they are finished."""
-        for task, running in tasks:
+    def watch(self, archive: Archive, workers: Pool[Any], tasks: list[Task]) -> None:
+        """Run tasks, and count trials scan by scan."""
+        for task, running in run_tasks(archive, workers, tasks, self._report):
+            self._under_way.end(task)
             self._add(task.sequence, task.numbers)
-            self._show(running)
+            self._running = running
+            self._show()
+
+    def _report(self, task: Task, progress: TaskProgress) -> None:
+        self._under_way.report(task, progress)
+        self._show()
 
     def catch_up(self) -> None:
         """Count trials that will not run as done, too."""
@@ -207,12 +214,40 @@ class _Tally:
         self._done += len(runs)
         self._failed += sum(run.lost > 0 or run.faults > 0 for run in runs)
 
-    def _show(self, running: int = 0) -> None:
-        remarks = [f"{running} running"] if running else []
+    def _show(self) -> None:
+        remarks = [f"{self._running} running"] if self._running else []
         remarks += [self.best] if self.best else []
         remarks += [f"{self._failed} lost track or failed"] if self._failed else []
         total = sum(search.total() for search in self._searches)
-        self._progress("runs", self._done, total, ", ".join(remarks))
+        done = self._done + self._under_way.runs
+        self._progress("runs", done, total, ", ".join(remarks))
+
+
+class _UnderWay:
+    """The tasks under way: the scans that they read, and the runs that they have done."""
+
+    def __init__(self, progress: Progress):
+        self._progress = progress
+        self._read: dict[str, int] = {}
+        self._runs: dict[int, float] = {}
+
+    @property
+    def runs(self) -> float:
+        """Runs of tasks that are not finished."""
+        return sum(self._runs.values())
+
+    def report(self, task: Task, progress: TaskProgress) -> None:
+        """Note how far a task is; several workers may read the same sequence."""
+        name, (stage, done, total) = task.sequence, progress
+        if stage == "reading":
+            self._read[name] = max(done, self._read.get(name, 0))
+            self._progress(f"reading {name}", self._read[name], total, "")
+        else:
+            self._runs[id(task)] = len(task.numbers) * done / max(total, 1)
+
+    def end(self, task: Task) -> None:
+        """Forget a task."""
+        self._runs.pop(id(task), None)
 
 
 def _best(config: OfflineConfig, stage: Stage) -> str:
@@ -227,11 +262,34 @@ def _best(config: OfflineConfig, stage: Stage) -> str:
     return f"{what} (trial {search.number(search.best)}){feasible}"
 
 
+def watch_tasks(
+    archive: Archive, workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
+) -> None:
+    """Run tasks; `progress` is called with `what` and the number of runs that are done."""
+    under_way, total = _UnderWay(progress), sum(len(task.numbers) for task in tasks)
+    done = 0
+
+    def report(task: Task, of_task: TaskProgress) -> None:
+        under_way.report(task, of_task)
+        progress(what, done + under_way.runs, total, "")
+
+    for task, _ in run_tasks(archive, workers, tasks, report):
+        under_way.end(task)
+        done += len(task.numbers)
+        progress(what, done + under_way.runs, total, "")
+
+
 def run_tasks(
-    archive: Archive, workers: Pool[Any], tasks: list[Task]
+    archive: Archive,
+    workers: Pool[Any],
+    tasks: list[Task],
+    report: Callable[[Task, TaskProgress], None] = lambda *_: None,
 ) -> Iterator[tuple[Task, int]]:
-    """Run tasks; yield each one once it is in the archive, with the number of running trials."""
-    for task, result, running in run(workers, tasks):
+    """Run tasks; yield each one once it is in the archive, with the number of running trials.
+
+    `report` is called about tasks that go on.
+    """
+    for task, result, running in run(workers, tasks, report):
         if result.frames is not None:
             archive.write_frames(task.sequence, result.frames)
         for number, trial in zip(task.numbers, result.trials, strict=True):

@@ -6,20 +6,19 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_serializer, model_validator
 
-from adaptune.sequence.config import ViewConfig, expand
+from adaptune.sequence.config import MOST_VIEWS, ViewConfig, expand
 from adaptune.space import ParameterSpace, nearest
-from adaptune.study.config import StudyConfig, StudySection
+from adaptune.strict import StrictModel
+from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import Mistake, validated
-from offline.samplers.check import check_sampler
-from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError, optuna_class
+from offline.samplers.check import check_class, check_sampler
+from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
 TIMED = ("ms_per_scan", "cpu", "memory")
 """Metrics that differ from run to run and from machine to machine."""
-_Weighted = Annotated[
-    dict[Metric, Annotated[float, Field(gt=0, allow_inf_nan=False)]], Field(min_length=1)
-]
+_Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field(min_length=1)]
 
 
 def _weighted(given: Any) -> Any:
@@ -36,10 +35,16 @@ def _weighted(given: Any) -> Any:
     return weighted
 
 
-class Limit(StudySection):
+class Limit(StrictModel):
     """What a metric may not exceed, on any training sequence."""
 
-    max: float = Field(gt=0, allow_inf_nan=False)
+    max: float = Field(gt=0, le=1e9)
+
+
+def _url(storage: str) -> str:
+    if "://" not in storage:
+        raise ValueError("give the URL of a database, as postgresql://user@host/database")
+    return expand(storage)
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -48,30 +53,30 @@ PRESETS: dict[str, dict[str, Any]] = {
 """The values that a preset of the offline stage sets. The study's own values replace them."""
 
 
-class OfflineConfig(StudySection):
+class OfflineConfig(StrictModel):
     """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = Field(default_factory=dict)
     sets: Literal["shared", "own", "both"] = "shared"
-    trials: int | None = Field(None, ge=1)
-    hours: float | None = Field(None, gt=0, allow_inf_nan=False)
-    stagnation: int | None = Field(None, ge=1)
-    target: float | None = Field(None, gt=0, allow_inf_nan=False)
-    initial: int = Field(32, ge=1)
-    batch: int = Field(16, ge=1)
-    seed: int = Field(0, ge=0)
-    workers: int | None = Field(None, ge=1)
-    memory: float = Field(4.0, gt=0, allow_inf_nan=False)
-    max_frames: int | None = Field(None, ge=1)
-    storage: Annotated[str, Field(pattern="://"), AfterValidator(expand)] | None = None
+    trials: int | None = Field(None, ge=1, le=10**6)
+    hours: float | None = Field(None, gt=0, le=1e5)
+    stagnation: int | None = Field(None, ge=1, le=10**6)
+    target: float | None = Field(None, gt=0, le=1e9)
+    initial: int = Field(32, ge=1, le=10_000)
+    batch: int = Field(16, ge=1, le=1000)
+    seed: int = Field(0, ge=0, lt=2**32)
+    workers: int | None = Field(None, ge=1, le=256)
+    memory: float = Field(4.0, gt=0, le=1e6)
+    max_frames: int | None = Field(None, ge=1, le=10**9)
+    storage: Annotated[str, AfterValidator(_url)] | None = None
     objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
         {"rte": 1.0},
     )
     limits: dict[Metric, Limit] = Field(default_factory=dict)
     runs: Literal["restart", "whole", "episodes"] = "restart"
-    repeats: int = Field(1, ge=1)
-    augment: tuple[ViewConfig, ...] = ()
+    repeats: int = Field(1, ge=1, le=100)
+    augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
     preset: Literal["paper"] | None = None
 
@@ -121,13 +126,12 @@ class OfflineConfig(StudySection):
                 return
         elif self.sampler != "tpe":  # which is always there, and need not be imported
             try:
-                optuna_class(self.sampler)
+                check_class(self.sampler)
             except SamplerError as error:
                 yield Mistake(("sampler",), str(error))
                 return
-        if space is not None:
-            below = check_sampler(self.sampler, self.sampler_settings, space, self.budgeted)
-            yield from (mistake.below(key) for mistake in below)
+        below = check_sampler(self.sampler, self.sampler_settings, space, self.budgeted)
+        yield from (mistake.below(key) for mistake in below)
 
 
 _LASTING = (

@@ -29,6 +29,15 @@ from adaptune.metrics import absolute_error, kitti_error, relative_error
 from adaptune.space import ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 
+UNITS: dict[Metric, str] = {
+    "rte": "%",
+    "kitti": "%",
+    "rpe": "m",
+    "ape": "m",
+    "ms_per_scan": "ms",
+    "cpu": "% of a core",
+    "memory": "MB",
+}
 BOUND = 1e6
 """The largest value of a metric, also where it cannot be computed: sums stay finite."""
 SEVERITY = 10.0
@@ -211,9 +220,12 @@ def choose_fixed(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
     return min(feasible, key=lambda n: verdicts[n].values[0] + verdicts[n].margin)
 
 
-def label(weights: Mapping[Metric, float]) -> str:
-    """A weighted sum in words."""
-    return " + ".join(name if w == 1.0 else f"{w:g} {name}" for name, w in weights.items())
+def label(weights: Mapping[Metric, float], units: bool = False) -> str:
+    """A weighted sum in words, on request with units."""
+    return " + ".join(
+        ("" if weight == 1.0 else f"{weight:g} ") + name + (f" [{UNITS[name]}]" if units else "")
+        for name, weight in weights.items()
+    )
 
 
 def pareto_front(values: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -19,11 +19,12 @@ from adaptune.parameter_sets import ParameterSets
 from adaptune.space import ParameterSet
 from adaptune.study.inputs import InputNotes, digest, resume
 from offline.budget import BUDGETS
-from offline.campaign import Progress, run_batches, run_tasks
+from offline.campaign import Progress, run_batches, watch_tasks
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
 from offline.objective import Verdict, choose_fixed, judge, label, pareto_front
 from offline.offline_study import OfflineStudy
+from offline.pictures import draw_front
 from offline.search import Finished
 from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Pool, Task, Workers
@@ -97,7 +98,7 @@ def train(
     table = _trial_rows(config, verdicts, finished)
     report.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
-        _write_pareto(study.folder, config.objective, verdicts, table)
+        _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     rows = _training_rows(config, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
     return Training(model, means, fixed, rows)
@@ -109,7 +110,8 @@ def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    odometry = replace(study.odometry, user_code=True)
+    setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = config.memory * 1e9
     return Cluster(setup, study.training, memory, cluster) if cluster else Workers(setup, n, memory)
 
@@ -243,16 +245,21 @@ def _write_pareto(
     folder: Path,
     objective: Sequence[Mapping[Metric, float]],
     verdicts: Mapping[int, Verdict],
+    fixed: int,
     trials: Mapping[int, Mapping[str, Any]],
 ) -> None:
-    """Write the sets that keep the limits and that no other set beats in every objective."""
+    """Write and draw the sets within the limits that no other set beats in every objective."""
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
     values = np.array([verdicts[n].values for n in feasible])
-    front = [feasible[i] for i in pareto_front(values)]
+    front = sorted((feasible[i] for i in pareto_front(values)), key=lambda n: verdicts[n].values)
     report.write_rows(folder, "pareto", [trials[n] for n in front])
-    names = [label(weights) for weights in objective]
-    on_front = np.array([verdicts[n].values for n in front])
-    report.draw_front(folder / "pareto.png", names, values, on_front)
+    draw_front(
+        folder / "pareto.png",
+        [label(weights, units=True) for weights in objective],
+        values,
+        np.array([verdicts[n].values for n in front]),
+        {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
+    )
 
 
 def _run_whole(
@@ -269,8 +276,7 @@ def _run_whole(
         for n, parameters in sets.items()
         if not archive.trial_path(name, n, whole=True).exists()
     ]
-    for done, _ in enumerate(run_tasks(archive, workers, tasks), start=1):
-        progress("whole runs", done, len(tasks), "")
+    watch_tasks(archive, workers, tasks, "whole runs", progress)
     return {
         name: {n: float(np.nanmean(archive.read(name, n, whole=True).errors)) for n in sets}
         for name in names

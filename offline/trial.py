@@ -1,7 +1,7 @@
 """One parameter set on one sequence, or several at once on one pass over it."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
@@ -22,6 +22,9 @@ from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
+
+Advance = Callable[[int, int], None]
+"""Called with how many scans of a sequence are done, and how many there are."""
 
 MIN_POINTS = 20
 """No odometry can use a scan with fewer points."""
@@ -79,6 +82,7 @@ class PreparedSequence:
         odometry: OdometryFactory,
         settings: TrialSettings,
         memory: float,
+        advance: Advance = lambda *_: None,
     ):
         self.name = name
         self._scans = scans
@@ -87,7 +91,7 @@ class PreparedSequence:
         self.nbytes = 0
         describe = Describer(settings.descriptors)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
-        for scan in scans:
+        for scan in _watched(scans, scans.n_messages, advance):
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
             descriptors.append(_described(describe, scan, name))
@@ -101,7 +105,8 @@ class PreparedSequence:
                 self.nbytes += prepared_bytes(prepared)
         if not enough:
             raise AdaptuneError(
-                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points"
+                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points; check "
+                f"`points` and what the sensor recorded"
             )
         at = np.array(stamps, np.int64)
         T_ref_sensor = reference_poses(name, scans, at, settings)
@@ -118,6 +123,14 @@ class PreparedSequence:
             for i, scan in enumerate(self._scans):
                 if i >= len(self._kept):
                     yield self._odometry.prepare(scan)
+
+
+def _watched(scans: Iterable[Any], n: int, advance: Advance) -> Iterator[Any]:
+    done = 0
+    for done, scan in enumerate(scans, start=1):
+        yield scan
+        advance(min(done, n), n)
+    advance(done, done)
 
 
 def _described(describe: Describer, scan: sequence.Scan, name: str) -> NDArray[np.float32]:
@@ -255,6 +268,7 @@ def run_trials(
     scans: PreparedSequence,
     sets: Sequence[ParameterSet],
     whole: bool = False,
+    advance: Advance = lambda *_: None,
 ) -> list[Trial]:
     """Run an odometry with several parameter sets on one pass over a sequence.
 
@@ -278,7 +292,7 @@ def run_trials(
         for s in sets
     ]
     each = [run for of_set in runs for repeat in of_set for run in repeat]
-    for i, prepared in enumerate(scans):
+    for i, prepared in enumerate(_watched(scans, len(frames.stamps), advance)):
         for run in each:
             if run.begin <= i < run.end:
                 run.step(i, prepared)
@@ -309,7 +323,8 @@ def _trial(
             run.restarted[piece],
         )[: own.stop - own.start]
         restarted[own], registered[own] = run.restarted[own], run.registered[own]
-        seconds[own] = run.seconds[own]
+        apart = run.odometry.usage.seconds
+        seconds[own] = run.seconds[own] if apart is None else apart
         lost_steps |= run.lost_steps
         cpu += run.odometry.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
         if after is not None:
@@ -368,13 +383,19 @@ class TrialSetup:
     odometry: OdometryFactory
     sequences: StudySequences
 
-    def prepare(self, name: str, memory: float) -> PreparedSequence:
+    def prepare(
+        self, name: str, memory: float, advance: Advance = lambda *_: None
+    ) -> PreparedSequence:
         """Read and prepare a sequence, see `PreparedSequence`."""
         scans = self.sequences.open(name)
-        return PreparedSequence(name, scans, self.odometry, self.settings, memory)
+        return PreparedSequence(name, scans, self.odometry, self.settings, memory, advance)
 
     def run(
-        self, scans: PreparedSequence, sets: Sequence[ParameterSet], whole: bool = False
+        self,
+        scans: PreparedSequence,
+        sets: Sequence[ParameterSet],
+        whole: bool = False,
+        advance: Advance = lambda *_: None,
     ) -> list[Trial]:
         """Run trials, see `run_trials`."""
-        return run_trials(self.settings, self.odometry, scans, sets, whole)
+        return run_trials(self.settings, self.odometry, scans, sets, whole, advance)

@@ -17,6 +17,7 @@ from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, labelled_data
 from offline.leave_one_out import Interval, Validation, leave_one_out
 from offline.offline_study import OfflineStudy
+from offline.pictures import LeftOutResults, draw_validation
 
 
 class Validated(NamedTuple):
@@ -41,7 +42,7 @@ def validate(
     ----------
     study
         A study that the offline stage has finished. Its folder receives ``validation`` (CSV, JSON
-        and PNG), and its model the summary.
+        and pictures), and its model the summary.
     curve
         Compute, too, what fewer training sequences would gain (``learning``).
     sizes
@@ -71,10 +72,10 @@ def validate(
     if sizes:
         banks = bank_curve(data, partial(progress, "sizes of banks"))
         report.write_rows(study.folder, "banks", banks)
-    report.draw_validation(
+    draw_validation(
         study.folder / "validation.png",
         study.name,
-        report.LeftOutResults(
+        LeftOutResults(
             validation.ratios,
             [s.name for s in validation.left_out],
             *_by_familiarity(validation),

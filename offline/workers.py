@@ -4,20 +4,25 @@ import contextlib
 import multiprocessing as mp
 import os
 import signal
+import time
 import traceback
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from typing import Generic, NamedTuple, Protocol, Self, TypeVar
+from typing import Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 
 from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
+from adaptune.hosting import verdict
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
 MOST_DEATHS = 3
 """A task fails after so many workers have died at it."""
+REPORT_EVERY = 0.5
+"""Seconds after which a worker reports how far its task is."""
 
 
 class WorkerError(AdaptuneError):
@@ -34,7 +39,8 @@ class Task(NamedTuple):
     frames: bool = False  # return the frames, which all trials on the sequence share, too
 
     def __str__(self) -> str:
-        return f"{self.sequence}, trials {', '.join(map(str, self.numbers))}"
+        trials = f"trials {', '.join(map(str, self.numbers))}" if self.numbers else "its scans"
+        return f"{self.sequence}, {trials}"
 
 
 class TaskResult(NamedTuple):
@@ -50,8 +56,18 @@ class Death(NamedTuple):
     cause: str
 
 
+class TaskProgress(NamedTuple):
+    """How far a task is that goes on."""
+
+    stage: Literal["reading", "running"]
+    done: int  # scans
+    total: int
+
+
 Outcome = TaskResult | AdaptuneError | Death
 
+Report = Callable[[TaskProgress], None]
+"""Called now and then by a task."""
 
 W = TypeVar("W", bound=Hashable)
 """Identifies a worker of a pool."""
@@ -68,16 +84,23 @@ class Pool(Protocol[W]):
         """Give an idle worker a task."""
         ...
 
-    def wait(self) -> list[tuple[W, Outcome]]:
-        """Wait for some of the tasks, and return their outcomes; the list may be empty."""
+    def wait(self) -> Sequence[tuple[W, Outcome | TaskProgress]]:
+        """Wait for some of the tasks, and return their outcomes; there may be none.
+
+        A task without an outcome may return how far it is.
+        """
         ...
 
 
-def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, TaskResult, int]]:
+def run(
+    pool: Pool[W],
+    tasks: Sequence[Task],
+    report: Callable[[Task, TaskProgress], None] = lambda *_: None,
+) -> Iterator[tuple[Task, TaskResult, int]]:
     """Run tasks, and yield each as it is done, with its result and the number of trials running.
 
     A task goes to a worker that has prepared its sequence, if there is one. If a worker dies,
-    another one runs its task again.
+    another one runs its task again. `report` is called about tasks that go on.
 
     Raises
     ------
@@ -86,7 +109,7 @@ def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, TaskResult
     WorkerError
         If several workers died at the same task.
     """
-    queue = _Queue(pool, tasks)
+    queue = _Queue(pool, tasks, report)
     while queue.open:
         queue.start()
         finished, queue.finished = queue.finished, []
@@ -102,12 +125,14 @@ def run(pool: Pool[W], tasks: Sequence[Task]) -> Iterator[tuple[Task, TaskResult
 class _Queue(Generic[W]):
     """Tasks that wait, run, and are finished."""
 
-    def __init__(self, pool: Pool[W], tasks: Sequence[Task]):
+    def __init__(
+        self, pool: Pool[W], tasks: Sequence[Task], report: Callable[[Task, TaskProgress], None]
+    ):
         self.waiting = list(tasks)
         self.running: dict[W, Task] = {}
         self.finished: list[tuple[Task, TaskResult]] = []
         self.failure: AdaptuneError | None = None
-        self._pool = pool
+        self._pool, self._report = pool, report
         self._deaths: dict[int, int] = {}
         self._near: dict[W, set[str]] = {}
 
@@ -129,6 +154,9 @@ class _Queue(Generic[W]):
     def wait(self) -> None:
         """Wait for some of the tasks."""
         for worker, outcome in self._pool.wait() if self.waiting or self.running else ():
+            if isinstance(outcome, TaskProgress):
+                self._report(self.running[worker], outcome)
+                continue
             task = self.running.pop(worker)
             if isinstance(outcome, TaskResult):
                 self.finished.append((task, outcome))
@@ -163,28 +191,35 @@ class Sequences:
         self._memory = memory
         self._ready: dict[str, PreparedSequence] = {}
 
-    def run(self, task: Task) -> TaskResult:
+    def run(self, task: Task, report: Report) -> TaskResult:
         """Do a task."""
-        sequence = self._prepared(task.sequence)
-        trials = self._setup.run(sequence, task.sets, task.whole)
+        sequence = self._prepared(task.sequence, report)
+        advance = partial(_report, report, "running")
+        trials = self._setup.run(sequence, task.sets, task.whole, advance)
         return TaskResult(trials, sequence.frames if task.frames else None)
 
-    def _prepared(self, name: str) -> PreparedSequence:
+    def _prepared(self, name: str, report: Report) -> PreparedSequence:
         sequence = self._ready.pop(name, None)
         if sequence is None:
             # Make room: drop the sequences that were not used for longest.
             while self._ready and sum(s.nbytes for s in self._ready.values()) > self._memory / 2:
                 del self._ready[next(iter(self._ready))]
             free = self._memory - sum(s.nbytes for s in self._ready.values())
-            sequence = self._setup.prepare(name, free)
+            sequence = self._setup.prepare(name, free, partial(_report, report, "reading"))
         self._ready[name] = sequence
         return sequence
 
 
-def attempt(sequences: Sequences, task: Task) -> TaskResult | AdaptuneError:
+def _report(report: Report, stage: Literal["reading", "running"], done: int, total: int) -> None:
+    report(TaskProgress(stage, done, total))
+
+
+def attempt(
+    sequences: Sequences, task: Task, report: Report = lambda _: None
+) -> TaskResult | AdaptuneError:
     """Do a task; return an exception instead of raising it."""
     try:
-        return sequences.run(task)
+        return sequences.run(task, report)
     except AdaptuneError as error:
         return error
     except Exception:
@@ -235,19 +270,20 @@ class Workers:
         with contextlib.suppress(BrokenPipeError):  # `wait` notices it
             self._workers[worker].connection.send(task)
 
-    def wait(self) -> list[tuple[int, Outcome]]:
+    def wait(self) -> list[tuple[int, Outcome | TaskProgress]]:
         """See `Pool`."""
         ready = wait([self._workers[w].connection for w in self._busy])
-        outcomes: list[tuple[int, Outcome]] = []
+        outcomes: list[tuple[int, Outcome | TaskProgress]] = []
         for w in [w for w in self._busy if self._workers[w].connection in ready]:
-            self._busy.remove(w)
             process, connection = self._workers[w]
             try:
                 outcomes.append((w, connection.recv()))
             except (EOFError, OSError):
                 connection.close()
                 process.join()
-                outcomes.append((w, Death(f"exit code {process.exitcode}")))
+                outcomes.append((w, Death(verdict(process.exitcode or 0))))
+            if not isinstance(outcomes[-1][1], TaskProgress):
+                self._busy.remove(w)
         return outcomes
 
     def _spawn(self, w: int) -> _Worker:
@@ -264,6 +300,21 @@ def _serve(connection: Connection, setup: TrialSetup, core: int, memory: float) 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pin(core)
     sequences = Sequences(setup, memory)
+    report = now_and_then(connection.send)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            connection.send(attempt(sequences, connection.recv()))
+            connection.send(attempt(sequences, connection.recv(), report))
+
+
+def now_and_then(report: Report) -> Report:
+    """Report once in `REPORT_EVERY` seconds, and when all scans are done."""
+    last = time.monotonic()
+
+    def some(progress: TaskProgress) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if progress.done == progress.total or now - last > REPORT_EVERY:
+            last = now
+            report(progress)
+
+    return some

@@ -1,12 +1,15 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune import report
+from adaptune.geometry import invert
 from adaptune.model import ErrorModel
-from adaptune.report import Track
 from adaptune.study.study import Study
+from adaptune.trajectory import Trajectory
 from online.modes import ReplaySetup
+from online.replay_picture import Track, draw_replays
 from online.run_replays import shared_identity
 from online.statistics import ComparisonRow, Reference, compare_modes, pooled
 from online.stored_reference import is_reference_of
@@ -19,8 +22,8 @@ def compare(study: Study) -> list[ComparisonRow]:
     Parameters
     ----------
     study
-        The study; its folder receives ``comparison.csv``, ``comparison.json`` and a PNG for every
-        sequence in ``comparison``.
+        The study; its folder receives ``comparison.csv``, ``comparison.json`` and a picture (PNG
+        and SVG) for every sequence in ``comparison``.
 
     Returns
     -------
@@ -45,11 +48,12 @@ def compare(study: Study) -> list[ComparisonRow]:
         replays = {mode: StoredReplay.read(folder / mode) for mode in setup.modes}
         reference = Reference.read(folder, study.config.sub_trajectory)
         rows += compare_modes(name, replays, reference)
-        report.draw_tracks(
+        draw_replays(
             study.folder / "comparison" / f"{name}.png",
             f"{study.name}: {name}",
             study.config.sub_trajectory,
             {mode: _track(replay, reference) for mode, replay in replays.items()},
+            None if reference.trajectory is None else _seen_from(reference.trajectory),
             logarithmic,
         )
     if len({row.sequence for row in rows if row.rte is not None}) > 1:
@@ -59,14 +63,24 @@ def compare(study: Study) -> list[ComparisonRow]:
 
 
 def _track(replay: StoredReplay, reference: Reference) -> Track:
-    stamps = replay.trajectory.stamps
+    stamps, known = replay.trajectory.stamps, reference.trajectory
+    # The odometry's own frame begins elsewhere: both are drawn from the first common pose.
+    start = 0 if known is None else int(np.argmax(np.isin(stamps, known.stamps)))
     return Track(
         (stamps - stamps[0]) * 1e-9,
+        _seen_from(replay.trajectory, start),
         reference.errors(replay.trajectory),
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
         replay.choices,
+        replay.weights,
     )
+
+
+def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
+    """Positions in the plane of the sensor at a pose: x forward, y to the left."""
+    T = trajectory.T_world_sensor
+    return np.asarray((invert(T[start]) @ T)[:, :2, 3])
 
 
 def _check_replays(study: Study, setup: ReplaySetup) -> None:

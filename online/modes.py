@@ -1,6 +1,7 @@
 """The modes of a replay: baseline, fixed, and adaptive by each selection rule."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -39,6 +40,7 @@ class ReplaySetup:
     warm_up: WarmUp
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     switch_cost: float  # what a switch must promise, as a share of the fixed set's error
+    descriptors: tuple[str, ...]  # those that the study names
 
     @classmethod
     def of(cls, study: Study) -> Self:
@@ -52,12 +54,19 @@ class ReplaySetup:
             study.warm_up,
             config.lost_track,
             study.switch_cost(),
+            config.descriptor.names,
         )
 
     @property
     def modes(self) -> tuple[str, ...]:
         """What is compared: baseline, fixed, and each selection rule."""
         return ("baseline", "fixed", *self.rules)
+
+    def check(self, model: ErrorModel, path: Path) -> None:
+        """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
+        model.check_descriptors(self.descriptors, path)
+        if self.mechanism == "bank":
+            self.members(model)
 
     def identity(self, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:
         """What a mode depends on, as plain data; `digest` is the model's."""
@@ -100,9 +109,9 @@ class ReplaySetup:
         if self.mechanism == "bank" and (mode != "paired" or model.bank_adapts):
             sets = self.members(model)
             bank = Bank(self.odometry, sets, self.warm_up, self.lost_track)
-            return Mode(bank, Selector(model, mode, list(sets)))
+            return Mode(bank, Selector(model, mode, list(sets), descriptors=self.descriptors))
         fixed = model.sets[model.fixed]
-        selector = Selector(model, mode, (), self.switch_cost)
+        selector = Selector(model, mode, (), self.switch_cost, self.descriptors)
         # A bank that was not shown to pay would only cost.
         if self.mechanism != "hand_over" and self.odometry.description.live:
             return Mode(self.odometry(fixed), selector)

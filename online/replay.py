@@ -181,7 +181,7 @@ def replay(
         steps.append(tracker.register(scan))
         progress()
     if not steps:
-        raise AdaptuneError("there is no scan to replay")
+        raise AdaptuneError("there is no scan to replay; check start, stop and views")
     return _recorded(steps, choices, time.perf_counter() - begin)
 
 

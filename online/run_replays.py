@@ -66,8 +66,7 @@ def run_replays(
     length = study.config.sub_trajectory
     model.check_study(study.odometry.identity, study.odometry.space, length, model_path)
     setup = ReplaySetup.of(study)
-    if setup.mechanism == "bank":
-        setup.members(model)  # refuses another bank before anything runs
+    setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     study.open()

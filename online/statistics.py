@@ -9,7 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.metrics import KittiError, bootstrap, kitti_error, span, sub_trajectory_rte
+from adaptune.metrics import (
+    KittiError,
+    absolute_error,
+    bootstrap,
+    kitti_error,
+    relative_error,
+    span,
+    sub_trajectory_rte,
+)
 from adaptune.trajectory import Trajectory, read_tum
 from online.stored_replays import StoredReplay
 
@@ -41,12 +49,31 @@ class Reference(NamedTuple):
         T_ref_sensor = self.trajectory.at(odometry.stamps)
         return sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length)
 
-    def kitti(self, odometry: Trajectory) -> KittiError:
-        """KITTI's error over 100 to 800 m, where the recording is long enough."""
+    def standard(self, odometry: Trajectory) -> "StandardErrors | None":
+        """The errors that other tools give, where there are reference poses to compare with."""
         if self.trajectory is None:
-            return KittiError(np.nan, np.nan, ())
-        both = np.isin(odometry.stamps, self.trajectory.stamps)
-        return kitti_error(self.trajectory.T_world_sensor, odometry.T_world_sensor[both])
+            return None
+        T_ref_sensor, T = self.trajectory.at(odometry.stamps), odometry.T_world_sensor
+        if np.isfinite(T_ref_sensor[:, 0, 0]).sum() < 2:
+            return None
+        ape, rpe = absolute_error(T_ref_sensor, T), relative_error(T_ref_sensor, T)
+        return StandardErrors(ape, rpe, kitti_error(T_ref_sensor, T))
+
+
+class StandardErrors(NamedTuple):
+    """Errors of a trajectory as evo and KITTI's benchmark define them."""
+
+    ape: float  # metres, after alignment
+    rpe: float  # metres, from scan to scan
+    kitti: KittiError
+
+    @classmethod
+    def pooled(cls, errors: "Sequence[StandardErrors]") -> "StandardErrors | None":
+        """Means over sequences; KITTI's error over the sub-trajectories of all of them."""
+        if not errors:
+            return None
+        ape, rpe, kitti = zip(*errors, strict=True)
+        return cls(float(np.mean(ape)), float(np.mean(rpe)), KittiError.pooled(kitti))
 
 
 @dataclass(frozen=True)
@@ -63,7 +90,7 @@ class ComparisonRow:
     rte_interval: Interval = None
     ratio_interval: Interval = None
     median: float | None = None  # of the sub-trajectory RTE, percent
-    kitti: KittiError | None = None
+    standard: StandardErrors | None = None
     blocks: int | None = None  # independent pieces of the recording
     x_real_time: float | None = None  # speed of the replay
 
@@ -87,8 +114,28 @@ class ComparisonRow:
             "_ratio_high": high,
             "_blocks": self.blocks,
             "_median": self.median,
-            "_kitti_percent": None if self.kitti is None else self.kitti.translation,
-            "_kitti_deg_per_m": None if self.kitti is None else self.kitti.rotation,
+        } | {f"_{key}": value for key, value in self._standard().items()}
+
+    def _standard(self) -> dict[str, Any]:
+        keys = ("ape_m", "rpe_m", "kitti_percent", "kitti_deg_per_m", "kitti_lengths_m")
+        if self.standard is None:
+            return dict.fromkeys(keys)
+        ape, rpe, kitti = self.standard
+        lengths = " ".join(f"{length:g}" for length in kitti.lengths)
+        return dict(zip(keys, (ape, rpe, kitti.translation, kitti.rotation, lengths), strict=True))
+
+    def standard_columns(self) -> dict[str, Any]:
+        """The row of a table of the errors that other tools give."""
+        ape, rpe, percent, degrees, listed = self._standard().values()
+        lengths = (listed or "").split()
+        return {
+            "sequence": self.sequence,
+            "mode": self.mode,
+            "APE [m]": ape,
+            "RPE [m]": rpe,
+            "KITTI [%]": percent,
+            "[deg/100 m]": None if degrees is None else 100.0 * degrees,
+            "over [m]": "-".join(dict.fromkeys([*lengths[:1], *lengths[-1:]])) or None,
         }
 
 
@@ -128,7 +175,7 @@ def compare_modes(
                 rte_interval,
                 ratio_interval,
                 float(np.median(mine)) if len(mine) else None,
-                reference.kitti(replay.trajectory),
+                reference.standard(replay.trajectory),
                 len(mine) // block,
                 round(summary.duration_s / summary.replay_s, 2),
             )
@@ -144,7 +191,7 @@ def _switches(replay: StoredReplay) -> int:
 
 
 def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
-    """For every mode the mean RTE over all sequences, and the geometric mean of the ratios."""
+    """For every mode the mean errors over all sequences, and the geometric mean of the ratios."""
     made = []
     for mode in dict.fromkeys(row.mode for row in rows):
         mine = [row for row in rows if row.mode == mode and row.rte is not None]
@@ -158,6 +205,7 @@ def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
                 sum(row.restarts for row in mine),
                 sum(row.switches for row in mine),
                 sum(row.poor_scans for row in mine),
+                standard=StandardErrors.pooled([row.standard for row in mine if row.standard]),
             )
         )
     return made

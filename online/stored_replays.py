@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
+from adaptune.plain_words import in_one_line
 from adaptune.study.run_folder import differences
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
 from online.replay import Replay
@@ -94,7 +95,9 @@ class StoredReplay:
     # (m,): nanoseconds, of the scans that selections were made from; the first one of a mode that
     # keeps its parameters.
     choice_stamps: NDArray[np.int64]
-    choices: dict[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
+    # For every parameter its values, of shape (m,); in a bank those of the heaviest member.
+    choices: dict[str, Sequence[Any]]
+    weights: dict[int, Sequence[float]]  # in a bank, by trial, of shape (m,); empty without one
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -114,11 +117,12 @@ class StoredReplay:
         restarted = _columns(folder / "frames.csv").get("restarted", [])
         if len(restarted) != len(trajectory):
             raise _damaged(folder / "frames.csv", ValueError("not a row for every scan"))
-        stamps, choices = _choices(folder / "selections.csv")
+        stamps, choices, weights = _choices(folder / "selections.csv")
         if not len(stamps):
             stamps = trajectory.stamps[:1]
-            choices = {name: [value] for name, value in (summary.about.parameters or {}).items()}
-        return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices)
+            kept = summary.about.parameters or {}
+            choices = {name: _numbers([str(value)]) for name, value in kept.items()}
+        return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices, weights)
 
 
 def write_replay(folder: Path, replay: Replay, about: ReplayIdentity, model_file: Path) -> None:
@@ -195,14 +199,25 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
         writer.writerows(rows)
 
 
-def _choices(path: Path) -> tuple[NDArray[np.int64], dict[str, Sequence[Any]]]:
+def _choices(
+    path: Path,
+) -> tuple[NDArray[np.int64], dict[str, Sequence[Any]], dict[int, Sequence[float]]]:
     columns = _columns(path)
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
+        weights = _weights(columns.get("weights", []))
     except (TypeError, ValueError) as error:
         raise _damaged(path, error) from error
     parameters = {name: v for name, v in columns.items() if name not in _SELECTION}
-    return stamps, {name: _numbers(values) for name, values in parameters.items()}
+    return stamps, {name: _numbers(values) for name, values in parameters.items()}, weights
+
+
+def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:
+    """Read the column of weights."""
+    rows = [dict(pair.split(":") for pair in text.split()) for text in texts]
+    if any(row.keys() != rows[0].keys() for row in rows):
+        raise ValueError("weights of other trials from row to row")
+    return {int(trial): [float(row[trial]) for row in rows] for trial in (rows[0] if rows else {})}
 
 
 def _columns(path: Path) -> dict[str, list[str]]:
@@ -222,5 +237,5 @@ def _numbers(values: Sequence[str]) -> list[Any]:
 
 
 def _damaged(path: Path, error: Exception) -> StoredReplayError:
-    what = " ".join(str(error).split())
-    return StoredReplayError(f"{path}: is damaged ({what}); run `adaptune online --again`")
+    what = f"is damaged ({in_one_line(error)})"
+    return StoredReplayError(f"{path}: {what}; run `adaptune online --again`")

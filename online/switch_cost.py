@@ -128,7 +128,10 @@ def _read(study: Study, name: str, seconds: float) -> Recording:
         scans.append(scan)
     reference = sequence.reference()
     if reference is None:
-        raise AdaptuneError(f"sequences.{name}: has no reference to measure errors against")
+        help_ = "name its topic or file (reference: ...)"
+        raise AdaptuneError(
+            f"sequences.{name}: has no reference to measure errors against; {help_}"
+        )
     T_ref_sensor = reference.at(np.array([scan.stamp for scan in scans], np.int64))
     return Recording(name, scans, T_ref_sensor, study.config.sub_trajectory)
 

@@ -26,6 +26,7 @@ SLOW = [
     "adaptune/odometry/test_gicp.py",
     "offline/test_full.py",
     "adaptune/odometry/test_protocol.py",
+    "adaptune/test_survey.py",
     "adaptune/test_inspect.py",
     "offline/test_resume.py",
     "adaptune/odometry/test_command.py",
@@ -45,8 +46,15 @@ SLOW = [
     "adaptune/model/test_knn.py",
     "online/test_switch_cost.py",
     "offline/test_storage.py",
+    "adaptune/test_hosting.py",
+    "offline/samplers/test_hosted.py",
     "adaptune/odometry/test_isolation.py",
     "adaptune/odometry/test_process.py",
+    "offline/test_progress.py",
+    "adaptune/test_interrupt.py",
+    "online/test_replay_picture.py",
+    "offline/test_pictures.py",
+    "adaptune/odometry/test_guarded.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 

@@ -4,7 +4,11 @@ import ast
 import re
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import drives
+import numpy as np
 import pytest
 from typer.main import get_command
 
@@ -73,3 +77,21 @@ def test_imports_in_examples_exist(page):
         imports = [node for node in ast.parse(block).body if isinstance(node, IMPORTS)]
         ours = [node for node in imports if re.search("adaptune|offline|online", ast.unparse(node))]
         exec(ast.unparse(ast.Module(ours, [])), {})
+
+
+def test_the_example_of_an_odometry_follows_a_drive():
+    (example,) = re.findall(
+        r"^```python\n(import small_gicp.*?)^```",
+        (ROOT / "docs/your-odometry.md").read_text(encoding="utf-8"),
+        re.MULTILINE | re.DOTALL,
+    )
+    names: dict[str, Any] = {}
+    exec(example, names)
+    scans = [points for _, points, _ in drives.scans(n_scans=6)]
+    for voxel in (0.1, 1.0):
+        odometry = names["Mine"]({"voxel": voxel})
+        odometry.start(odometry.prepare(SimpleNamespace(points=scans[0])), np.eye(4))
+        for points in scans[1:]:
+            pose, registered = odometry.register(odometry.prepare(SimpleNamespace(points=points)))
+        assert registered
+        assert abs(pose[0, 3] - 5 * 0.3) < 0.15

@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Callable, Iterable
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import plugins
+from adaptune import hosting, plugins
 from adaptune.descriptor.motion import MOTION
 from adaptune.errors import AdaptuneError
+from adaptune.odometry import wire
 from adaptune.sequence import Scan
 
 Descriptor = Callable[[Scan], NDArray[np.floating]]
@@ -31,14 +33,27 @@ class DescriptorError(AdaptuneError):
     """A descriptor that does not exist or does not describe a scan."""
 
 
-def descriptor(name: str) -> Descriptor:
-    """Function of a descriptor; a DescriptorError if there is none.
+_SERVICE = hosting.Service("adaptune.descriptor.base")
+_SECONDS = 60.0
+"""A descriptor of the user may take so long for a scan."""
+
+
+def where(name: str) -> str:
+    """Where the function of a descriptor is, as ``module:function``, without importing it.
 
     `name` is one of `DESCRIPTORS`, one that an installed package announces in the entry-point group
-    ``adaptune.descriptors``, or ``module:function``.
+    ``adaptune.descriptors``, or ``module:function``; else there is a DescriptorError.
     """
     try:
-        found = plugins.load(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
+        return plugins.path_of(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
+    except plugins.PluginError as error:
+        raise DescriptorError(str(error)) from error
+
+
+def descriptor(name: str) -> Descriptor:
+    """Function of a descriptor, see `where`; a DescriptorError if there is none."""
+    try:
+        found = plugins.load(name, where(name), "function")
     except plugins.PluginError as error:
         raise DescriptorError(str(error)) from error
     if not callable(found):
@@ -48,9 +63,46 @@ def descriptor(name: str) -> Descriptor:
 
 
 def check_descriptor(name: str) -> None:
-    """Refuse a name that leads to no descriptor, without importing one of `DESCRIPTORS`."""
+    """Refuse a name that leads to no descriptor; the user's are imported elsewhere."""
+    path = where(name)
     if name not in DESCRIPTORS:
-        descriptor(name)
+        try:
+            hosting.server(_SERVICE, path)
+        except hosting.HostError as error:
+            raise DescriptorError(str(error)) from error
+
+
+# What runs in a process of its own for a descriptor of the user, see `adaptune.hosting`.
+
+
+def load(name: str) -> None:
+    """Import a descriptor."""
+    descriptor(name)
+
+
+def serve(reader: wire.Readable, writer: BinaryIO, name: str) -> None:
+    """Describe scan after scan."""
+    describe = descriptor(name)
+
+    def answer(message: wire.Message) -> dict[str, Any]:
+        return {"described": np.asarray(describe(wire.to_scan(message)), np.float32)}
+
+    hosting.answer_all(reader, writer, answer)
+
+
+def _elsewhere(name: str) -> Descriptor:
+    """Function of a descriptor of the user that runs in a process of its own."""
+    bounds = hosting.Bounds(_SECONDS, late=f"a scan took longer than {_SECONDS:g} s")
+    process = hosting.Hosted(_SERVICE, where(name), "serve", bounds)
+
+    def describe(scan: Scan) -> NDArray[np.float32]:
+        try:
+            header = {"type": "describe", "stamp": scan.stamp}
+            return process.ask(header, **wire.scan_arrays(scan)).arrays["described"]
+        except hosting.HostError as error:
+            raise DescriptorError(f"{error}; this was scan {scan.stamp}") from error
+
+    return describe
 
 
 class Describer:
@@ -65,7 +117,9 @@ class Describer:
     """
 
     def __init__(self, names: Iterable[str]):
-        self._functions = {name: descriptor(name) for name in names}
+        self._functions = {
+            name: descriptor(name) if name in DESCRIPTORS else _elsewhere(name) for name in names
+        }
         self.blocks: dict[str, int] = {}
         # This also loads compiled code before the first scan.
         nothing = Scan(0, np.empty((0, 3), np.float32))

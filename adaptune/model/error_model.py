@@ -1,7 +1,7 @@
 """The error model: what passes from training to the robot."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from adaptune.archive import compact
+from adaptune.descriptor.base import DESCRIPTORS
 from adaptune.model.bank_weights import BankSettings
 from adaptune.model.base import TrainingData
 from adaptune.model.model_file import (
@@ -22,6 +23,7 @@ from adaptune.model.model_file import (
 )
 from adaptune.model.paired import PairedSettings
 from adaptune.parameter_sets import ParameterSets
+from adaptune.plain_words import in_one_line
 from adaptune.sequence.names import places
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
@@ -249,6 +251,30 @@ class ErrorModel:
                 f"is {length:g} m; run `adaptune offline` for this study"
             )
 
+    def check_descriptors(
+        self, descriptors: Collection[str], where: Path | str = "the model"
+    ) -> None:
+        """Refuse a model that would run code which was not asked for.
+
+        Parameters
+        ----------
+        descriptors
+            The names of the descriptors that may be used besides adaptune's own.
+        where
+            Where the model is from.
+
+        Raises
+        ------
+        ModelError
+        """
+        for name in self.blocks:
+            if name not in DESCRIPTORS and name not in descriptors:
+                raise ModelError(
+                    f"{where}: uses the descriptor {name!r}, which is code of its author's; if you "
+                    f"trust it, name it in descriptor.names, too, or fit a model of your own "
+                    f"(`adaptune offline`)"
+                )
+
     def is_foreign(self, elevation: float) -> bool:
         """Whether scans whose lowest points lie there come from no sensor of the training's.
 
@@ -317,9 +343,9 @@ class ErrorModel:
         except FileNotFoundError as error:
             raise ModelError(f"{path}: there is no such model; run `adaptune offline`") from error
         except (OSError, SpaceError, *DAMAGED) as error:
-            lines = " ".join(str(error).split())
+            what = in_one_line(error)
             raise ModelError(
-                f"{path}: is not an error model, or damaged ({lines}); run `adaptune offline` again"
+                f"{path}: is not an error model, or damaged ({what}); run `adaptune offline` again"
             ) from error
         return model
 

@@ -1,17 +1,19 @@
 """Descriptions of error models, for people."""
 
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
 from adaptune import report
 from adaptune.metrics import cap
 from adaptune.model.base import mean_errors
 from adaptune.model.error_model import ErrorModel
-from adaptune.space import Value, describe
+from adaptune.space import Categorical, Parameter, describe
 
 N_BEST = 5
 """Sets to show, besides the fixed one."""
@@ -31,46 +33,85 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
     window = f", mean of {model.window} selections" if model.window > 1 else ""
     size = path.stat().st_size / 1e6
-    lines = [
-        f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets on "
-        f"{n_frames} frames of {len(model.sequences)} sequences, {size:.1f} MB",
-        f"Errors over {model.length:g} m. Scans are described by {blocks}{window}.",
-        *_pairs("Settings", model.odometry.get("settings", {})),
-    ]
     return Group(
-        escape("\n".join(lines)),
+        Text(
+            f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets "
+            f"on {n_frames} frames of {len(model.sequences)} sequences, {size:.1f} MB\n"
+            f"Errors over {model.length:g} m. Scans are described by {blocks}{window}."
+        ),
+        *_named("Settings", model.odometry.get("settings", {})),
         report.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         report.table("Parameters", _parameters(model)),
-        report.table(f"The best sets of {n_sets}", _sets(model), "Mean error over all sequences."),
-        escape("\n".join(_bank(model) + _pairs("From", model.provenance) + _validation(model))),
+        report.table(f"The best sets of {n_sets}", _best(model), "Mean error over all sequences."),
+        *_adapting(model),
+        *_named("Where it comes from", model.provenance),
+        *_validation(model),
     )
 
 
-def _bank(model: ErrorModel) -> list[str]:
+def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
+    """What is selected along the way."""
+    paired, bank = model.paired, model.bank_settings
+    if not paired.adapt:
+        yield Text("One set at a time: it was not shown to pay; `paired` keeps the fixed set.")
+    else:
+        n = "all" if paired.n_sets is None else str(paired.n_sets)
+        yield Text(f"One set at a time: `paired` chooses among {n} sets.")
     if not model.bank:
-        return []
-    sets = ", ".join(map(str, model.bank))
-    if not model.bank_adapts:
-        return [f"Bank: trials {sets}; it was not shown to pay, and is not used."]
-    share = model.bank_settings.min_fixed_share
-    return [f"Bank: trials {sets}; the first has {100 * share:.0f} % of the weight at least."]
+        return
+    if not bank.adapt:
+        yield Text("Bank: it was not shown to pay, and is not used.")
+    else:
+        share = 100 * bank.min_fixed_share
+        yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
+    yield report.table(f"The bank's {len(model.bank)} members", _sets(model, model.bank))
 
 
-def _pairs(title: str, data: Any) -> list[str]:
-    if not isinstance(data, dict) or not data:
-        return []
-    return [f"{title}: " + ", ".join(f"{key} {value}" for key, value in data.items())]
+def _named(title: str, data: Mapping[str, Any]) -> list[Table]:
+    """A table of plain data, if there are any."""
+    rows = [{"key": key, "value": value} for key, value in _flat(data)]
+    return [report.table(title, rows)] if rows else []
 
 
-def _validation(model: ErrorModel) -> list[str]:
+def _flat(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted keys and values in words."""
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{key}.")
+        elif value is not None and value != []:
+            yield f"{above}{key}", _words(value)
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {text}" for key, text in _flat(value))
+    if isinstance(value, list | tuple):
+        nested = any(isinstance(item, Mapping | list | tuple) for item in value)
+        return ("; " if nested else ", ").join(map(_words, value))
+    if isinstance(value, bool):
+        return str(value).lower()  # as in YAML
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _validation(model: ErrorModel) -> list[RenderableType]:
+    """Numbers in a table, and the rest in words."""
     if not model.validation:
-        return ["Not validated yet: `adaptune validate` shows whether adapting pays."]
-    lines = []
-    for rule, found in model.validation.items():
-        pairs = found.items() if isinstance(found, dict) else ()
-        short = {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in pairs}
-        lines += _pairs(f"Validation, {rule}", short) or [f"Validation, {rule}: {found}"]
-    return lines
+        return [Text("Not validated yet: `adaptune validate` shows whether adapting pays.")]
+    found = {
+        rule: of_rule if isinstance(of_rule, Mapping) else {"found": of_rule}
+        for rule, of_rule in model.validation.items()
+    }
+    keys = dict.fromkeys(key for of_rule in found.values() for key in of_rule)
+    numbers = [k for k in keys if all(isinstance(f.get(k, 0.0), float) for f in found.values())]
+    rows = [
+        {"rule": rule} | {k: of_rule.get(k) for k in numbers} for rule, of_rule in found.items()
+    ]
+    caption = "Ratios to the fixed set's error, each sequence left out; low, high: 95 % interval."
+    made: list[RenderableType] = [report.table("Validation", rows, caption)] if numbers else []
+    for rule, of_rule in found.items():
+        rest = {key: value for key, value in of_rule.items() if key not in numbers}
+        made += [Text(f"{rule}, {key}: {text}") for key, text in _flat(rest)]
+    return made
 
 
 def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
@@ -98,27 +139,31 @@ def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
     return [
         {
             "parameter": name,
-            "range": describe(parameter) + (" log" if getattr(parameter, "log", False) else ""),
-            "baseline": _short(parameter.baseline),
-            "fixed": _short(fixed[name]),
+            "range": _range(parameter),
+            "baseline": _words(parameter.baseline),
+            "fixed": _words(fixed[name]),
         }
         for name, parameter in model.sets.space.parameters.items()
     ]
 
 
-def _sets(model: ErrorModel) -> list[dict[str, Any]]:
+def _range(parameter: Parameter) -> str:
+    if isinstance(parameter, Categorical):
+        return _words(parameter.choices)
+    return describe(parameter) + (" log" if parameter.log else "")
+
+
+def _best(model: ErrorModel) -> list[dict[str, Any]]:
     means = mean_errors(model.errors, model.sequence)
     best = [model.sets.trials[c] for c in np.argsort(means, kind="stable")[:N_BEST]]
-    if model.fixed not in best:
-        best.insert(0, model.fixed)
+    return _sets(model, best if model.fixed in best else [model.fixed, *best])
+
+
+def _sets(model: ErrorModel, trials: Sequence[int]) -> list[dict[str, Any]]:
+    means = mean_errors(model.errors, model.sequence)
     return [
         {"set": f"{n}, fixed" if n == model.fixed else str(n)}
         | {"mean [%]": float(means[model.sets.column(n)])}
-        | {name: _short(value) for name, value in model.sets[n].items()}
-        for n in best
+        | {name: _words(value) for name, value in model.sets[n].items()}
+        for n in trials
     ]
-
-
-def _short(value: Value) -> str:
-    # Brackets would be taken for markup.
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))

@@ -7,13 +7,14 @@ from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
+from adaptune.strict import StrictModel
 
 MIN_POINTS = 20
 """An adapter does not register scans with fewer points in range."""
@@ -23,10 +24,8 @@ class OdometryError(AdaptuneError):
     """An odometry that cannot do what is asked of it."""
 
 
-class BaseSettings(BaseModel):
+class BaseSettings(StrictModel):
     """What a study sets once and does not tune."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class RangeSettings(BaseSettings):
@@ -40,8 +39,8 @@ class RangeSettings(BaseSettings):
         Take the motion out of scans whose points have times.
     """
 
-    min_range: float = Field(1.0, ge=0)
-    max_range: float = Field(100.0, gt=0)
+    min_range: float = Field(1.0, ge=0, le=1e6)
+    max_range: float = Field(100.0, gt=0, le=1e6)
     deskew: bool = True
 
 
@@ -65,11 +64,12 @@ class Usage(NamedTuple):
 
     cpu: float  # seconds of CPU time
     memory: float | None  # peak megabytes of its own processes; None if it shares this process
+    seconds: float | None = None  # a scan, if it runs apart from its calls; None if within them
 
     @classmethod
     def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
         """CPU time of all together, and the sum or the maximum of their memory."""
-        cpu, peaks = zip(*usages, strict=True)
+        cpu, peaks, _ = zip(*usages, strict=True)
         known = [peak for peak in peaks if peak is not None]
         return cls(sum(cpu), memory(known) if known else None)
 

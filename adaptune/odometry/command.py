@@ -1,14 +1,12 @@
 """Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
-import contextlib
 import os
 import shutil
-import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from logging import getLogger
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
+from adaptune import hosting
 from adaptune.geometry import Poses, invert
-from adaptune.odometry import isolation
 from adaptune.odometry.base import (
     BaseSettings,
     Description,
@@ -30,7 +28,7 @@ from adaptune.odometry.base import (
     Usage,
 )
 from adaptune.odometry.frame_check import check_frame
-from adaptune.odometry.isolation import Arguments, Limits
+from adaptune.odometry.isolation import Arguments, Limits, pose_fault
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.selection import Selection
@@ -116,12 +114,13 @@ class Command(OdometryInstance):
         self._limits, self._read_input, self._strict = limits, read, strict
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_odom_own = np.eye(4)
-        self._cpu = 0.0
+        self._usage = Usage(0.0, None)
         self._last_motion = LastMotion()
 
     @property
     def usage(self) -> Usage:
-        return Usage(self._cpu, None)
+        """What the program has used, with all processes that it has started."""
+        return self._usage
 
     @property
     def motions(self) -> Motions:
@@ -165,16 +164,17 @@ class Command(OdometryInstance):
         self._submitted = prepared
 
     def collect(self) -> Registration:
-        begin = time.process_time()
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
         self._last_motion.move(T_odom_sensor)
-        self._cpu += time.process_time() - begin
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
 
     def apply(self, selection: Selection) -> None:  # noqa: ARG002
         raise OdometryError(
             "a program that runs whole recordings cannot change its parameters: give it one set"
         )
+
+    def close(self) -> None:
+        pass  # the program has ended
 
     def _own(self, stamp: NDArray[np.int64]) -> Poses:
         assert self._T_own_sensor is not None
@@ -196,7 +196,7 @@ class Command(OdometryInstance):
                 except (TrajectoryError, OdometryError) as error:
                     failure = str(error).replace(f"{folder}{os.sep}", "")
             with log.open("rb") as written:
-                words = isolation.last_lines(written)
+                words = hosting.last_lines(written)
         known = np.isfinite(T_own_sensor[:, 0, 0])
         if failure is None and known.mean() < _COVERAGE:
             seconds = 1e-9 * (given.stamps - given.stamps[0])
@@ -224,27 +224,25 @@ class Command(OdometryInstance):
 
     def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:
         """Run the program; how it ended if not well."""
-        seconds = self._limits.seconds * n
-        late = f"it took longer than isolation.seconds = {self._limits.seconds:g} for each scan"
+        begin = time.perf_counter()
         with log.open("wb") as file:
-            process = subprocess.Popen(
-                # The limit on its CPU time holds even if this process is killed.
-                isolation.bounded(command, self._limits.memory, f"-t {round(seconds) + 1}"),
+            program = hosting.Program(
+                command,
+                self._limits.memory,
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
-                env=os.environ | isolation.ONE_THREAD,
-                start_new_session=True,
             )
-            with _ending(process):
-                try:
-                    code = process.wait(seconds)
-                except subprocess.TimeoutExpired:
-                    return late
-        if code == -signal.SIGXCPU:
-            return late
-        return isolation.verdict(code) if code else None
+            with closing(program):
+                ended = in_time = program.wait(self._limits.seconds * n)
+                if ended is None:
+                    ended = program.end()
+        if ended is not None:
+            self._usage = Usage(ended.cpu, ended.memory, (time.perf_counter() - begin) / n)
+        if in_time is None:
+            return f"it took longer than isolation.seconds = {self._limits.seconds:g} for each scan"
+        return hosting.verdict(in_time.code) if in_time.code else None
 
     def _read(self, path: Path, stamps: NDArray[np.int64]) -> Poses:
         if not path.exists():
@@ -259,7 +257,7 @@ class Command(OdometryInstance):
             trajectory = read_tum(path)
             poses, stamps_own = trajectory.T_world_sensor, trajectory.stamps
         for number, T in enumerate(poses):
-            if what := isolation.pose_fault(T):
+            if what := pose_fault(T):
                 raise OdometryError(f"{self.settings.output}, pose {number + 1}: {what}")
         if self.settings.extrinsic is not None:
             poses = poses @ to_pose(self.settings.extrinsic)
@@ -301,23 +299,3 @@ def _at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
             f"{1e-9 * stamps[0]:.3f} s to {1e-9 * stamps[-1]:.3f} s"
         )
     return T
-
-
-@contextmanager
-def _ending(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """End a program and its children after the block, or when this process receives SIGTERM."""
-
-    def terminate(number: int, _: object) -> None:
-        isolation.end_group(process)
-        signal.signal(number, signal.SIG_DFL)
-        os.kill(os.getpid(), number)
-
-    before = None
-    with contextlib.suppress(ValueError):  # only the main thread may
-        before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        isolation.end_group(process)
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)

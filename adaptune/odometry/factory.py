@@ -1,17 +1,19 @@
 """Make an odometry from its name, wherever it runs."""
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from adaptune.odometry.base import Description, OdometryInstance
 from adaptune.odometry.command import Command
+from adaptune.odometry.declaration import declare
+from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import Process
 from adaptune.odometry.program_input import ProgramInput
-from adaptune.odometry.registry import AnyOdometry, odometry_class, versions
+from adaptune.odometry.registry import is_user_class, odometry_class, versions
 from adaptune.space import ParameterSet, ParameterSpace
 
 
@@ -23,7 +25,7 @@ class OdometryFactory:
     ----------
     name : str
         The odometry, see `adaptune.odometry.registry.odometry_class`.
-    settings : BaseSettings
+    settings : BaseModel
         Its settings; a mapping is validated.
     space : ParameterSpace
         The parameters that are tuned.
@@ -34,6 +36,11 @@ class OdometryFactory:
     strict_sequences : collection of str
         Sequences on which such a program must not fail with the baseline's parameters: there its
         failure is an error, not a fault.
+    user_code : bool
+        Whether classes of the user may run in this process, if they are clean. Only processes that
+        the user can do without may allow it.
+    description : Description
+        What a study must know of the odometry.
     """
 
     name: str
@@ -42,20 +49,19 @@ class OdometryFactory:
     limits: Limits
     program_input: Callable[[str], ProgramInput] | None = None
     strict_sequences: Collection[str] = ()
+    user_code: bool = False
+    description: Description = field(init=False)
+    _clean: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        settings = self.odometry_class.settings_type.model_validate(self.settings)
-        object.__setattr__(self, "settings", settings)
-
-    @cached_property
-    def odometry_class(self) -> AnyOdometry:
-        """Class of the odometry."""
-        return odometry_class(self.name)
-
-    @cached_property
-    def description(self) -> Description:
-        """What a study must know of the odometry."""
-        return self.odometry_class.describe(self.settings)
+        declared = declare(self.name, self.settings)
+        settings, description = declared.sound(self.name)
+        for name, value in (
+            ("settings", settings),
+            ("description", description),
+            ("_clean", declared.clean),
+        ):
+            object.__setattr__(self, name, value)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -65,7 +71,7 @@ class OdometryFactory:
     @property
     def versions(self) -> dict[str, str]:
         """Versions of the packages that the poses depend on."""
-        return versions(self.odometry_class)
+        return versions(self.name)
 
     def __call__(
         self,
@@ -85,16 +91,19 @@ class OdometryFactory:
         isolated
             Run in a process of its own even if the odometry is clean, to measure its memory.
         """
-        cls, given = self.odometry_class, self.space.baseline | (parameters or {})
-        if issubclass(cls, Command):
+        given = self.space.baseline | (parameters or {})
+        if self.name == "command":
             # A failure with the baseline's parameters means that something is missing.
             strict = sequence in self.strict_sequences and given == self.space.baseline
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            return cls(given, self.settings, self.limits, read, strict)
-        if issubclass(cls, Process):
-            return cls(given, self.settings, self.limits)
-        if cls.clean and not isolated:
-            return InProcess(cls(given, self.settings))
-        return Isolated(self.name, given, self.settings, self.limits)
+            return Command(given, self.settings, self.limits, read, strict)
+        if self.name == "process":
+            return Process(given, self.settings, self.limits)
+        if isolated or not self._clean or (is_user_class(self.name) and not self.user_code):
+            return Isolated(self.name, given, self.settings, self.limits)
+        if is_user_class(self.name):
+            return Guarded(self.name, given, self.settings, self.limits.seconds)
+        cls: Any = odometry_class(self.name)
+        return InProcess(cls(given, self.settings))

@@ -4,9 +4,10 @@ from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from adaptune.geometry import Poses, rotation_angle, scale
+from adaptune.strict import StrictModel
 
 _STILL = 1e-6
 """Metres and radians by which a pose that stays where it is may move."""
@@ -14,7 +15,7 @@ _WALK = 0.5
 """Metres a second."""
 
 
-class HealthCheck(BaseModel):
+class HealthCheck(StrictModel):
     """Bounds on a platform's motion.
 
     An odometry that predicts by constant velocity runs away after a failure and does not come
@@ -37,13 +38,11 @@ class HealthCheck(BaseModel):
         Scans in a row that the odometry reports as not registered.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    max_speed: float = Field(40.0, gt=0)
-    max_acceleration: float = Field(30.0, gt=0)
-    max_turn_rate: float = Field(360.0, gt=0)
-    max_freeze: float = Field(1.0, gt=0)
-    max_unregistered: int = Field(10, ge=1)
+    max_speed: float = Field(40.0, gt=0, le=1e9)
+    max_acceleration: float = Field(30.0, gt=0, le=1e9)
+    max_turn_rate: float = Field(360.0, gt=0, le=1e9)
+    max_freeze: float = Field(1.0, gt=0, le=1e9)
+    max_unregistered: int = Field(10, ge=1, le=10**9)
 
     def exceeded(
         self, velocity: Poses, last_velocity: Poses | None, elapsed: float, turn_rate: float = 0.0

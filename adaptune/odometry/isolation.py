@@ -6,22 +6,16 @@ milliseconds, and global state of the odometry ends with its process.
 
 import contextlib
 import logging
-import os
-import signal
-import socket
-import subprocess
-import sys
 from collections.abc import Sequence
-from functools import cache
-from typing import Annotated, Any, BinaryIO, NamedTuple, cast
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, BaseModel, Field, ValidationInfo
 
+from adaptune import hosting
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
 from adaptune.odometry.base import (
-    BaseSettings,
     LastMotion,
     Motions,
     OdometryError,
@@ -32,6 +26,7 @@ from adaptune.odometry.base import (
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
+from adaptune.strict import StrictModel
 
 MOST_FAULTS = 10
 """An instance with so many faults does not start again: the rest of its sequence is lost."""
@@ -39,11 +34,8 @@ MOST_FAULTS = 10
 _TOLERANCE = 1e-3
 """By how much a rotation times its transpose may differ from the identity."""
 
-_TAIL, _LINES = 1 << 14, 5
-"""Messages quote the last lines, out of the last bytes, that a program wrote."""
-
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment of programs that must not start threads of their own."""
+SERVICE = hosting.Service("adaptune.odometry.elsewhere", tuple(hosting.ONE_THREAD.items()))
+"""What a server does with an odometry."""
 
 _log = logging.getLogger(__name__)
 
@@ -57,7 +49,7 @@ Arguments = Annotated[tuple[Annotated[str, AfterValidator(_in_study)], ...], Fie
 """A program and its arguments; ``{study}`` in them is the folder of the study's file."""
 
 
-class Limits(BaseModel):
+class Limits(StrictModel):
     """Limits of an odometry in a process of its own.
 
     Attributes
@@ -68,13 +60,53 @@ class Limits(BaseModel):
         Gigabytes, in addition to what the process begins with.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    seconds: float = Field(10.0, gt=0, le=1e6)
+    memory: float = Field(4.0, gt=0, le=1e6)
 
-    seconds: float = Field(10.0, gt=0)
-    memory: float = Field(4.0, gt=0)
+    @property
+    def bounds(self) -> hosting.Bounds:
+        """The limits as a server takes them."""
+        late = f"a scan took longer than isolation.seconds = {self.seconds:g}"
+        full = f"out of isolation.memory = {self.memory:g} GB"
+        return hosting.Bounds(self.seconds, self.memory, late, full)
 
 
-class Isolated(OdometryInstance):
+class Faulting(OdometryInstance):
+    """An instance that may go wrong, and notes it.
+
+    Parameters
+    ----------
+    name, parameters
+        The odometry.
+    """
+
+    faults: Sequence[str] = ()
+
+    def __init__(self, name: str, parameters: ParameterSet):
+        self.name = name
+        self.parameters = dict(parameters)
+        self._last_motion = LastMotion()
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it had so many faults that it does not start again."""
+        return len(self.faults) >= MOST_FAULTS
+
+    def note_fault(self, what: str) -> Registration:
+        """Note a fault and end; the pose of a scan with a fault."""
+        self.close()
+        self.faults = [*self.faults, what]
+        _log.warning("%s with %s: %s", self.name, self.parameters, what)
+        if self.given_up:
+            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
+        return Registration(np.full((4, 4), np.nan), registered=False)
+
+
+class Isolated(Faulting):
     """An odometry that lives in another process, a new one with every start.
 
     If that process ends, or returns an invalid pose, this is a *fault*: the pose of that scan is
@@ -91,12 +123,10 @@ class Isolated(OdometryInstance):
         What each process may use.
     """
 
-    faults: Sequence[str] = ()
     _fresh = True  # each start needs a new process
 
-    def __init__(self, name: str, parameters: ParameterSet, settings: BaseSettings, limits: Limits):
-        self.name = name
-        self.parameters = dict(parameters)
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, limits: Limits):
+        super().__init__(name, parameters)
         self._cpu = self._cpu_before = self._memory = 0.0  # as the other processes report
         self._hello: dict[str, Any] = {
             "odometry": name,
@@ -104,15 +134,10 @@ class Isolated(OdometryInstance):
         }
         self._limits = limits
         self._stream: BinaryIO | None = None
-        self._last_motion = LastMotion()
 
     @property
     def usage(self) -> Usage:
         return Usage(self._cpu, self._memory)
-
-    @property
-    def motions(self) -> Motions:
-        return self._last_motion.motions
 
     def prepare(self, scan: Scan) -> Scan:
         return scan  # the other process prepares
@@ -124,7 +149,7 @@ class Isolated(OdometryInstance):
         if self._fresh:
             self.close()
         if self._stream is None:
-            if len(self.faults) >= MOST_FAULTS:
+            if self.given_up:
                 return
             self._stream = self._connect()
             self._ask(wire.hello(**self._hello, parameters=self.parameters))
@@ -162,8 +187,7 @@ class Isolated(OdometryInstance):
         except (TypeError, ValueError) as error:
             wrong = f"an answer of other types ({error})"
         if wrong:
-            self._fault(f"it gave {wrong}")
-            return lost
+            return self.note_fault(f"it gave {wrong}")
         self._cpu = self._cpu_before + cpu
         self._memory = max(self._memory, memory)
         return Registration(T_odom_sensor.copy(), bool(registered))
@@ -210,36 +234,26 @@ class Isolated(OdometryInstance):
         except wire.WireError as error:
             what = str(error)
         if answer is None:
-            self._fault(self._verdict(what))
+            self.note_fault(self._verdict(what))
             return None
         kind, message = map(answer.header.get, ("type", "message"))
         if kind == "refused":
             raise OdometryError(f"{self.name}: {message}")
         if kind == "fault":
-            self._fault(str(message))
+            self.note_fault(str(message))
             return None
         return answer
 
     def _connect(self) -> BinaryIO:
         """A stream to a new process, which first receives a hello."""
-        if fork_server(self.name).process.poll() is not None:
-            fork_server.cache_clear()
-        here, there = socket.socketpair()
-        with here, there:
-            request = self._limits.model_dump_json().encode()
-            socket.send_fds(fork_server(self.name).control, [request], [there.fileno()])
-            return cast("BinaryIO", here.makefile("rwb"))
+        try:
+            return hosting.connect(SERVICE, self.name, "converse", self._limits.bounds)
+        except hosting.HostError as error:
+            raise OdometryError(str(error)) from error
 
     def _verdict(self, what: str) -> str:
         """Add to `what` how the process ended; here the process itself reports that."""
         return what
-
-    def _fault(self, what: str) -> None:
-        self.close()
-        self.faults = [*self.faults, what]
-        _log.warning("%s with %s: %s", self.name, self.parameters, what)
-        if len(self.faults) == MOST_FAULTS:
-            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
 
 
 def pose_fault(T_odom_sensor: Poses) -> str | None:
@@ -252,55 +266,3 @@ def pose_fault(T_odom_sensor: Poses) -> str | None:
     if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         return "that is not rigid"
     return None
-
-
-def verdict(code: int) -> str:
-    """How a process ended, by its exit code, or minus the signal's number."""
-    if code >= 0:
-        return f"its process ended with code {code}"
-    return f"its process was ended by {signal.Signals(-code).name}"
-
-
-def bounded(command: Sequence[str], memory: float, *limits: str) -> list[str]:
-    """A command with a limit on its address space in gigabytes, and further limits of ulimit."""
-    bounds = "; ".join(f"ulimit {limit}" for limit in (f"-v {round(memory * 1e6)}", *limits))
-    return ["/bin/sh", "-c", f'{bounds}; exec "$@"', "sh", *command]
-
-
-def end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a process that leads a session, and its children."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
-def last_lines(output: BinaryIO) -> str:
-    """The last lines that a process wrote to a file."""
-    size = output.seek(0, os.SEEK_END)
-    output.seek(max(size - _TAIL, 0))
-    lines = output.read().decode(errors="replace").strip().splitlines()
-    return " | ".join(lines[-_LINES:])
-
-
-class ForkServer(NamedTuple):
-    """A process that forks instances of an odometry, and the socket that asks it to."""
-
-    process: subprocess.Popen[bytes]
-    control: socket.socket
-
-
-@cache
-def fork_server(name: str) -> ForkServer:
-    """Fork server of an odometry, started at the first call."""
-    here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
-    path = os.pathsep.join(filter(None, sys.path))
-    with there:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "adaptune.odometry.forkserver", str(there.fileno()), name],
-            pass_fds=[there.fileno()],
-            stdin=subprocess.DEVNULL,
-            env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
-            # Ctrl-C is for this process only.
-            start_new_session=True,
-        )
-    return ForkServer(process, here)

@@ -18,9 +18,9 @@ turns more steadily than its stamps say, and a missing scan doubles the time."""
 class KeyframeSettings(BaseSettings):
     """Settings of keyframe odometries, in metres."""
 
-    downsampling: float = Field(0.5, gt=0)
-    min_range: float = Field(1.0, ge=0)
-    iterations: int = Field(20, ge=1)
+    downsampling: float = Field(0.5, ge=1e-3, le=1e3)
+    min_range: float = Field(1.0, ge=0, le=1e6)
+    iterations: int = Field(20, ge=1, le=10_000)
 
 
 class PreparedCloud(NamedTuple):

@@ -14,7 +14,7 @@ from adaptune.space import Float, ParameterSpace
 class NdtSettings(keyframe.KeyframeSettings):
     """Settings of keyframe NDT, in metres."""
 
-    iterations: int = Field(30, ge=1)
+    iterations: int = Field(30, ge=1, le=10_000)
 
 
 class KeyframeNdt(KeyframeOdometry):

@@ -1,16 +1,14 @@
 """Odometries in programs of the user that receive scans and return poses, one after the other."""
 
-import contextlib
-import os
 import socket
-import subprocess
 import tempfile
 from functools import cache
 from typing import Any, BinaryIO, Self, cast
 
 from pydantic import Field, model_validator
 
-from adaptune.odometry import isolation, wire
+from adaptune import hosting
+from adaptune.odometry import wire
 from adaptune.odometry.base import BaseSettings, Description, OdometryError
 from adaptune.odometry.isolation import Arguments, Isolated, Limits
 from adaptune.space import ParameterSet
@@ -81,7 +79,7 @@ class Process(Isolated):
         self._hello = {"odometry": None, "settings": settings.settings}
         self._reach = settings
         self._socket: socket.socket | None = None
-        self._program: subprocess.Popen[bytes] | None = None
+        self._program: hosting.Program | None = None
         self._written: Any = None
 
     @staticmethod
@@ -95,7 +93,7 @@ class Process(Isolated):
             self._socket.close()
             self._socket = None
         if self._program is not None:
-            isolation.end_group(self._program)
+            self._program.close()
             self._program = None
 
     def _connect(self) -> BinaryIO:
@@ -118,13 +116,12 @@ class Process(Isolated):
         here, there = socket.socketpair()
         self._written = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
         with there:
-            self._program = subprocess.Popen(
-                isolation.bounded(command, self._limits.memory),
+            self._program = hosting.Program(
+                command,
+                self._limits.memory,
                 stdin=there.fileno(),
                 stdout=there.fileno(),
                 stderr=self._written,
-                env=os.environ | isolation.ONE_THREAD,
-                start_new_session=True,
             )
         return here
 
@@ -138,10 +135,9 @@ class Process(Isolated):
         """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._program is None:
             return what.replace("its process ended", "it ended the conversation")
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            what = isolation.verdict(self._program.wait(0.5))
-        words = isolation.last_lines(self._written)
-        return f"{what}: {words}" if words else what
+        if (ended := self._program.wait(0.5)) is not None:
+            what = hosting.verdict(ended.code)
+        return hosting.quoting(what, self._written)
 
 
 @cache

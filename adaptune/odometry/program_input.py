@@ -79,7 +79,7 @@ def _own_bag(config: SequenceConfig, layout: Layout) -> Path | None:
     if not isinstance(config.bag, str) or layout == "kitti":
         return None
     plain = SequenceConfig(bag=config.bag)
-    changes = ("start", "stop", "stride", "views", "compensate")
+    changes = ("start", "stop", "stride", "part", "views", "compensate")
     if any(getattr(config, key) != getattr(plain, key) for key in changes):
         return None
     path = Path(config.bag)

@@ -42,8 +42,27 @@ PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
 AnyOdometry = type[Odometry] | type["Command"] | type["Process"]
 
 
+def is_user_class(name: str) -> bool:
+    """Whether an odometry is a class that is not adaptune's: another package's, or the user's."""
+    return name not in ODOMETRIES and name not in PROGRAMS
+
+
+def where(name: str) -> str:
+    """Where the class of an odometry is, as ``module:Class``, without importing it.
+
+    Raises
+    ------
+    OdometryError
+        If there is no such odometry, with the nearest name.
+    """
+    try:
+        return plugins.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
+    except plugins.PluginError as error:
+        raise OdometryError(str(error)) from error
+
+
 def odometry_class(name: str) -> "AnyOdometry":
-    """Class of an odometry.
+    """Class of an odometry; see `adaptune.odometry.declaration` for a user's.
 
     Parameters
     ----------
@@ -57,7 +76,7 @@ def odometry_class(name: str) -> "AnyOdometry":
         If there is no such odometry, with the nearest name, or if the class cannot be used.
     """
     try:
-        found = plugins.load(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
+        found = plugins.load(name, where(name), "class")
     except plugins.PluginError as error:
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
@@ -69,17 +88,17 @@ def odometry_class(name: str) -> "AnyOdometry":
     return found
 
 
-def versions(odometry: "AnyOdometry") -> dict[str, str]:
+def versions(name: str) -> dict[str, str]:
     """Versions of what a trial's outcome may depend on: adaptune, numpy, the odometry's package."""
     names = {"adaptune", "numpy"}
-    module = odometry.__module__
+    module = where(name).partition(":")[0]
     top = module.removeprefix(f"{__package__}.").partition(".")[0]
     if module.startswith(f"{__package__}."):
         names.add(PACKAGES.get(top, top))
     else:
         names |= set(metadata.packages_distributions().get(top, ()))
     found = {}
-    for name in sorted(names):
+    for package in sorted(names):
         with suppress(metadata.PackageNotFoundError):  # written by the user, or built in
-            found[name] = metadata.version(name)
+            found[package] = metadata.version(package)
     return found

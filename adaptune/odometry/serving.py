@@ -5,14 +5,16 @@ import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from adaptune.odometry import wire
-from adaptune.odometry.base import BaseSettings, OdometryError, Registration
+from adaptune.odometry.base import Description, OdometryError, Registration
+from adaptune.odometry.declaration import declare
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import parse_address
+from adaptune.odometry.registry import is_user_class
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 
@@ -32,14 +34,20 @@ class _Elsewhere(Isolated):
 def serve(reader: wire.Readable, writer: BinaryIO, name: str | None = None) -> None:
     """Do `wire.serve`, but let an odometry that is not clean run in a process of its own."""
     if name is not None:
-        wire.python_class(name)
+        _check(name)
     wire.serve(reader, writer, name, _make)
 
 
-def _make(name: str, parameters: ParameterSet, settings: BaseSettings) -> wire.Served:
-    if wire.python_class(name).clean:
+def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[wire.Served, Description]:
+    declared = declare(wire.check_served(name), settings)
+    if declared.clean and not is_user_class(name):
         return wire.make_here(name, parameters, settings)
-    return _Elsewhere(name, parameters, settings, Limits())
+    checked, described = declared.sound(name)
+    return _Elsewhere(name, parameters, checked, Limits()), described
+
+
+def _check(name: str) -> None:
+    declare(wire.check_served(name), {})
 
 
 def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
@@ -54,7 +62,7 @@ def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
     ready
         Called with the address when connections are accepted.
     """
-    wire.python_class(name)
+    _check(name)
     family, where = parse_address(address)
     with socket.socket(family) as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -43,8 +43,9 @@ from pydantic import ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.odometry import BaseSettings, Description, Odometry, OdometryError, Registration
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry import Description, OdometryError, Registration
+from adaptune.odometry.registry import PROGRAMS, odometry_class
+from adaptune.plain_words import in_one_line
 from adaptune.sequence.imu import Imu, ImuNoise
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, nearest
@@ -155,21 +156,25 @@ class Served(Protocol):
     def configure(self, parameters: ParameterSet) -> None: ...
 
 
-Make = Callable[[str, ParameterSet, BaseSettings], Served]
-"""Makes an odometry by its name."""
+Make = Callable[[str, ParameterSet, Any], tuple[Served, Description]]
+"""Makes an odometry by its name and settings, and describes it."""
 
 
-def python_class(name: str) -> type[Odometry]:
-    """Class of an odometry that can be served; an error for programs of the user."""
-    cls = odometry_class(name)
-    if not issubclass(cls, Odometry):
-        raise OdometryError(f"{name} is a program of the user: serve an odometry such as gicp")
-    return cls
-
-
-def make_here(name: str, parameters: ParameterSet, settings: BaseSettings) -> Odometry:
+def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Served, Description]:
     """Make an odometry in this process."""
-    return python_class(name)(parameters, settings)
+    cls: Any = odometry_class(check_served(name))
+    try:
+        checked = cls.settings_type.model_validate(settings)
+    except ValidationError as error:
+        raise OdometryError(f"settings: {error}") from error
+    return cls(parameters, checked), cls.describe(checked)
+
+
+def check_served(name: str) -> str:
+    """Refuse programs of the user."""
+    if name in PROGRAMS:
+        raise OdometryError(f"{name} is a program of the user: serve an odometry such as gicp")
+    return name
 
 
 def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
@@ -187,7 +192,8 @@ def announced(answer: Message) -> Description:
         space = ParameterSpace.load(header["space"])
         return Description(space, bool(header["live"]), bool(header.get("needs_imu")))
     except (KeyError, TypeError, AttributeError, ValidationError) as error:
-        raise OdometryError(f"its answer to hello does not describe it: {error}") from error
+        what = in_one_line(error, header.get("space"))
+        raise OdometryError(f"its answer to hello does not describe it: {what}") from error
 
 
 def serve(
@@ -242,19 +248,29 @@ def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Serve
         raise OdometryError("the hello names no odometry; name it, or serve one: adaptune serve X")
     if only not in (None, name):
         raise OdometryError(f"only {only} is served here, not {name}")
-    cls = python_class(name)
+    odometry, described = make(name, hello["parameters"], hello["settings"])
+    return odometry, {"odometry": name, **about(described)}
+
+
+def about(described: Description) -> dict[str, Any]:
+    """A description as an answer holds it."""
+    space = {} if described.space is None else described.space.dump()
+    return {"live": described.live, "needs_imu": described.needs_imu, "space": space}
+
+
+def unpacked(found: Any) -> Registration:
+    """What `Odometry.register` returned; a TypeError that says so if it is no registration."""
     try:
-        settings = cls.settings_type.model_validate(hello["settings"])
-    except ValidationError as error:
-        raise OdometryError(f"settings: {error}") from error
-    about = {"live": cls.live, "needs_imu": cls.needs_imu, "space": cls.space.dump()}
-    return make(name, hello["parameters"], settings), {"odometry": name, **about}
+        return Registration(*found)
+    except TypeError as error:
+        raise TypeError(f"register returned {found!r:.100}, not a Registration") from error
 
 
 def _answer(odometry: Served, message: Message, writer: BinaryIO) -> None:
     header, arrays = message
     if header["type"] == "register":
-        T_odom_sensor, registered = odometry.register(odometry.prepare(to_scan(message)))
+        found = odometry.register(odometry.prepare(to_scan(message)))
+        T_odom_sensor, registered = unpacked(found)
         pose: Poses = np.asarray(T_odom_sensor, np.float64)
         answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
         used = resource.getrusage(resource.RUSAGE_SELF)

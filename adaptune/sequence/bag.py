@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.sequence import livox, pointcloud2, velodyne
 from adaptune.sequence.bag_files import files_of
+from adaptune.sequence.bag_index import IndexReader
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloudError
 from adaptune.sequence.pose_messages import PATH, POSES, TRANSFORMS, message_stamp, of_frame, usable
@@ -114,14 +115,14 @@ class BagSource:
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of their recording."""
         with self.open() as reader:
-            decode = self._decoder(reader)
+            load = self.loader(reader)
             messages = enumerate(self.read(reader, self.points), start=1)
             for number, (_, recorded, data) in messages:
                 what = f"{self.name}: message {number} on {self.points}"
                 stamp = header_stamp(data, reader.is2)
                 if stamp is None:
                     raise SequenceError(f"{what} is cut short")
-                yield Frame(stamp, recorded, partial(_load, decode, data, what))
+                yield Frame(stamp, recorded, partial(load, data, what))
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
         """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
@@ -156,7 +157,7 @@ class BagSource:
         if self.topics[name] in TRANSFORMS:
             found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
-            raise SequenceError(f"{self.name}: no pose on {name}")
+            raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
         trajectory, unusable = usable(found)
         unfit = f"poses on {name} that are not finite or have no rotation"
         if trajectory is None:
@@ -175,7 +176,7 @@ class BagSource:
             stamps.append(message_stamp(message))
             values.append((w.x, w.y, w.z, a.x, a.y, a.z))
         if not stamps:
-            raise SequenceError(f"{self.name}: no measurement on {name}")
+            raise SequenceError(f"{self.name}: no measurement on {name}; name another topic")
         unique, index = np.unique(np.array(stamps, np.int64), return_index=True)
         measured = np.array(values)[index]
         if not np.isfinite(measured).all():
@@ -228,17 +229,19 @@ class BagSource:
                     raise SequenceError(f"{self.name}: {what}") from error
 
     @contextmanager
-    def open(self) -> Iterator[AnyReader]:
-        """Open the bags for reading."""
-        reader, self._ready = self._ready or self._opened(), None
+    def open(self, by_index: bool = False) -> Iterator[AnyReader]:
+        """Open the bags for reading; `by_index`, without a look at their chunks."""
+        reader, self._ready = self._ready or self._opened(by_index), None
         try:
             yield reader
         finally:
             reader.close()
 
-    def _opened(self) -> AnyReader:
+    def _opened(self, by_index: bool = False) -> AnyReader:
         try:
             reader = AnyReader(self.paths, default_typestore=_typestore())
+            if by_index and not reader.is2:
+                reader.readers = [IndexReader(path) for path in self.paths]
             reader.open()
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
@@ -249,10 +252,14 @@ class BagSource:
         return reader
 
     def read(
-        self, reader: AnyReader, topic: str | None = None
+        self,
+        reader: AnyReader,
+        topic: str | None = None,
+        span: tuple[int | None, int | None] = (None, None),
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Serialised messages of a topic, or of all topics."""
-        messages = reader.messages([c for c in reader.connections if topic in (None, c.topic)])
+        """Serialised messages of a topic, or of all topics; `span`, those recorded then."""
+        chosen = [c for c in reader.connections if topic in (None, c.topic)]
+        messages = reader.messages(chosen, *span)
         while True:
             try:
                 message = next(messages)
@@ -264,6 +271,10 @@ class BagSource:
                     f"{self.name}: the rest cannot be read ({_say(error)}); {help_}"
                 ) from error
             yield message
+
+    def loader(self, reader: AnyReader) -> Callable[[bytes, str], Scan]:
+        """What decodes a message of the point clouds; its name goes into the SequenceError."""
+        return partial(_load, self._decoder(reader))
 
     def _decoder(self, reader: AnyReader) -> Callable[[bytes], Scan]:
         kind, definitions = self.topics[self.points], reader.typestore.fielddefs

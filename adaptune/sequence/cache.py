@@ -13,6 +13,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -22,6 +23,8 @@ import platformdirs
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from adaptune.errors import AdaptuneError
+from adaptune.files import expand_user
 from adaptune.sequence.scan import Scan
 
 _log = logging.getLogger(__name__)
@@ -31,7 +34,7 @@ SMALL = 1 << 24
 """Bytes below which the content of a file counts, all of it."""
 _VERSION = 4
 _SAMPLE = 1 << 16
-_CAP_GB = 50.0
+_CAP_GB, _MOST_GB = 50.0, 1e9
 # Seconds. A writer that has not written for this long is dead.
 _DEAD = 3600.0
 # Fields that a scan may lack.
@@ -48,16 +51,23 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
 def folder() -> Path:
     """Where decoded sequences are kept: ``$ADAPTUNE_CACHE``, or in the user's cache folder."""
     if given := os.environ.get("ADAPTUNE_CACHE"):
-        return Path(given).expanduser()
+        return expand_user(given)
     return platformdirs.user_cache_path("adaptune", appauthor=False)
 
 
 def cap() -> int:
-    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50."""
-    try:
-        return round(float(os.environ.get("ADAPTUNE_CACHE_GB", _CAP_GB)) * 1e9)
-    except ValueError:
-        return round(_CAP_GB * 1e9)
+    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50.
+
+    An AdaptuneError if the variable is no number of gigabytes.
+    """
+    given = os.environ.get("ADAPTUNE_CACHE_GB", "").strip()
+    with suppress(ValueError):
+        gigabytes = float(given or _CAP_GB)
+        if 0 <= gigabytes <= _MOST_GB:
+            return round(gigabytes * 1e9)
+    raise AdaptuneError(
+        f"ADAPTUNE_CACHE_GB is {given!r}; give gigabytes, 0 or more, or unset it for {_CAP_GB:g}"
+    )
 
 
 def key(paths: Sequence[Path], settings: Any) -> str:

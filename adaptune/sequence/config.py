@@ -8,22 +8,31 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     ValidationInfo,
     model_validator,
 )
 
 from adaptune import geometry
+from adaptune.errors import AdaptuneError
+from adaptune.files import expand_user
 from adaptune.geometry import Poses
 from adaptune.sequence.bag_files import bag_paths
 from adaptune.sequence.imu import USUAL
+from adaptune.sequence.part import Part
 from adaptune.sequence.timing import Unit
+from adaptune.strict import StrictModel
 
+MOST_VIEWS = 16
+"""Views of one sequence, and views to train on; each costs time with every scan."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 _SOURCES = ("bag", "kitti", "folder", "evalio")
+
+
+_POSE = "give numbers: x y z qx qy qz qw, or the four rows of a 4x4 matrix"
+_FARTHEST = 1e6
+"""Metres between two frames of one platform."""
 
 
 def expand(text: str) -> str:
@@ -36,7 +45,18 @@ def expand(text: str) -> str:
 def resolve(path: str, info: ValidationInfo) -> str:
     """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
     folder = (info.context or {}).get("folder", Path())
-    return str((Path(folder) / Path(expand(path)).expanduser()).resolve())
+    if not path.strip():
+        raise ValueError("give a path, not an empty text")
+    try:
+        whole = (Path(folder) / expand_user(expand(path))).resolve()
+        whole.exists()
+    except AdaptuneError as error:
+        raise ValueError(str(error)) from error
+    except RuntimeError as error:
+        raise ValueError(f"{path}: links lead in a circle; remove them") from error
+    except OSError as error:
+        raise ValueError(f"cannot be reached ({error.strerror}); give another path") from error
+    return str(whole)
 
 
 def _resolve_bags(given: Any, info: ValidationInfo) -> Any:
@@ -53,27 +73,36 @@ def _resolve_file(reference: str, info: ValidationInfo) -> str:
     return resolve(reference, info) if reference.endswith(REFERENCE_FILES) else reference
 
 
-_Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
+_Numbers = tuple[float, ...]
 
 
 def _check_transform(given: Any) -> Any:
-    to_pose(given)
+    rows: Any = given if isinstance(given, list | tuple) else ()
+    nested = any(isinstance(row, list | tuple) for row in rows)
+    for row in rows if nested else (rows,):
+        for number in row if isinstance(row, list | tuple) else (row,):
+            real = isinstance(number, int | float) and not isinstance(number, bool)
+            if not (real and abs(number) <= _FARTHEST):
+                raise ValueError(f"holds {number!r:.20}; {_POSE}")
+    to_pose(rows)
     return given
 
 
 def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
     """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
-    values = np.array(given, np.float64) if len({np.size(row) for row in given}) == 1 else None
+    values = np.array(given, np.float64) if len({np.shape(row) for row in given}) == 1 else None
     if values is not None and values.shape == (7,):
         if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
             raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
         pose: Poses = geometry.from_quaternions(values[None, :3], values[None, 3:])[0]
         return pose
     if values is None or values.shape not in ((4, 4), (3, 4)):
-        raise ValueError("give x y z qx qy qz qw, or the four rows of a 4x4 matrix")
+        raise ValueError(_POSE)
     R = values[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError("its first three columns and rows are not a rotation")
+    if values.shape == (4, 4) and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError("its last row is not 0 0 0 1; is it transposed?")
     from scipy.spatial.transform import Rotation
 
     T = np.eye(4)
@@ -83,19 +112,15 @@ def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
     return T
 
 
-Transform = Annotated[_Numbers | tuple[_Numbers, ...], AfterValidator(_check_transform)]
+Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_check_transform)]
 """A pose as seven numbers, or as the rows of a matrix."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _Part(_Section):
+class _Part(StrictModel):
     """Seconds since the first scan."""
 
-    start: float = Field(0.0, ge=0)
-    stop: float | None = Field(None, gt=0)
+    start: float = Field(0.0, ge=0, le=1e9)
+    stop: float | None = Field(None, gt=0, le=1e9)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -104,35 +129,38 @@ class _Part(_Section):
         return self
 
 
+_Seconds = Annotated[float, Field(ge=0, le=1e9)]
+
+
 class DropConfig(_Part):
     """The share of the scans from `start` to `stop` that is lost."""
 
     share: float = Field(gt=0, lt=1)
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, lt=2**32)
 
 
 class SpeedConfig(_Part):
     """How many times faster the scans from `start` to `stop` arrive."""
 
-    factor: float = Field(gt=0, allow_inf_nan=False)
+    factor: float = Field(ge=1e-3, le=1e3)
 
 
-class NoiseConfig(_Section):
+class NoiseConfig(StrictModel):
     """Metres by which points are moved along their rays."""
 
-    sigma: float = Field(gt=0, allow_inf_nan=False)
-    seed: int = Field(0, ge=0)
+    sigma: float = Field(gt=0, le=1e3)
+    seed: int = Field(0, ge=0, lt=2**32)
 
 
-class ViewConfig(_Section):
+class ViewConfig(StrictModel):
     """One view, by its name; views apply in the order of the list."""
 
     # Only these parts, in seconds since the first scan.
-    cut: tuple[tuple[float, float], ...] | None = Field(None, min_length=1)
+    cut: tuple[tuple[_Seconds, _Seconds], ...] | None = Field(None, min_length=1, max_length=1000)
     drop: DropConfig | None = None
     speed: SpeedConfig | None = None
     reverse: Literal[True] | None = None
-    rings: int | None = Field(None, ge=2)  # keep one ring in so many
+    rings: int | None = Field(None, ge=2, le=256)  # keep one ring in so many
     noise: NoiseConfig | None = None
     transform: Transform | None = None  # pose of the LiDAR in the frame from which to see it
 
@@ -154,10 +182,10 @@ class ViewConfig(_Section):
         return [name for name in type(self).model_fields if getattr(self, name) is not None]
 
 
-_Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Noise = Annotated[float, Field(gt=0, le=1e6)]
 
 
-class NoiseDensities(_Section):
+class NoiseDensities(StrictModel):
     """See `ImuNoise`."""
 
     gyroscope: _Noise = USUAL.gyroscope
@@ -166,7 +194,7 @@ class NoiseDensities(_Section):
     accelerometer_walk: _Noise = USUAL.accelerometer_walk
 
 
-class ImuConfig(_Section):
+class ImuConfig(StrictModel):
     """An IMU."""
 
     topic: str | None = None  # may be left out where there is only one
@@ -189,24 +217,24 @@ class SequenceConfig(_Part):
     stamp: Literal["auto", "start", "end"] = "auto"  # what a stamp marks of its scan
     time_unit: Unit | None = None  # of the points' times
     # Seconds a scan takes; used if neither points nor files have times.
-    period: float = Field(0.1, gt=0, allow_inf_nan=False)
-    stride: int = Field(1, ge=1)  # use every stride-th scan
+    period: float = Field(0.1, gt=0, le=60)
+    stride: int = Field(1, ge=1, le=10_000)  # use every stride-th scan
+    part: Part | None = None  # of the time from `start` to `stop`
     # Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
-    clock_offset: float = Field(
-        0.0, allow_inf_nan=False
-    )  # seconds to add to the reference's stamps
+    # Seconds to add to the reference's stamps, as far as those of other clocks lie.
+    clock_offset: float = Field(0.0, ge=-3e9, le=3e9)
     # Seconds. The reference is unknown between poses further apart.
-    max_gap: float = Field(1.0, gt=0, allow_inf_nan=False)
+    max_gap: float = Field(1.0, gt=0, le=1e9)
     imu: ImuConfig | None = None
     # Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
     # benchmark and the raw drives when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
     # Undo the motion since the scan before, or the rotation that the IMU measured.
     compensate: Literal["constant_velocity", "gyro"] | None = None
-    views: tuple[ViewConfig, ...] = ()
+    views: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     cache: bool = True  # whether to keep decoded bags in the cache
 
     @model_validator(mode="after")

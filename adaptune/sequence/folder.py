@@ -172,7 +172,9 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
         stamp_files.append(times)
         stamps = _seconds(times)
         if len(stamps) != len(files):
-            raise SequenceError(f"{times}: {len(stamps)} times for {len(files)} scans")
+            raise SequenceError(
+                f"{times}: {len(stamps)} times for {len(files)} scans; give one a scan"
+            )
     else:
         named = _named_stamps(files)
         evenly = np.arange(len(files)) * round(timing.period * 1e9)

@@ -94,7 +94,10 @@ def _recorded(config: SequenceConfig) -> RecordedSequence:
     settings = ReferenceSettings(
         reference, config.child_frame, T, config.clock_offset, config.max_gap
     )
-    return RecordedSequence(source, _section(config), settings, _imu(config.imu), key)
+    section = _section(config)
+    if config.part is not None and (span := source.span()) is not None:
+        section = section.part(config.part, (span[1] - span[0]) * 1e-9)
+    return RecordedSequence(source, section, settings, _imu(config.imu), key)
 
 
 def _source(config: SequenceConfig) -> tuple[Source, str | None]:
@@ -114,7 +117,8 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
     if not config.cache or not cache.cap():
         return BagSource(paths, config.points, timing), None
     try:
-        key = cache.key(paths, (config.points, timing, _section(config)))
+        part = () if config.part is None else (config.part,)
+        key = cache.key(paths, (config.points, timing, _section(config), *part))
     except OSError as error:
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
     entry = cache.find(key)

@@ -91,8 +91,9 @@ class RecordedSequence:
 
     @property
     def n_messages(self) -> int:
-        """Scans in the recording, over the stride."""
-        return -(-self.source.n_messages // self.section.stride)
+        """About how many scans of the recording it uses."""
+        begin, end = self.source.span() or (0, 0)
+        return self.section.count(self.source.n_messages, (end - begin) * 1e-9)
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans one after the other.
@@ -122,7 +123,9 @@ class RecordedSequence:
             last = scan.stamp
             yield scan
         if last is None:
-            raise SequenceError(f"{self.name}: no scan {self.section}")
+            raise SequenceError(
+                f"{self.name}: no scan {self.section}; change start, stop or stride"
+            )
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first. A bag is decoded to the cache before."""

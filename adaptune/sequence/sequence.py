@@ -25,7 +25,7 @@ class Sequence(Protocol):
 
     @property
     def n_messages(self) -> int:
-        """At least as many as there are scans."""
+        """About how many scans there are."""
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans; their stamps strictly increase."""

@@ -2,11 +2,12 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 from adaptune.sequence.imu import Imu
+from adaptune.sequence.part import Fractions
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
 
@@ -153,6 +154,19 @@ class Section:
                 if number % self.stride == 0:
                     yield frame
                 number += 1
+
+    def part(self, part: Fractions, seconds: float) -> "Section":
+        """A part of it in a recording of so many seconds; the last part has the last scan."""
+        begin, end = part
+        whole = (seconds if self.stop is None else min(self.stop, seconds)) - self.start
+        stop = self.stop if end == 1.0 else self.start + end * whole
+        return replace(self, start=self.start + begin * whole, stop=stop)
+
+    def count(self, n: int, seconds: float) -> int:
+        """About how many of `n` scans are in it, in a recording of so many seconds."""
+        stop = seconds if self.stop is None else min(self.stop, seconds)
+        share = max(stop - self.start, 0.0) / seconds if seconds > 0.0 else 1.0
+        return -(-round(n * share) // self.stride)
 
     def __str__(self) -> str:
         stop = "the end" if self.stop is None else f"{self.stop:g} s"

@@ -73,7 +73,7 @@ class View:
                 seen = changed
                 yield seen
         if seen is None:
-            raise SequenceError(f"{self.name}: its views leave no scan")
+            raise SequenceError(f"{self.name}: its views leave no scan; cut or drop less")
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR as seen."""
@@ -181,7 +181,7 @@ def thin_rings(sequence: Reversible, every: int) -> View:
         if scan.rings is not None:
             return scan.select(scan.rings % every == 0)
         if len(scan):
-            raise SequenceError(f"{sequence.name}: its points have no ring, none can be left out")
+            raise SequenceError(f"{sequence.name}: its points have no ring; leave `rings` out")
         return scan
 
     return View(sequence, thin)
@@ -276,7 +276,7 @@ class WithImu:
         """Read the scans; a SequenceError if there is no IMU, or it measured at another time."""
         imu = self.imu()
         if imu is None or not len(imu):
-            raise SequenceError(f"{self.name}: holds no measurements of an IMU")
+            raise SequenceError(f"{self.name}: holds no measurements of an IMU; name their topic")
         first: int | None = None
         for scan in self.inner:
             if first is None:
@@ -285,7 +285,7 @@ class WithImu:
                     first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
                     raise SequenceError(
                         f"{self.name}: the IMU covers {' to '.join(covered)}, the first scan is of "
-                        f"{first_scan}: they are not on the same clock"
+                        f"{first_scan}: record both on the same clock, or leave `imu` out"
                     )
                 # Those during the first scan, and the one before.
                 first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)

@@ -3,13 +3,15 @@
 from collections.abc import Collection
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from adaptune.errors import AdaptuneError
+from adaptune.sequence.part import Part
 from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import SENSORS
 from adaptune.simulation.weather import WEATHERS
+from adaptune.strict import StrictModel
 
 LONGEST = 20_000.0
 """Metres; a longer course is most likely a mistake."""
@@ -28,20 +30,16 @@ def _known(kind: str, names: Collection[str]) -> AfterValidator:
     return AfterValidator(check)
 
 
-class SceneLeg(BaseModel):
+class SceneLeg(StrictModel):
     """One scene of a course."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     scene: Annotated[str, _known("scene", SCENES)]
     # Metres driven in it; the course's `length` if not given.
     length: Annotated[float, Field(ge=10.0, le=LONGEST)] | None = None
 
 
-class Course(BaseModel):
+class Course(StrictModel):
     """A simulated recording: its scenes, its sensor and its motion."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     # Scenes in driving order, by name or with a length of their own.
     scenes: tuple[Annotated[str | SceneLeg, _known("scene", SCENES)], ...] = Field(min_length=1)
@@ -61,6 +59,9 @@ class Course(BaseModel):
     weather: Annotated[str, _known("weather", WEATHERS)] = "clear"
     # Whether a recording's headers mark the start or the end of each scan.
     stamp: Literal["start", "end"] = "start"
+    # The course whose recording it is a part of; a study's `training` and `test` name such parts.
+    of: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] | None = None
+    part: Part | None = None
 
     @model_validator(mode="after")
     def _rate_follows_motion(self) -> Self:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin
 
 from adaptune import geometry
+from adaptune.drawing import as_png_and_svg
 from adaptune.files import replacing, replacing_folder
 from adaptune.sequence.export import Message, Messages, structured, write_kitti_times
 from adaptune.simulation.course import Course, SimulationError
@@ -41,8 +42,8 @@ def record(
 ) -> None:
     """Simulate a course and write its recording, its ground truth and a preview.
 
-    The truth, in the TUM format, and the preview, a PNG, are named after the recording. All three
-    are written whole or not at all.
+    The truth, in the TUM format, and the preview, as PNG and SVG, are named after the recording.
+    All are written whole or not at all.
 
     Parameters
     ----------
@@ -64,15 +65,16 @@ def record(
     path = Path(path)
     layout = _layout(path) if layout is None else layout
     stem = path.name if layout in _MARKS else path.stem
-    truth, preview = path.with_name(f"{stem}.tum"), path.with_name(f"{stem}.png")
-    for file in (path, truth, preview):
+    truth = path.with_name(f"{stem}.tum")
+    previews = as_png_and_svg(path.with_name(f"{stem}.png"))
+    for file in (path, truth, *previews):
         _check(file, overwrite, _MARKS.get(layout) if file is path else None)
     drive = Drive(course)
     if not len(drive):
         raise SimulationError("the course is over before its first scan is: make it longer")
     with ExitStack() as stack:
         temporary_truth = stack.enter_context(replacing(truth))
-        temporary_preview = stack.enter_context(replacing(preview))
+        temporary_previews = [stack.enter_context(replacing(preview)) for preview in previews]
         scans = _watched(drive, picture := Preview(drive), progress)
         new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
         if layout == "kitti":
@@ -85,7 +87,7 @@ def record(
             _write_bag(drive, scans, new, 1 if layout == "ros1" else 2)
         stamps = drive.stamps()
         write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        picture.save(temporary_preview)
+        picture.save(temporary_previews)
 
 
 def _layout(path: Path) -> Layout:

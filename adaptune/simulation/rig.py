@@ -33,4 +33,4 @@ def as_sequence(course: Course, path: Path) -> SequenceConfig:
     extrinsic = geometry.invert(T_IMU_LIDAR).tolist()
     imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": NOISE._asdict()}
     imu = None if course.imu is None else imu
-    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=imu)
+    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=imu, part=course.part)

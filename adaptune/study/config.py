@@ -1,30 +1,35 @@
 """The configuration of a study: the settings that both stages share."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Limits
 from adaptune.sequence.config import SequenceConfig, ViewConfig
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
+from adaptune.strict import StrictModel
 
 if TYPE_CHECKING:
     from adaptune.study.mistakes import Mistake
 
-Name = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
+
+def _file_name(name: str) -> str:
+    if not re.fullmatch(r"\w[\w.-]*", name) or len(name.encode()) > 100:
+        raise ValueError(
+            "becomes the name of a file: give letters, digits, _ . and - (not first), 100 at most"
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(_file_name)]
 """Becomes the name of a file."""
 
 
-class StudySection(BaseModel):
-    """A section of a study's YAML."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class OdometryConfig(StudySection):
+class OdometryConfig(StrictModel):
     """The odometry, its settings, and the ranges of the parameters that are tuned.
 
     Without `parameters`, all parameters are tuned in their usual ranges. Otherwise those that it
@@ -32,7 +37,7 @@ class OdometryConfig(StudySection):
     """
 
     name: str
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
     parameters: Annotated[dict[str, dict[str, Any]], Field(min_length=1)] | None = None
 
 
@@ -46,7 +51,7 @@ def _known_descriptor(name: str) -> str:
     return name
 
 
-class DescriptorConfig(StudySection):
+class DescriptorConfig(StrictModel):
     """How scans are described.
 
     Descriptors are averaged over `window` seconds; with 0, only the newest scan counts.
@@ -55,7 +60,7 @@ class DescriptorConfig(StudySection):
     names: Annotated[
         tuple[Annotated[str, AfterValidator(_known_descriptor)], ...], Field(min_length=1)
     ] = ("ndt",)
-    window: float = Field(3.0, ge=0, allow_inf_nan=False)
+    window: float = Field(3.0, ge=0, le=3600)
 
     @field_validator("names")
     @classmethod
@@ -78,7 +83,7 @@ def _catches_up(scans: int) -> int:
     return scans
 
 
-class SwitchingConfig(StudySection):
+class SwitchingConfig(StrictModel):
     """How the odometry changes its parameters during a replay.
 
     `live`: it changes them between scans. `hand_over`: a new instance takes over. `bank`: several
@@ -88,40 +93,40 @@ class SwitchingConfig(StudySection):
     """
 
     mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"
-    warm_up: float | None = Field(None, gt=0, allow_inf_nan=False)
-    full_rate: float | None = Field(None, ge=0, allow_inf_nan=False)
-    stride: int | None = Field(None, ge=1)
-    catch_up_scans: Annotated[int, Field(ge=0), AfterValidator(_catches_up)] = 0
+    warm_up: float | None = Field(None, gt=0, le=3600)
+    full_rate: float | None = Field(None, ge=0, le=3600)
+    stride: int | None = Field(None, ge=1, le=10_000)
+    catch_up_scans: Annotated[int, Field(ge=0, le=10_000), AfterValidator(_catches_up)] = 0
     size: int = Field(4, ge=2, le=6)
     sets: Annotated[
-        tuple[Annotated[int, Field(ge=0)] | dict[str, Value], ...] | None,
+        tuple[Annotated[int, Field(ge=0, le=10**9)] | dict[str, Value], ...] | None,
         Field(min_length=2, max_length=6),
     ] = None
-    cores: int | None = Field(None, ge=1)
-    memory: float = Field(16.0, gt=0, allow_inf_nan=False)
+    cores: int | None = Field(None, ge=1, le=10_000)
+    memory: float = Field(16.0, gt=0, le=1e6)
 
 
-class OnlineConfig(StudySection):
+class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, and switching."""
 
-    period: float = Field(1.0, gt=0, allow_inf_nan=False)
+    period: float = Field(1.0, ge=0.01, le=3600)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
     switching: SwitchingConfig = SwitchingConfig()
 
 
-class StudyConfig(StudySection):
+class StudyConfig(StrictModel):
     """The YAML of a study without the settings that only one stage uses.
 
     ``docs/reference-study.md`` describes every key.
     """
 
     odometry: OdometryConfig
-    sequences: dict[Name, SequenceConfig] = {}
-    courses: dict[Name, Course] = {}
+    sequences: dict[Name, SequenceConfig] = Field(default_factory=dict)
+    courses: dict[Name, Course] = Field(default_factory=dict)
     training: tuple[str, ...] = Field(min_length=1)
     test: tuple[str, ...] = ()
-    sub_trajectory: float = Field(25.0, gt=0, allow_inf_nan=False)
-    lost_track: float = Field(3.0, gt=0, allow_inf_nan=False)
+    sub_trajectory: float = Field(25.0, ge=0.01, le=1e6)
+    lost_track: float = Field(3.0, gt=0, le=1e6)
     health: HealthCheck = HealthCheck()
     isolation: Limits = Limits()
     descriptor: DescriptorConfig = DescriptorConfig()

@@ -1,23 +1,27 @@
 """Reading a study: its YAML, the overrides, and all mistakes with their lines."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
-
 from adaptune import yaml
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Description, Odometry, OdometryError
+from adaptune.odometry.base import Description, OdometryError
 from adaptune.odometry.command import Command
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.declaration import declare
+from adaptune.odometry.registry import is_user_class, where
+from adaptune.plain_words import Key
+from adaptune.sequence.cache import cap
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
-from adaptune.study.mistakes import ConfigurationError, Key, Mistake, validated
+from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
 from adaptune.study.overlaps import overlaps
+from adaptune.study.roles import settle_roles
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
+
+_MOST_BYTES = 10**6
 
 C = TypeVar("C", bound=StudyConfig)
 
@@ -55,6 +59,7 @@ def read_study(
     ConfigurationError
         It lists all mistakes, each with its line, its key and what to do.
     """
+    cap()  # a wrong variable is no mistake of the study
     document = _read(path)
     data: Any = document.data
     overridden = [_override(data, text) for text in overrides]
@@ -68,6 +73,8 @@ def read_study(
 
 def _read(path: Path) -> yaml.Document:
     try:
+        if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
+            raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
         document = yaml.Document(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigurationError(f"{path}: there is no such file") from error
@@ -87,7 +94,9 @@ def _override(data: dict[str, Any], text: str) -> Key:
         raise ConfigurationError(f"-o {text}: give a key and a value, as in -o offline.trials=32")
     *parents, last = path = tuple(dotted.split("."))
     for part in parents:
-        data = data.setdefault(part, {})
+        if data.get(part) is None:
+            data[part] = {}
+        data = data[part]
         if not isinstance(data, dict):
             raise ConfigurationError(f"-o {text}: {part} has no keys below it")
     try:
@@ -123,19 +132,25 @@ def _check(
     mistakes: list[Mistake] = []
     if isinstance(odometry := data.get("odometry"), dict):
         _check_odometry(odometry, mistakes, folder)
-    sound = not mistakes
-    config = validated(config_type, data, (), mistakes, {"folder": folder})
+    origins, in_roles = settle_roles(data)
+    mistakes += in_roles
+    context = {"folder": folder}
+    config = validated(config_type, data, (), mistakes, context)
+    sound = all(mistake.key[:1] != ("odometry",) for mistake in mistakes)
+    if config is None:
+        needed = {"odometry": {"name": ""}, "training": [""]}
+        config = validated_rest(config_type, data, needed, mistakes, context)
     if config is not None:
         try:
-            described = describe_odometry(config.odometry)
-        except (OdometryError, ValidationError):
+            described = describe_odometry(config.odometry) if sound else None
+        except OdometryError:
             described = None
         if described is not None:
             mistakes += _check_imu(config, described)
             mistakes += _check_switching(config, described)
         space = tuned_space(config.odometry, described) if sound and described else None
         mistakes += config.mistakes(space)
-    sequences, courses = data.get("sequences") or {}, data.get("courses") or {}
+    sequences, courses = data.get("sequences", {}), data.get("courses", {})
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
         return None, mistakes
     mistakes += [
@@ -144,12 +159,19 @@ def _check(
         if name in courses
     ]
     for name, entry in sequences.items():
-        mistakes += _check_recording(name, entry, folder)
-    for role in ("training", "test"):
-        mistakes += _check_role(role, data, {*sequences, *courses})
+        if name not in origins:
+            mistakes += _check_recording(name, entry, folder)
     if config is not None and not mistakes:
         mistakes += overlaps(config)
-    return config, mistakes
+    return config, [_at_origin(mistake, origins) for mistake in mistakes]
+
+
+def _at_origin(mistake: Mistake, origins: Mapping[str, str]) -> Mistake:
+    """The mistake of a part of a sequence as that of the sequence."""
+    kind, *names = mistake.key or ("",)
+    if kind in ("sequences", "courses") and names and names[0] in origins:
+        return mistake._replace(key=(kind, origins[str(names[0])], *names[1:]))
+    return mistake
 
 
 def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
@@ -162,48 +184,32 @@ def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
             yield Mistake(("sequences", name), str(error))
 
 
-def _check_role(role: str, data: Mapping[str, Any], known: Collection[Any]) -> Iterable[Mistake]:
-    names, training = data.get(role), data.get("training")
-    if not isinstance(names, list):
-        return
-    for i, name in enumerate(names):
-        if not isinstance(name, str):
-            continue  # the models find it
-        if name not in known:
-            message = f"there is no sequence {name!r}: {nearest(name, map(str, known))}"
-            yield Mistake((role, i), message)
-        elif name in names[:i]:
-            yield Mistake((role, i), f"{name!r} is named twice")
-        elif role == "test" and isinstance(training, list) and name in training:
-            yield Mistake((role, i), f"{name!r} is a training sequence, and proves nothing here")
-
-
 def _check_odometry(data: dict[str, Any], mistakes: list[Mistake], folder: Path) -> None:
     """Check all that depends on the odometry; make paths in its settings absolute."""
     name = data.get("name")
     if not isinstance(name, str):
         return
+    settings, key = data.get("settings") or {}, ("odometry", "settings")
+    if not isinstance(settings, dict):
+        return
     try:
-        odometry = odometry_class(name)
+        where(name)
     except OdometryError as error:
         mistakes.append(Mistake(("odometry", "name"), str(error)))
         return
-    key = ("odometry", "settings")
-    settings = data.get("settings") or {}
-    if not isinstance(settings, dict):
-        return
-    found: Any = validated(odometry.settings_type, settings, key, mistakes, {"folder": folder})
-    if found is not None:
-        data["settings"] = found.model_dump(mode="json", exclude_unset=True)
-    elif not issubclass(odometry, Odometry):
-        return
     try:
-        space = odometry.describe(found).space
-        _check_parameters(name, space, data.get("parameters"), mistakes)
-        if issubclass(odometry, Command) and isinstance(tuned := data.get("parameters"), dict):
-            odometry.check(found, dict.fromkeys(tuned, 0))
+        declared = declare(name, settings, folder)
+        mistakes += (mistake.below(key) for mistake in declared.mistakes)
+        if declared.settings is not None:
+            data["settings"] = declared.settings.model_dump(mode="json", exclude_unset=True)
+        if (described := declared.description) is None:
+            return
+        _check_parameters(name, described.space, data.get("parameters"), mistakes)
+        if name == "command" and isinstance(tuned := data.get("parameters"), dict):
+            Command.check(declared.settings, dict.fromkeys(tuned, 0))
     except OdometryError as error:
-        mistakes.append(Mistake(key, str(error)))
+        at = ("odometry", "name") if is_user_class(name) else key
+        mistakes.append(Mistake(at, str(error)))
 
 
 def _check_parameters(
@@ -219,7 +225,7 @@ def _check_parameters(
             mistakes.append(Mistake(key, f"{name} has no parameter {parameter!r}: {help_}"))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
-            if whole.get("type") not in _KINDS:
+            if str(whole.get("type")) not in _KINDS:
                 mistakes.append(Mistake(key, f"give its type, one of {', '.join(_KINDS)}"))
             else:
                 validated(_KINDS[whole["type"]], whole, key, mistakes)

@@ -1,18 +1,15 @@
 """Mistakes in a study's YAML, each with the path of its key."""
 
-import json
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from adaptune.errors import AdaptuneError
+from adaptune.plain_words import UNKNOWN, Key, plain_words
 from adaptune.space import nearest
-
-Key = tuple[str | int, ...]
-"""Keys and indices that lead to a value."""
 
 RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
 """Keys of earlier versions, and their present names."""
@@ -46,31 +43,49 @@ def validated(
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
-        found: dict[Key, Mistake] = {}
-        for detail in error.errors(include_url=False):
-            # Where several types are allowed, pydantic names each of them in the path.
-            types_ = [part for part in detail["loc"] if isinstance(part, str) and "[" in part]
-            path = tuple(part for part in detail["loc"] if part not in types_)
-            if not (types_ and path in found):
-                found[path] = Mistake(key + path, _message(model, path, key, detail))
-                mistakes.append(found[path])
+        for path, message in plain_words(error, data).items():
+            said = _unknown(model, path, key) if message == UNKNOWN else message
+            mistakes.append(Mistake(key + path, said))
         return None
 
 
-def _message(model: type[BaseModel], path: Key, key: Key, detail: Any) -> str:
-    message = str(detail["msg"]).removeprefix("Value error, ")
-    given = json.dumps(detail["input"], default=str)
-    if detail["type"] == "extra_forbidden":
-        if new := RENAMED.get(".".join(map(str, key + path))):
-            return f"is now called {new}"
-        return f"unknown key; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
-    if detail["type"] == "missing":
-        return "this key is missing"
-    if detail["type"] == "tuple_type":
-        return f"give a list, not {given}"
-    if isinstance(detail["input"], dict | list) or detail["type"] == "value_error":
-        return message
-    return f"{message}, not {given}"
+def validated_rest(
+    model: type[M],
+    data: dict[str, Any],
+    needed: dict[str, Any],
+    mistakes: Iterable[Mistake],
+    context: dict[str, Any],
+) -> M | None:
+    """Validate what is left of a section without its mistakes, with `needed` where it lacks keys.
+
+    What is not mistaken by itself may still not go together. None if nothing can be left.
+    """
+    keys, given = [mistake.key for mistake in mistakes], data
+    while (rest := needed | _without(data, keys)) != given:
+        found: list[Mistake] = []
+        if (valid := validated(model, rest, (), found, context)) is not None:
+            return valid
+        given = rest
+        keys += [mistake.key for mistake in found]
+    return None
+
+
+def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:
+    """Leave out what the keys lead to; where there is no such key, the section that lacks it."""
+    rest = {}
+    for name, value in data.items():
+        below = [key[1:] for key in keys if key[:1] == (name,)]
+        if not below:
+            rest[name] = value
+        elif isinstance(value, dict) and all(key and key[0] in value for key in below):
+            rest[name] = _without(value, below)
+    return rest
+
+
+def _unknown(model: type[BaseModel], path: Key, key: Key) -> str:
+    if new := RENAMED.get(".".join(map(str, key + path))):
+        return f"is now called {new}"
+    return f"{UNKNOWN}; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
 
 
 def _keys(annotation: Any, path: Sequence[str | int]) -> list[str]:

@@ -37,8 +37,8 @@ class StudySequences:
     layout: Layout = "bag"  # the format that a program reads
 
     def recording(self, course: str) -> Path:
-        """The bag of a simulated course."""
-        return self.folder / "recordings" / f"{course}.bag"
+        """The bag of a simulated course; the parts of a course share it."""
+        return self.folder / "recordings" / f"{self.courses[course].of or course}.bag"
 
     def config(self, name: str) -> SequenceConfig:
         """Configuration of a sequence, a course, or a view."""

@@ -14,8 +14,8 @@ from typing_extensions import TypeVar
 from adaptune.cores import available
 from adaptune.odometry.base import Description, WarmUp
 from adaptune.odometry.content import odometry_content
+from adaptune.odometry.declaration import declare
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.registry import odometry_class
 from adaptune.sequence.names import OF_VIEW
 from adaptune.space import ParameterSpace
 from adaptune.study.config import OdometryConfig, StudyConfig
@@ -188,12 +188,12 @@ class Study(Generic[C_co]):
 
 def odometry_settings(config: OdometryConfig) -> Any:
     """Settings of the odometry."""
-    return odometry_class(config.name).settings_type.model_validate(config.settings)
+    return declare(config.name, config.settings).sound(config.name)[0]
 
 
 def describe_odometry(config: OdometryConfig) -> Description:
     """Description of the odometry with its settings."""
-    return odometry_class(config.name).describe(odometry_settings(config))
+    return declare(config.name, config.settings).sound(config.name)[1]
 
 
 def tuned_space(config: OdometryConfig, described: Description) -> ParameterSpace:

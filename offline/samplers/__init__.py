@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from adaptune.space import ParameterSpace
+from offline.samplers.settings import is_user_sampler
 
 if TYPE_CHECKING:
     from offline.config import OfflineConfig
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
 def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
     """Make the sampler that a configuration names."""
     from offline.samplers.asked import AskedSampler
+    from offline.samplers.hosted import HostedSampler
     from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
 
     own: dict[str, type[Sampler]] = {
@@ -19,4 +21,5 @@ def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
         "random": RandomSampler,
         "sobol": SobolSampler,
     }
-    return own.get(config.sampler, AskedSampler)(space, config)
+    other = HostedSampler if is_user_sampler(config.sampler) else AskedSampler
+    return own.get(config.sampler, other)(space, config)

@@ -1,5 +1,6 @@
 """Optuna's samplers, through its ask-and-tell interface."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from offline.objective import SamplerResult
 from offline.samplers.annealing import AnnealingSampler
 from offline.samplers.base import Sampler, Tried, key
 from offline.samplers.points import sobol_points
-from offline.samplers.settings import AnnealingSettings, optuna_sampler
+from offline.samplers.settings import AnnealingSettings, SamplerError, optuna_sampler
 from offline.storage import distribution
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -27,6 +28,8 @@ CONSTRAINED = (
 FORGETFUL = ("tpe", "gp")
 """Samplers that keep no notes: they continue from any list of trials."""
 _ATTEMPTS = 32
+_ROUNDED = 1e-6
+"""By how much a proposal may exceed its range."""
 
 
 class AskedSampler(Sampler):
@@ -175,9 +178,12 @@ class AskedSampler(Sampler):
             value = params[name]
             if isinstance(p, Categorical):
                 decoded[name] = p.choices[value]
-            else:
-                value = min(max(value, p.low), p.high)
-                decoded[name] = float(value) if isinstance(p, Float) else int(value)
+                continue
+            inside = min(max(value, p.low), p.high)
+            if not math.isclose(value, inside, rel_tol=_ROUNDED, abs_tol=_ROUNDED):
+                what = f"{self.config.sampler} proposed {value!r} for {name}"
+                raise SamplerError(f"{what}, which is not between {p.low:g} and {p.high:g}")
+            decoded[name] = float(inside) if isinstance(p, Float) else int(inside)
         return decoded
 
 

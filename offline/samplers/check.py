@@ -3,54 +3,87 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from adaptune import hosting
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.mistakes import Mistake
 from offline.samplers.grid import check_grid
 from offline.samplers.settings import (
+    SERVICE,
+    SETTINGS,
     AnnealingSettings,
     RandomSettings,
     SamplerError,
     Step,
+    is_user_sampler,
+    optuna_class,
     optuna_sampler,
 )
 
 _ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
+_MOST = 100_000
+"""Candidates, or members of a population: more of them take hours, or all memory."""
+
+
+def check_class(name: str) -> None:
+    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere.
+
+    Raises
+    ------
+    SamplerError
+    """
+    if not is_user_sampler(name):
+        optuna_class(name)
+        return
+    try:
+        hosting.server(SERVICE, name)
+    except hosting.HostError as error:
+        raise SamplerError(str(error)) from error
 
 
 def check_sampler(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace, budgeted: bool
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
 ) -> Iterable[Mistake]:
-    """Find mistakes in a sampler's settings.
+    """Find mistakes in a sampler's settings, where `space` is None without the parameters.
 
     Yields
     ------
     Mistake
         Its key begins below the settings.
     """
-    if name == "annealing":
+    if name == "tpe" and not settings:
+        return  # a look at Optuna would take long
+    if name not in SETTINGS:
+        yield from _check_optuna(name, settings, space)
+    elif space is None:
+        return
+    elif name == "annealing":
         for parameter, step in AnnealingSettings.model_validate(settings).steps.items():
             yield from _check_step(parameter, step, space)
     elif name in ("grid", "random"):
         axes = RandomSettings.model_validate(settings).grid
         if axes is not None:
             yield from check_grid(axes, space, bounded=budgeted or name == "random")
-    elif settings or name not in ("sobol", "tpe"):  # which need no look at Optuna
-        yield from _check_optuna(name, settings, space)
 
 
 def _check_optuna(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
 ) -> Iterable[Mistake]:
     if taken := next((key for key in _ELSEWHERE if key in settings), None):
         yield Mistake((taken,), f"is set by offline.{_ELSEWHERE[taken]}")
         return
+    for key, value in settings.items():
+        if isinstance(value, int) and abs(value) > _MOST:
+            yield Mistake((key,), f"give a number of at most {_MOST:,}, not {value}")
+            return
     try:
-        optuna_sampler(name, settings, 0)
+        make = _make_elsewhere if is_user_sampler(name) else optuna_sampler
+        make(name, settings, 0)
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
         yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
-    if name == "cmaes" and all(isinstance(p, Categorical) for p in space.parameters.values()):
+    parameters = () if space is None else space.parameters.values()
+    if name == "cmaes" and parameters and all(isinstance(p, Categorical) for p in parameters):
         yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
 
 
@@ -78,3 +111,21 @@ def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
         return ("change",)
     linear = isinstance(parameter, Integer) and not parameter.log
     return ("delta_max",) if linear else ("mu", "sigma")
+
+
+def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
+    """Try whether a sampler of the user takes its settings.
+
+    Raises
+    ------
+    SamplerError
+    """
+    seconds = hosting.IMPORT_SECONDS
+    bounds = hosting.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
+    process = hosting.Hosted(SERVICE, name, "make", bounds)
+    try:
+        process.ask({"settings": dict(settings), "seed": seed})
+    except hosting.HostError as error:
+        raise SamplerError(str(error)) from error
+    finally:
+        process.close()

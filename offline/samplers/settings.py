@@ -3,14 +3,15 @@
 import inspect
 import warnings
 from collections.abc import Mapping
-from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
+from adaptune import hosting, plugins
 from adaptune.errors import AdaptuneError
 from adaptune.space import Value, nearest
+from adaptune.strict import StrictModel
 
 OPTUNA = {
     "cmaes": "optuna.samplers:CmaEsSampler",
@@ -25,55 +26,58 @@ SINGLE = ("annealing", "cmaes")
 """Samplers that minimise one objective only."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
+SERVICE = hosting.Service("offline.samplers.hosted")
+"""What a server does with a sampler of the user."""
+
+
+def is_user_sampler(name: str) -> bool:
+    """Whether a sampler is a class that is neither adaptune's nor Optuna's."""
+    return ":" in name and name.partition(":")[0].partition(".")[0] != "optuna"
 
 
 class SamplerError(AdaptuneError):
     """A sampler that cannot be used."""
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Step(_Settings):
+class Step(StrictModel):
     """How far a step of annealing moves a parameter.
 
     ``docs/reference-offline.md`` describes the settings and their defaults.
     """
 
-    mu: float | None = Field(None, allow_inf_nan=False)
-    sigma: float | None = Field(None, ge=0, allow_inf_nan=False)
-    delta_max: int | None = Field(None, ge=0)
+    mu: float | None = None
+    sigma: float | None = Field(None, ge=0)
+    delta_max: int | None = Field(None, ge=0, le=2**53)
     change: float | None = Field(None, ge=0, le=1)
 
 
-class AnnealingSettings(_Settings):
+class AnnealingSettings(StrictModel):
     """Settings of simulated annealing, with the names they have in RUSTLE.
 
     ``docs/reference-offline.md`` describes them.
     """
 
-    initial_temperature: float = Field(0.1, gt=0, allow_inf_nan=False)
+    initial_temperature: float = Field(0.1, gt=0)
     alpha: float = Field(0.9, gt=0, le=1)
-    energy_scale: float | None = Field(None, gt=0, allow_inf_nan=False)
-    reanneal_fixed: int | None = Field(None, ge=1)
-    reanneal_accepted: int | None = Field(None, ge=1)
-    reanneal_best: int | None = Field(None, ge=1)
-    stall_accepted: int | None = Field(None, ge=1)
-    stall_best: int | None = Field(None, ge=1)
-    chains: int = Field(2, ge=1)
-    steps: dict[str, Step] = {}
+    energy_scale: float | None = Field(None, gt=0)
+    reanneal_fixed: int | None = Field(None, ge=1, le=10**9)
+    reanneal_accepted: int | None = Field(None, ge=1, le=10**9)
+    reanneal_best: int | None = Field(None, ge=1, le=10**9)
+    stall_accepted: int | None = Field(None, ge=1, le=10**9)
+    stall_best: int | None = Field(None, ge=1, le=10**9)
+    chains: int = Field(2, ge=1, le=1000)
+    steps: dict[str, Step] = Field(default_factory=dict)
 
 
-class Span(_Settings):
+class Span(StrictModel):
     """`count` values from `low` to `high`, evenly in ratio where the parameter's scale is log."""
 
-    low: float = Field(allow_inf_nan=False)
-    high: float = Field(allow_inf_nan=False)
-    count: int = Field(ge=1)
+    low: float
+    high: float
+    count: int = Field(ge=1, le=10**6)
 
 
-class GridSettings(_Settings):
+class GridSettings(StrictModel):
     """Settings of `grid`."""
 
     # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
@@ -81,7 +85,7 @@ class GridSettings(_Settings):
     grid: dict[str, Span | tuple[Value, ...]]
 
 
-class RandomSettings(_Settings):
+class RandomSettings(StrictModel):
     """Settings of `random`: with a grid, it draws the grid's points without repetition."""
 
     grid: dict[str, Span | tuple[Value, ...]] | None = None
@@ -99,24 +103,18 @@ def optuna_class(name: str) -> type[Any]:
         raise SamplerError(
             f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
         )
-    path = OPTUNA.get(name, name)
-    if ":" not in path:
+    if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
             f"package.module:Class)"
         )
     from optuna.samplers import BaseSampler
 
-    module, _, attribute = path.partition(":")
     try:
-        found = getattr(import_module(module), attribute)
-    except (ImportError, ValueError) as error:
-        raise SamplerError(
-            f"{name}: cannot import {module} ({error}); install it, or name its folder in "
-            f"PYTHONPATH"
-        ) from error
-    except AttributeError as error:
-        raise SamplerError(f"{name}: {module} has no {attribute or 'class'}") from error
+        path = plugins.path_of(name, "sampler", OPTUNA, "", "Class")
+        found = plugins.load(name, path, "class")
+    except plugins.PluginError as error:
+        raise SamplerError(str(error)) from error
     if not (isinstance(found, type) and issubclass(found, BaseSampler)):
         raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
     return found
@@ -149,6 +147,6 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
     "random": RandomSettings,
-    "sobol": type("SobolSettings", (_Settings,), {"__doc__": "`sobol` has no settings."}),
+    "sobol": type("SobolSettings", (StrictModel,), {"__doc__": "`sobol` has no settings."}),
 }
 """Settings of adaptune's own samplers."""

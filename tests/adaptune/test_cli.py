@@ -1,9 +1,14 @@
 import os
+import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
 
+import drives
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -23,19 +28,100 @@ def adaptune(*arguments, cwd):
     )
 
 
+def next_words(done):
+    """The words of the command that is named as the next one, which is said last."""
+    *_, last = done.stdout.splitlines()
+    match = re.fullmatch(r"Next: (?:.*; then )?adaptune (.*?)    # .*", last)
+    assert match, last
+    return shlex.split(match[1])
+
+
+def test_one_bag_is_enough_and_every_command_names_the_next(study_file, tmp_path):
+    (tmp_path / "one.bag").symlink_to(study_file.parent / "one.bag")
+    done = adaptune("inspect", "one.bag", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    words = [*next_words(done), "-o", "offline.trials=4", "--folder", "my study[v2]"]
+    for command in ("offline", "online", "compare"):
+        assert words[0] == command
+        done = adaptune(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        words = next_words(done)
+        assert words[1:] == ["one.yaml", "--folder", "my study[v2]", "-o", "offline.trials=4"]
+        lines = [line for line in done.stdout.splitlines() if line.strip()]
+        assert len(set(lines)) == len(lines)
+    assert "one_60-100" in done.stdout
+    assert "name 6 training sequences or more, the study has 1; then" in done.stdout
+    assert (tmp_path / "my study[v2]/comparison/one_60-100.png").exists()
+
+
+def test_inspect_says_what_to_do_without_a_reference(tmp_path):
+    for i, (_, points, _) in enumerate(drives.scans(n_scans=3)):
+        np.save(tmp_path / f"{i}.npy", points)
+    done = CliRunner().invoke(app, ["inspect", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "can only be a `test` sequence" in done.stdout.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("command", "following"),
+    [
+        (["trials"], "offline"),
+        (["validate"], "online"),
+        (["switching", "--seconds", "10"], "online"),
+        (["model", "show", "MODEL"], "online"),
+        (["cache"], "cache"),
+    ],
+)
+def test_other_commands_name_the_next_too(study_file, trained_folder, tmp_path, command, following):
+    folder = tmp_path / "run"
+    shutil.copytree(trained_folder, folder)
+    if "MODEL" in command:
+        words = [*command[:-1], folder / "model.safetensors"]
+    elif command == ["cache"]:
+        words = command
+    else:
+        words = [*command, study_file, "--folder", folder]
+    done = adaptune(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert next_words(done)[0] == following
+    csv = adaptune("trials", study_file, "--folder", folder, "--csv", cwd=tmp_path)
+    assert "Next" not in csv.stdout
+
+
+def test_parts_of_a_course_are_recorded_once(study_file, tmp_path):
+    course = "courses={cave: {scenes: [cave], length: 10, seed: 1, columns: 64}}"
+    roles = ["training=[cave: 0-50%]", "test=[cave: 50-100%]"]
+    overrides = [word for text in (course, *roles) for word in ("-o", text)]
+    words = ("simulate", study_file, "--folder", "run", *overrides)
+    done = adaptune(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Recorded 1 of 1 courses" in done.stdout
+    assert [path.name for path in (tmp_path / "run/recordings").glob("*.bag")] == ["cave.bag"]
+    assert "Recorded 0 of 1" in adaptune(*words, cwd=tmp_path).stdout
+
+
 def test_the_whole_way(study_file, tmp_path):
     done = adaptune("offline", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "Fixed: max_correspondence_distance" in done.stdout
+    assert re.search(
+        r"^Fixed: \d.* % against the baseline's \d.* \(2 sequences\)", done.stdout, re.MULTILINE
+    )
+    assert "Parameters of the fixed set: max_correspondence_distance" in done.stdout
+    assert next_words(done)[:2] == ["validate", str(study_file)]
     done = adaptune("online", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "4 replays made" in done.stdout
+    assert next_words(done)[:2] == ["compare", str(study_file)]
     done = adaptune("compare", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for mode in ("baseline", "fixed", "paired", "paper"):
         assert mode in done.stdout
-    assert max(map(len, done.stdout.splitlines())) <= 80
-    assert (tmp_path / "runs/small/comparison/three.png").exists()
+    assert all(name in done.stdout for name in ("APE [m]", "RPE [m]", "KITTI [%]", "[deg/100 m]"))
+    table, *_ = done.stdout.partition("Tables and pictures")
+    assert max(map(len, table.splitlines())) <= 80
+    assert (tmp_path / "runs/small/comparison/three.svg").exists()
 
 
 @pytest.mark.parametrize(
@@ -43,7 +129,7 @@ def test_the_whole_way(study_file, tmp_path):
     [
         (["offline", "none.yaml"], "none.yaml: there is no such file"),
         (["offline", "STUDY", "-o", "offline.sampler=best"], "offline.sampler"),
-        (["simulate", "STUDY"], "there is none to simulate"),
+        (["simulate", "STUDY"], "there is none to simulate; add one"),
         (["online", "STUDY"], "model.safetensors: there is no such model"),
         (["compare", "STUDY"], "run `adaptune online`"),
         (["online", "STUDY", "--model", "STUDY"], "is not an error model, or damaged"),

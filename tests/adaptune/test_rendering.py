@@ -2,10 +2,10 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from small_bag import drive
+from small_bag import START, cloud, drive, write
 
 from adaptune.inspect import inspect
-from adaptune.rendering import render_cache, write_inspection_png
+from adaptune.rendering import draw_inspection, render_cache
 from adaptune.sequence import SequenceConfig
 from adaptune.sequence.opening import open_sequence
 
@@ -16,9 +16,18 @@ def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_picture_is_one(tmp_path: Path) -> None:
-    write_inspection_png(inspect(drive(tmp_path / "a.bag", [0, 0.1], [])), tmp_path / "a.png")
+    bag = write(tmp_path / "a.bag", [("/points", START, cloud(START, 5000))])
+    inspection = inspect(bag)
+    for name in ("a.png", "a.svg"):
+        draw_inspection(inspection, tmp_path / name)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag", ".png"]
+    drawn = (tmp_path / "a.svg").read_text()
+    assert "<svg" in drawn
+    # A path for each point would make files of many megabytes.
+    assert drawn.count("<use") < 1000
+    for words in ("x (m)", "y (m)", "z (m)", "height z (m)", "LiDAR"):
+        assert f"<!-- {words} -->" in drawn
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag", ".png", ".svg"]
 
 
 def test_the_cache_is_listed(tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ def test_contains(parameter, good, bad):
         ({"type": "float", "low": 3, "high": 2, "baseline": 2}, "must be less than"),
         ({"type": "integer", "low": 3, "high": 3, "baseline": 3}, "must be less than"),
         ({"type": "float", "low": 1, "high": 2, "baseline": 2.5}, "must lie between"),
-        ({"type": "float", "low": 1, "high": 2, "baseline": math.nan}, "must lie between"),
+        ({"type": "float", "low": 1, "high": 2, "baseline": math.nan}, "finite"),
         ({"type": "integer", "low": 1, "high": 2, "baseline": 0}, "must lie between"),
         ({"type": "float", "low": 0, "high": 2, "baseline": 1, "log": True}, "above 0"),
         ({"type": "integer", "low": 0, "high": 2, "baseline": 1, "log": True}, "above 0"),

@@ -98,7 +98,7 @@ def test_reads_a_study(study_file, tmp_path):
             "odometry.parameters.keyframe_interval.low=0",
             ["keyframe_interval", "log scale needs low (0) above 0"],
         ),
-        ("sub_trajectory=none", ["sub_trajectory", '"none"']),
+        ("sub_trajectory=none", ["sub_trajectory: give a number, not 'none'"]),
         ("sub_trajectories=1", ["sub_trajectories: unknown key", "'sub_trajectory'"]),
         ("offline.sampler=tpee", ["offline.sampler", "'tpe'"]),
         ("offline.sampler=math:sin", ["offline.sampler", "not a class derived from optuna"]),
@@ -179,7 +179,11 @@ GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
     ("offline", "line", "words"),
     [
         (ANNEALING + "steps:\n  {keyframe: {mu: 1}}}}", 15, "did you mean 'keyframe_interval'?"),
-        (ANNEALING + "steps: {keyframe_interval:\n  {sigma: -1}}}}", 15, "sigma: Input should be"),
+        (
+            ANNEALING + "steps: {keyframe_interval:\n  {sigma: -1}}}}",
+            15,
+            "sigma: give a number of at least 0, not -1",
+        ),
         (
             ANNEALING + "steps: {\n keyframe_interval: {mu: 0, sigma: 0}}}}",
             15,
@@ -316,3 +320,9 @@ def test_folder_goes_on_only_with_the_same_study(study_file, tmp_path):
         other.open()
     # A test sequence may change: only replays depend on it, and they know what they are made of.
     load_study(study_file, ["sequences.three.stop=3"], folder).open()
+
+
+def test_an_empty_section_can_be_overridden(study_file):
+    file = study_file.with_name("empty.yaml")
+    file.write_text(study_file.read_text() + "health:\n")
+    assert load_study(file, ["health.max_speed=7"]).config.health.max_speed == 7

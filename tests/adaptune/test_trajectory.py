@@ -97,11 +97,15 @@ TUM_LINE = "1.5 0 0 0 0 0 0 1\n"
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.tum", "", "holds no pose"),
-        ("a.tum", "# only a comment\n\n", "holds no pose"),
+        ("a.tum", "", "holds no pose; give a file of"),
+        ("a.tum", "# only a comment\n\n", "holds no pose; give a file of"),
         ("a.tum", "1.5 0 0\n", "line 1: a TUM line has 8 numbers, this has 3"),
         ("a.tum", TUM_LINE + "2 0 0 0 0 0 0 x\n", "line 2: could not convert"),
-        ("a.tum", TUM_LINE + "2 0 nan 0 0 0 0 1\n", "line 2: a number is not finite"),
+        (
+            "a.tum",
+            TUM_LINE + "2 0 nan 0 0 0 0 1\n",
+            "line 2: a number is not finite; remove the line",
+        ),
         ("a.tum", "now 0 0 0 0 0 0 1\n", "line 1: 'now' is not a time"),
         ("a.tum", TUM_LINE + TUM_LINE, "line 2: its stamp does not come after"),
         ("a.tum", "2 0 0 0 0 0 0 1\n" + TUM_LINE, "line 2: its stamp does not come after"),

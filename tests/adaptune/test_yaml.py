@@ -12,7 +12,7 @@ from adaptune.yaml import Document, YamlError, dump, scalar
 modest = settings(max_examples=80, deadline=None)
 
 # PyYAML writes YAML 1.1's rarer line breaks so that they are read as plain ones.
-words = st.text(st.characters(exclude_characters="\x85\u2028\u2029"), max_size=30)
+words = st.text(st.characters(exclude_characters="\0\x85\u2028\u2029"), max_size=30)
 scalars = (
     st.none()
     | st.booleans()
@@ -82,6 +82,16 @@ def test_keys_are_read_as_values_are():
     assert Document("on: 1\n010: 2\n1e3: 3\n").data == {"on": 1, 10: 2, 1000.0: 3}
 
 
+# Ten lines of aliases, which stand for ten to the tenth values.
+LAUGHS = "a0: &a0 [x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 11)
+)
+
+
+def test_aliases_are_read():
+    assert Document("a: &a {b: [1, 2]}\nc: [*a, *a]\n").data["c"] == [{"b": [1, 2]}] * 2
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -98,9 +108,17 @@ def test_keys_are_read_as_values_are():
         ("a: !thing 1\n", "line 1: .*!thing"),
         ("a: !!python/object/apply:os.getpid []\n", "line 1: "),
         ("a: 1\n---\nb: 1\n", "line 2: "),
-        ("[" * 5000, "recursion"),
-        ("a: " + "9" * 5000, "5000 digits"),
-        ("a: !!int many", "'many'"),
+        ("[" * 5000, "nested too deeply"),
+        ("b: 1\na: " + "9" * 5000, "line 2: a number of 5,000 digits"),
+        ("a: !!int many", "a tag .* does not fit its value"),
+        ("a: !!binary aaaa\n", "line 1: .*binary"),
+        ("a: !!timestamp 2001-01-01\n", "line 1: .*timestamp"),
+        ("a: !!set {b}\n", "line 1: .*set"),
+        ('b: 1\na: "\\0"\n', "line 2: a text holds a null character"),
+        ('a: "\\ud800"\n', "line 1: a text holds a null character or half of one"),
+        ("a: &a [*a]\n", "an alias of itself"),
+        ("a: &a {b: {c: *a}}\n", "an alias of itself"),
+        (LAUGHS, "more than 100,000 values"),
     ],
 )
 def test_mistakes_are_told_with_their_line(text, message):

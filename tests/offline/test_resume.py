@@ -192,7 +192,9 @@ def test_a_recording_of_empty_clouds_is_refused(tmp_path):
     empty = [(stamp, points[:3], T) for stamp, points, T in drives.scans(0, 20)]
     (tmp_path / "two.bag").unlink()
     drives.write_bag(tmp_path / "two.bag", empty)
-    with pytest.raises(AdaptuneError, match=r"two: none of its 20 scans has 20 points"):
+    with pytest.raises(
+        AdaptuneError, match=r"two: none of its 20 scans has 20 points; check `points`"
+    ):
         train(load_study(tmp_path / "small.yaml", [], tmp_path / "other"))
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import drives
 import numpy as np
 import pytest
+from pictures import texts
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
@@ -17,7 +18,7 @@ from offline.offline_study import load_study
 from online.comparison import compare
 from online.modes import ModeError, ReplaySetup
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
-from online.stored_replays import StoredReplayError
+from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
 
@@ -54,7 +55,16 @@ def test_rows_and_files(replayed):
     with (folder / "comparison.csv").open() as file:
         assert [row["mode"] for row in csv.DictReader(file)] == MODES
     assert json.loads((folder / "comparison.json").read_text())[1]["vs fixed"] == 1.0
-    assert (folder / "three.png").read_bytes().startswith(b"\x89PNG")
+    said = texts(folder / "three.png")
+    assert {"from above", "RTE over the next 3 m [%]", "time [s]", "reference"} <= set(said)
+    assert "restarted by the health check" not in said
+    # 12 m are too short for KITTI's error.
+    for row, written in zip(
+        rows, json.loads((folder / "comparison.json").read_text()), strict=True
+    ):
+        assert 0.0 < row.standard.rpe < row.standard.ape * 10
+        assert (written["ape_m"], written["rpe_m"]) == (row.standard.ape, row.standard.rpe)
+        assert (written["kitti_percent"], written["kitti_lengths_m"]) == (None, "")
 
 
 def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(replayed):
@@ -70,6 +80,15 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
         for row in rows:
             chosen = model.sets[int(row["trial"])]
             assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
+
+
+def test_values_that_stay_read_as_those_that_change(own):
+    path = own.folder / "replays/three/fixed/replay.json"
+    about = json.loads(path.read_text())
+    about["about"]["parameters"] = {"mode": True, "size": 3, "kernel": "none"}
+    path.write_text(json.dumps(about))
+    choices = StoredReplay.read(path.parent).choices
+    assert choices == {"mode": ["True"], "size": [3.0], "kernel": ["none"]}
 
 
 def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
@@ -131,6 +150,8 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     with (folder / "paper/selections.csv").open() as file:
         assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.bank)
     assert next(row.rte for row in compare(study) if row.mode == "paired") < 3.0
+    said = set(texts(study.folder / "comparison/three.png"))
+    assert {f"trial {n}" for n in model.bank} | {"weight [%]"} <= said
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
         ReplaySetup.of(more).members(replace(model, bank=model.bank[:3]))
@@ -208,6 +229,7 @@ def test_rows_over_several_sequences(replayed, study_file, tmp_path):
     assert [row.sequence for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all 2"] * 4
     a, b, all_ = rows[3], rows[7], rows[11]
     assert all_.rte == pytest.approx((a.rte + b.rte) / 2)
+    assert all_.standard.ape == pytest.approx((a.standard.ape + b.standard.ape) / 2)
     assert all_.vs_fixed == pytest.approx((a.vs_fixed * b.vs_fixed) ** 0.5)
 
 
@@ -253,6 +275,9 @@ def read_tum_of(study, study_file):
         ("replay.json", "{}"),
         ("frames.csv", "a,b\n1,2\n"),
         ("selections.csv", "stamp_ns\nnone\n"),
+        ("selections.csv", "stamp_ns,weights\n1,0:a\n"),
+        ("selections.csv", "stamp_ns,weights\n1,0\n"),
+        ("selections.csv", "stamp_ns,weights\n1,0:0.5 1:0.5\n2,0:1\n"),
     ],
 )
 def test_a_damaged_replay_is_named(replayed, file, text):
@@ -260,8 +285,9 @@ def test_a_damaged_replay_is_named(replayed, file, text):
     before = path.read_text()
     path.write_text(text)
     try:
-        with pytest.raises(StoredReplayError, match=rf"{file}: is damaged .*--again"):
+        with pytest.raises(StoredReplayError, match=rf"{file}: is damaged .*--again") as caught:
             compare(replayed)
+        assert "https://" not in str(caught.value)
     finally:
         path.write_text(before)
 

@@ -198,7 +198,7 @@ def test_too_many_scans_that_do_not_register_restart(tmp_path):
 
 
 def test_no_scans():
-    with pytest.raises(AdaptuneError, match="no scan"):
+    with pytest.raises(AdaptuneError, match="no scan to replay; check start, stop and views"):
         replay([], InProcess(Scripted()), HEALTH)
 
 

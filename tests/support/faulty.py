@@ -22,6 +22,8 @@ FAULTS = (
     "mirrored",
     "shape",
 )
+ELSEWHERE = ("init", "prepare", "start", "nothing", "hangs in init")
+"""Faults that do not happen at the scan, and a registration that returns nothing."""
 n_instances = 0
 
 
@@ -41,12 +43,23 @@ class Faulty(Odometry):
         global n_instances  # noqa: PLW0603
         super().__init__(*args)
         n_instances += 1
+        self.raise_in("init")
+        if self.settings.fault == "hangs in init":
+            time.sleep(60)
+
+    def raise_in(self, where):
+        if self.settings.fault == where:
+            raise RuntimeError(f"no planes in {where}")
 
     def prepare(self, scan):
+        self.raise_in("prepare")
+        if self.settings.fault == "leaves":
+            os._exit(3)
         return scan
 
     def start(self, prepared, T_odom_sensor, T_previous_current=None):
         self.T, self.began_with = T_odom_sensor, (prepared, T_previous_current)
+        self.raise_in("start")
         if self.settings.fault == "never begins":
             os.abort()
 
@@ -57,6 +70,8 @@ class Faulty(Odometry):
         if prepared.stamp == self.settings.at:
             os.write(1, b"about to go wrong\n")
             self.go_wrong(T)
+        if self.settings.fault == "nothing":
+            return None
         if self.settings.fault == "shape":
             T = T[:3]
         return Registration(T, n_instances == 1)
@@ -81,3 +96,9 @@ class Faulty(Odometry):
                 T[:3, :3] *= 1.1
             case "mirrored":
                 T[2, 2] = -1.0
+
+
+class Clean(Faulty):
+    """Says that no scan ends its process."""
+
+    clean = True

@@ -1,14 +1,15 @@
-"""Damages messages and bags at random, and looks at what the readers make of them.
+"""Damages messages, bags and studies at random, and looks at what the readers make of them.
 
-    python tests/support/fuzz.py [--messages 8000] [--bags 2000] [--seed 0]
+    python tests/support/fuzz.py [--messages 8000] [--bags 2000] [--studies 4000] [--seed 0]
 
-Whatever is damaged must become scans that can be or an error that says so: no other exception, no
-crash, no more than a few seconds of the processor, no more than two gigabytes.
+Whatever is damaged must become scans or a study that can be, or an error that says so: no other
+exception, no crash, no more than a few seconds of the processor, no more than two gigabytes.
 """
 
 import argparse
 import contextlib
 import faulthandler
+import re
 import resource
 import signal
 import struct
@@ -17,17 +18,22 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import drives
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import get_types_from_msg
 
 from adaptune.errors import AdaptuneError
+from adaptune.inspect import inspect
+from adaptune.rendering import render_inspection
 from adaptune.sequence import Scan, SequenceConfig, livox, pointcloud2
 from adaptune.sequence.export import Messages
 from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.pointcloud2 import PointCloudError
 from adaptune.sequence.timing import AUTO
+from offline.offline_study import load_study
 
 SECONDS, BYTES = 10, 2 << 30
 START = 1_700_000_000_123_456_789
@@ -38,6 +44,21 @@ LAYOUTS = {
     "velodyne": [*((a, "<f4") for a in "xyz"), ("ring", "<u2"), ("time", "<f4")],
     "plain": [(a, "<f4") for a in "xyz"],
 }
+
+# What a value of a study is most wrong with; RAN is the path of a file that code would make.
+HOSTILE = (
+    *("true", "false", "", "null", "''", "0", "-1", ".nan", "-.inf", "1e300", "1e-300", "1e400"),
+    *("1" + "0" * 30, "1" + "0" * 400, "9" * 5000, "100000000", "abc", "1_0", "2001-01-01"),
+    *("[]", "{}", "[[]]", "[{}]", "{a: 1}", "[1, true]", "&a [*a]", "*a", "[", "{", "- a", "? x"),
+    *("~nobodyx/a.bag", "${NOPE}/a.bag", "/dev/zero", "..", "/", "'**/*'", "'['", "a" * 300),
+    *("x:y", "math:sin", "os:system", "ünicode", "'\u202e'", '"\\0"', '"\\ud800"', "'a b/[c]'"),
+    *("!!binary abc", "!!set {a}", "!!int x", "!!timestamp 2001-01-01", "!thing 3", "[" * 500),
+    "!!python/object/apply:os.mkdir [RAN]",
+    "!!python/object/new:os.system [mkdir RAN]",
+    "!!python/name:os.system",
+)
+KEYS = ("descriptor", "health", "online", "isolation", "courses", "lost_track", "<<", "a", "1")
+_VALUE = re.compile(r"(?<=[:\[,{] )[^\s,\[\]{}]+|(?<=[\[{])[^\s,\[\]{}:]+(?=[,\]])")
 
 Decode = Callable[[bytes], Scan]
 
@@ -156,7 +177,7 @@ def fuzz_messages(number: int, seed: int) -> Counter[str]:
     return counts
 
 
-def bags(folder: Path, scans: int = 4) -> list[Path]:
+def bags(folder: Path, scans: int = 16) -> list[Path]:
     """Bags of every format and compression; of ROS 2, the files themselves and their folders."""
     made = []
     rng = np.random.default_rng(0)
@@ -185,6 +206,50 @@ def bags(folder: Path, scans: int = 4) -> list[Path]:
     return made
 
 
+def fuzz_studies(number: int, seed: int, folder: Path) -> Counter[str]:
+    """Read so many damaged studies, and count what became of them."""
+    rng = np.random.default_rng(seed)
+    sound = drives.write_study(folder).read_text("utf-8")
+    ran, file = folder / "ran", folder / "damaged.yaml"
+    counts: Counter[str] = Counter()
+    for i in range(number):
+        text = sound
+        for _ in range(rng.integers(1, 4)):
+            text = _worse(text, rng).replace("RAN", str(ran))
+        file.write_text(text, "utf-8")
+        said = ""
+        with case(f"study {i} of seed {seed}:\n{text}"):
+            try:
+                load_study(file)
+            except AdaptuneError as error:
+                said = str(error)
+            assert not ran.exists()
+            assert not re.search("pydantic|Error:|Input should", said)
+        counts["errors" if said else "studies"] += 1
+    return counts
+
+
+def _worse(text: str, rng: np.random.Generator) -> str:
+    """Replace a value, give one more, or lose, repeat or damage a line."""
+    lines = text.splitlines(keepends=True)
+    at, hostile = int(rng.integers(len(lines))), str(rng.choice(HOSTILE))
+    match rng.choice(5, p=[0.6, 0.15, 0.08, 0.07, 0.1]):
+        case 0:
+            places = list(_VALUE.finditer(text))
+            if places:
+                place = places[int(rng.integers(len(places)))]
+                return f"{text[: place.start()]}{hostile}{text[place.end() :]}"
+        case 1:
+            lines.insert(at, f"{rng.choice(KEYS)}: {hostile}\n")
+        case 2:
+            del lines[at]
+        case 3:
+            lines.insert(at, lines[at])
+        case _:
+            lines[at] = damage(lines[at].encode(), rng).decode(errors="replace")
+    return "".join(lines) or text
+
+
 def _writer(path: Path, cdr: bool, option: Any) -> Any:
     if not cdr:
         writer = rosbag1.Writer(path)
@@ -199,8 +264,9 @@ def _writer(path: Path, cdr: bool, option: Any) -> Any:
     return folder
 
 
+@patch("adaptune.survey.SECONDS", 0.0)
 def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
-    """Read so many damaged bags, and count what became of them."""
+    """Read so many damaged bags, and count what became of them; inspect samples of half of them."""
     rng = np.random.default_rng(seed)
     sound = bags(folder)
     counts: Counter[str] = Counter()
@@ -226,6 +292,8 @@ def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
                     counts["scans"] += 1
                 except AdaptuneError:
                     counts["errors"] += 1
+                with contextlib.suppress(AdaptuneError):
+                    render_inspection(inspect(path, deep=i // len(sound) % 2 == 0))
         finally:
             hit.write_bytes(whole)
     return counts
@@ -260,12 +328,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--messages", type=int, default=8000)
     parser.add_argument("--bags", type=int, default=2000)
+    parser.add_argument("--studies", type=int, default=4000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     faulthandler.enable()
     print(f"messages: {dict(fuzz_messages(options.messages, options.seed))}", flush=True)  # noqa: T201
     with tempfile.TemporaryDirectory() as folder:
         print(f"bags: {dict(fuzz_bags(options.bags, options.seed, Path(folder)))}")  # noqa: T201
+    with tempfile.TemporaryDirectory() as folder:
+        studies = fuzz_studies(options.studies, options.seed, Path(folder))
+        print(f"studies: {dict(studies)}")  # noqa: T201
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"seed {options.seed}, peak memory {peak:.0f} MB")  # noqa: T201
     assert peak < BYTES >> 20

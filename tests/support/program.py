@@ -24,12 +24,28 @@ def main(source, topic, output, file, fault="none"):
         sys.exit(1)
     if fault == "abort":
         os.abort()
+    if fault == "work":
+        work()
     if fault == "hang":
         time.sleep(60)
     if fault == "memory":
         bytearray(1 << 33)
     if fault != "nothing":
         write(Path(output), *spoil(poses, fault), fault)
+
+
+def work():
+    """Half a second of CPU time in one child, 200 MB in another."""
+    if os.fork() == 0:
+        while time.process_time() < 0.5:
+            pass
+        os._exit(0)
+    if os.fork() == 0:
+        held = bytearray(200_000_000)
+        time.sleep(0.5)
+        os._exit(len(held) % 2)
+    os.wait()
+    os.wait()
 
 
 def straight(x):

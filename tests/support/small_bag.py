@@ -29,6 +29,20 @@ def cloud(stamp: int, n: int = 200) -> Any:
     )
 
 
+def bad_cloud(stamp: int, of: str) -> Any:
+    """A cloud that is cut, or has no or few valid points."""
+    made = cloud(stamp)
+    if of == "cut":
+        made.data = made.data[:-1]
+        return made
+    values = {"NaN": np.nan, "zero": 0.0, "far": 2000.0, "few": 0.0}
+    raw = made.data.view("<f4").reshape(-1, 4)
+    raw[19 if of == "few" else 0 :, :3] = values[of]
+    if of == "few":
+        raw[:19, :3] = 1.0
+    return made
+
+
 def pose(stamp: int, x: float) -> Any:
     types = STORE.types
     return types["geometry_msgs/msg/PoseStamped"](

@@ -6,9 +6,10 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.cli import app
-from adaptune.model import BankSettings, ErrorModel
+from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.parameter_sets import ParameterSets
 from adaptune.space import Categorical, Float, ParameterSpace
+from offline.config import Limit, OfflineConfig
 
 
 @pytest.fixture
@@ -57,6 +58,7 @@ def test_a_model_is_explained(model, tmp_path):
         "cave 2 3 4.000 1.000 1 0.000",
         "street 2 3 2.000 2.000 0 0.000",
         "distance [1, 10] log 4 4",
+        "kernel none, [huber] none none",
         "0, fixed 3.000 4 none",
         "1 3.000 2 [huber]",
         "seed 7",
@@ -65,10 +67,76 @@ def test_a_model_is_explained(model, tmp_path):
         assert said in text, (said, text)
 
 
+LITERAL = ("my[v2]", "[/b]", ":x:", "[red]")
+
+
+def kinds(model):
+    """Models as all stages and settings store them."""
+    vectors = np.zeros((4, 2, 3), np.float32)
+    bank = dataclasses.replace(model, bank=[0, 2], vectors=vectors)
+    summary = dict.fromkeys(("geometric", "low", "high", "worst", "arithmetic"), 0.9)
+    augment = [{"name": "noise", "sigma": 0.1}, {"name": "cut", "start": None}]
+    config = OfflineConfig(
+        objective=({"rte": 1.0, "ape": 0.5}, "memory"), limits={"rte": Limit(max=3.0)}, repeats=2
+    ).model_dump(mode="json")
+    settings = {
+        "command": ["slam", "--fast"],
+        "extrinsic": {"translation": [0, 0.5, 1]},
+        "gpu": True,
+    }
+    return [
+        model,
+        bank,
+        dataclasses.replace(bank, bank_settings=BankSettings(adapt=False)),
+        dataclasses.replace(model, paired=PairedSettings(adapt=False)),
+        dataclasses.replace(bank, validation={"bank": summary, "paper": summary | {"low": np.nan}}),
+        dataclasses.replace(model, validation={"paired": {"kept": ["a", {"b": None}]}, "x": "y"}),
+        dataclasses.replace(model, provenance={"versions": {"numpy": "2"}, "augment": augment}),
+        dataclasses.replace(model, provenance=config),
+        dataclasses.replace(model, odometry={"name": "command", "settings": settings}),
+        dataclasses.replace(model, odometry={"name": "bare"}, provenance={}),
+    ]
+
+
+@pytest.mark.parametrize("i", range(10))
+def test_no_model_shows_raw_data(model, tmp_path, i):
+    text = shown(kinds(model)[i], tmp_path)
+    for raw in ("{", "}", "['", "': ", "None", "True"):
+        assert raw not in text, raw
+
+
+def test_nested_data_are_shown_in_words(model, tmp_path):
+    *_, augmented, configured, program, _ = kinds(model)
+    assert "versions.numpy 2 augment name noise, sigma 0.1; name cut" in shown(augmented, tmp_path)
+    text = shown(configured, tmp_path)
+    assert "objective rte 1, ape 0.5; memory 1" in text
+    assert "limits.rte.max 3" in text
+    text = shown(program, tmp_path)
+    assert "command slam, --fast" in text
+    assert "extrinsic.translation 0, 0.5, 1 gpu true" in text
+
+
+def test_text_of_a_file_is_shown_literally(model, tmp_path):
+    known = dict.fromkeys(LITERAL, "{kept}")
+    strange = dataclasses.replace(
+        model,
+        odometry={"name": LITERAL[0], "settings": known},
+        sequences=["cave", LITERAL[1]],
+        provenance={"by": list(LITERAL)},
+        validation={LITERAL[2]: {"verdict": LITERAL[3]}},
+    )
+    text = shown(strange, tmp_path)
+    for name in LITERAL:
+        assert text.count(name) >= 3, name
+    assert text.count("{kept}") == 4
+
+
 def test_what_validation_found_is_shown(model, tmp_path):
     found = {"paired": {"geometric": 0.61, "verdict": "Adapt by `paired`."}}
     text = shown(dataclasses.replace(model, validation=found), tmp_path)
-    assert "Validation, paired: geometric 0.61, verdict Adapt by `paired`." in text
+    assert "rule geometric ─" in text
+    assert "paired 0.610" in text
+    assert "paired, verdict: Adapt by `paired`." in text
 
 
 def test_sets_that_a_sequence_lacks_are_shown(model, tmp_path):
@@ -94,5 +162,6 @@ def test_a_bank_is_shown(model, tmp_path):
     ):
         of_two = dataclasses.replace(model, bank=[0, 2], vectors=vectors, bank_settings=settings)
         text = shown(of_two, tmp_path)
-        assert "Bank: trials 0, 2;" in text
+        assert "The bank's 2 members" in text
+        assert "0, fixed 3.000 4 none 2 11.8 9 none" in text
         assert said in text

@@ -1,3 +1,4 @@
+import dataclasses
 import importlib.util
 import json
 import re
@@ -12,6 +13,7 @@ import yaml
 from needs import lacking
 from setups import setup_of
 
+from adaptune.errors import AdaptuneError
 from adaptune.odometry import OdometryError
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
@@ -169,6 +171,27 @@ def test_a_program_that_stamps_the_end_of_a_scan(make):
     assert np.nanmax(trial.errors) < 5.0
 
 
+def test_what_it_takes_is_measured_and_can_be_limited(make):
+    kept = "{cpu: {max: 100000}, ms_per_scan: {max: 1000}}"
+    once = "offline.trials=1"
+    study = make("work", "offline.objective=[rte, memory]", f"offline.limits={kept}", once)
+    trial, _ = run(study)
+    # It computes for half a second in a child, beside a child of 200 MB, over 40 scans of 3.9 s.
+    assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0
+    assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
+    assert 200.0 <= trial.usage["memory"] < 1000.0
+    assert len(train(study).means) > 0
+    late = make("hang", "isolation.seconds=0.02")
+    trial, _ = run(late)
+    assert trial.faults
+    assert 1e3 * np.median(trial.seconds) >= 20.0
+    assert trial.usage["memory"] > 5.0
+    limited = make("work", "offline.limits={ms_per_scan: {max: 1}}", once)
+    limited = dataclasses.replace(limited, folder=limited.folder.with_name("limited"))
+    with pytest.raises(AdaptuneError, match="ms_per_scan"):
+        train(limited)
+
+
 def test_another_frame(make):
     with pytest.raises(
         OdometryError, match=r"another frame: turned by 120 degrees.*extrinsic.*: read"
@@ -300,12 +323,15 @@ def test_the_whole_way(make):
         ("odometry.settings.template=", "voxel}, and there is no template"),
         ("odometry.settings.command=[slam3000, x]", "there is no program 'slam3000'"),
         ("odometry.settings.command=[sh, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
-        ("odometry.settings.format=tumm", "odometry.settings.format: Input should be"),
+        (
+            "odometry.settings.format=tumm",
+            "odometry.settings.format: give 'tum', 'kitti' or 'evalio', not 'tumm'",
+        ),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
         ("online.rules=[paired]", "online.rules: a command runs whole recordings"),
         ("online.switching.mechanism=live", "a command runs whole recordings and cannot change"),
         ("online.switching.mechanism=bank", "a command runs whole recordings and cannot change"),
-        ("odometry.settings.command=sh", 'settings.command: give a list, not "sh"'),
+        ("odometry.settings.command=sh", "settings.command: give a list, not 'sh'"),
     ],
 )
 def test_mistakes_in_the_study(make, override, words):

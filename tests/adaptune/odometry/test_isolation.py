@@ -13,10 +13,11 @@ import turns
 from setups import setup_of
 
 from adaptune.archive import Archive
+from adaptune.hosting import server
 from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.isolation import Isolated, Limits, fork_server
+from adaptune.odometry.isolation import SERVICE, Isolated, Limits
 from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.selection import Selection
 from adaptune.sequence import Imu, Scan
@@ -85,8 +86,8 @@ def test_one_that_cannot_begin_is_given_up():
 def test_a_server_that_was_killed_is_replaced():
     odometry = isolated("none")
     odometry.start(scan(0), np.eye(4))
-    fork_server("faulty:Faulty").process.kill()
-    fork_server("faulty:Faulty").process.wait()
+    server(SERVICE, "faulty:Faulty").process.kill()
+    server(SERVICE, "faulty:Faulty").process.wait()
     # Those it has forked live on.
     assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
     odometry.start(scan(2), np.eye(4))
@@ -96,7 +97,7 @@ def test_a_server_that_was_killed_is_replaced():
 
 def test_what_it_refuses_is_an_error():
     odometry = Isolated("ntd", {}, faulty.Settings(), Limits())
-    with pytest.raises(OdometryError, match="ntd: there is no odometry 'ntd': did you mean 'ndt'"):
+    with pytest.raises(OdometryError, match="there is no odometry 'ntd': did you mean 'ndt'"):
         odometry.start(scan(0), np.eye(4))
 
 
@@ -257,7 +258,7 @@ def test_a_conversation_with_the_command_line():
         (HELLO | {"version": 1}, "speaks version 2 of the protocol, not 1"),
         (HELLO | {"odometry": None}, "the hello names no odometry"),
         (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
-        (HELLO | {"settings": {"fualt": "hang"}}, "fualt"),
+        (HELLO | {"settings": {"fualt": "hang"}}, "settings: fualt: unknown key"),
         ({"type": "hello", "version": 2}, "hello lacks parameters, settings"),
         ({"type": "begin"}, "no message of type 'begin'"),
         ({"type": "start", "stamp": 0}, "start lacks points, pose"),
@@ -269,6 +270,7 @@ def test_what_a_server_refuses(first, message):
     (answer,) = exchange((first, {}))
     assert answer.header["type"] == "refused"
     assert message in answer.header["message"]
+    assert "https://" not in answer.header["message"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
+from pictures import is_white, texts
 from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert, rotation_angle, steps
@@ -89,8 +90,13 @@ def test_inertial_measurements_read_back(recording, scans):
 
 
 def test_a_preview_lies_beside(recording):
-    assert recording.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
-    assert len(list(recording.parent.iterdir())) == 3
+    picture = recording.with_suffix(".png")
+    for label in ("x [m]", "y [m]", "azimuth [deg]", "elevation [deg]", "range [m]", "path"):
+        assert label in texts(picture)
+    assert is_white(picture)
+    # Its points are one image, not thousands of shapes.
+    assert picture.with_suffix(".svg").stat().st_size < 2_000_000
+    assert len(list(recording.parent.iterdir())) == 4
 
 
 @pytest.mark.parametrize("stamp", ["start", "end"])
@@ -156,7 +162,7 @@ def test_undistorted_points_agree_from_scan_to_scan(scans):
 
 def test_what_is_there_is_not_touched_unasked(tmp_path):
     path = tmp_path / "run.bag"
-    for name in ("run.bag", "run.tum", "run.png"):
+    for name in ("run.bag", "run.tum", "run.png", "run.svg"):
         (tmp_path / name).write_text("mine")
         with pytest.raises(SimulationError, match=f"{name} exists already; give --overwrite"):
             record(COURSE, path)

@@ -1,0 +1,43 @@
+"""What runs in a process of its own for an odometry, see `adaptune.hosting`."""
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from adaptune import hosting
+from adaptune.cores import pin
+from adaptune.odometry import wire
+from adaptune.odometry.declaration import declare_here
+from adaptune.odometry.registry import odometry_class
+
+
+def load(name: str) -> None:
+    """Import the odometry."""
+    odometry_class(name)
+
+
+def converse(reader: wire.Readable, writer: BinaryIO, name: str) -> None:
+    """Be an instance."""
+    # Nothing else limits TBB's threads, and it sums in the order in which they finish.
+    pin(os.getpid())
+    wire.serve(reader, writer, name)
+
+
+def describe(reader: wire.Readable, writer: BinaryIO, name: str) -> None:
+    """Answer what `adaptune.odometry.declaration.declare` asks."""
+    hosting.answer_all(reader, writer, partial(_declared, name))
+
+
+def _declared(name: str, message: wire.Message) -> dict[str, Any]:
+    folder = message.header["folder"]
+    found = declare_here(name, message.header["settings"], Path(folder) if folder else None)
+    described = found.description
+    assert described is not None  # it is a class
+    return wire.about(described) | {
+        "warm_up": list(described.warm_up),
+        "whole": described.whole,
+        "clean": found.clean,
+        "settings": found.settings and found.settings.model_dump(mode="json"),
+        "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
+    }

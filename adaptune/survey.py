@@ -1,0 +1,271 @@
+"""Read what a bag holds: a sample of its messages, or all of them."""
+
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+
+from adaptune import geometry
+from adaptune.faults import FARTHEST, Fault
+from adaptune.sequence import Scan, SequenceError
+from adaptune.sequence.bag import IMU_TYPES, POINTS_TYPES, BagSource
+from adaptune.sequence.bag_files import bag_paths
+from adaptune.sequence.bag_index import IndexReader
+from adaptune.sequence.pose_messages import PATH, POSES, Pose, usable
+from adaptune.sequence.serialized import header_stamp
+from adaptune.trajectory import Trajectory
+
+Show = Callable[[str, int, int], None]
+"""Called with what is done, how much of it is done, and how much there is."""
+
+Take = Callable[[bytes], None]
+"""Decodes a message."""
+
+Span = tuple[int | None, int | None]
+"""Nanoseconds on the recorder's clock from which, and up to which, to read."""
+
+# A recording that takes no longer than this is read completely, and a sample takes about as long.
+SECONDS = 1.0
+# Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
+_SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
+# Parts of a sample, and messages of a topic in each.
+_FEWEST, _MOST, _EACH = 5, 20, 2.5
+
+
+@dataclass
+class Reading:
+    """What was read of a topic; each list holds a list for every part of the sample."""
+
+    name: str
+    kind: str
+    count: int  # messages in the recording
+    stamped: bool
+    stamps: list[list[int]] = field(default_factory=list)
+    recorded: list[list[int]] = field(default_factory=list)
+    undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
+
+    @property
+    def n_read(self) -> int:
+        """Messages that were read."""
+        return sum(map(len, self.recorded))
+
+
+@dataclass
+class Survey:
+    """What was read of a bag."""
+
+    topics: dict[str, Reading]
+    points: str | None  # the topics that adaptune would use
+    reference: str | None
+    imu: str | None
+    complete: bool = True  # whether all messages were read
+    slack: float = 0.0  # seconds between two parts of the sample
+    first: tuple[Scan, Any] | None = None  # the first scan, and its message
+    valid: list[int] = field(default_factory=list)  # points of each cloud that are valid
+    poses: list[Pose] = field(default_factory=list)
+    path: bytes = b""  # the last message, where each repeats all poses before
+    faults: list[Fault] = field(default_factory=list)
+
+    def trajectory(self) -> Trajectory | None:
+        """The reference, as far as it was read; its faults are kept."""
+        if self.reference is None or not self.poses:
+            return None
+        found, unusable = usable(self.poses)
+        if unusable:
+            what = f"{unusable} of {len(self.poses)} poses are not finite or have no rotation"
+            lacks = "a reference trajectory" if found is None else ""
+            text = f"{self.reference}: {what}: adaptune leaves them out"
+            self.faults.append(Fault(text, "reference", lacks))
+        return found
+
+
+def survey(path: Path, deep: bool, show: Show) -> Survey:
+    """Read the bags of a path: all messages if there are few or if it is to be `deep`."""
+    source = _source(bag_paths([str(path)]))
+    with source.open(by_index=True) as reader:
+        found = _empty(reader)
+        number = 0 if deep else _number(reader, source.paths, found)
+        _read(_source(source.paths, found), reader, found, number, show)
+    return found
+
+
+def _source(paths: Items[Path], found: Survey | None = None) -> BagSource:
+    """The bags, without opening them; the topics are those found."""
+    about: dict[str, Any] = {"n_messages": 0, "duration": 0, "begins": {}}
+    topics = {} if found is None else {name: t.kind for name, t in found.topics.items()}
+    points = None if found is None else found.points
+    return BagSource(paths, about=about | {"topics": topics, "points": points or ""})
+
+
+def _empty(reader: AnyReader) -> Survey:
+    """The topics, and which of them adaptune would use."""
+    first = {kind: fields[:1] for kind, (_, fields) in reader.typestore.fielddefs.items()}
+    topics: dict[str, Reading] = {}
+    for c in sorted(reader.connections, key=lambda c: c.topic):
+        stamped = [f[1][1] for f in first.get(c.msgtype, ())] == ["std_msgs/msg/Header"]
+        topic = topics.setdefault(c.topic, Reading(c.topic, c.msgtype, 0, stamped))
+        topic.count += c.msgcount
+
+    def most(kinds: Items[str]) -> str | None:
+        # The densest of several clouds: the others are parts of it, or filtered.
+        fit = [t for t in topics.values() if t.kind in kinds and t.count]
+        return max(fit, key=lambda t: (t.count, t.name)).name if fit else None
+
+    poses = [kind for kind in POSES if "tf" not in kind]
+    return Survey(topics, most(POINTS_TYPES), most(poses), most(IMU_TYPES))
+
+
+def _number(reader: AnyReader, paths: Items[Path], found: Survey) -> int:
+    """Parts of a sample; 0 if the recording is short enough to be read completely."""
+    size = sum(p.stat().st_size for path in paths for p in [path, *path.glob("*")] if p.is_file())
+    try:
+        slow = any(isinstance(r, IndexReader) and r.is_slow() for r in reader.readers)
+    except Exception:  # damage, which reading reports
+        slow = False
+    speed, total = _SLOW if slow else _FAST, sum(t.count for t in found.topics.values())
+    length = reader.end_time - reader.start_time
+    if size / speed + total * _DECODE <= SECONDS or length <= 0:
+        return 0
+    # Whole chunks are unpacked for each part.
+    cost = size * min(_EACH / max(_usual(found), 1), 1.0) + min(size, 5e5)
+    return int(np.clip(SECONDS * speed / cost, _FEWEST, _MOST))
+
+
+def _usual(found: Survey) -> int:
+    """Number of clouds; where there are none, of messages."""
+    total = sum(topic.count for topic in found.topics.values())
+    return total if found.points is None else found.topics[found.points].count
+
+
+def _spans(reader: AnyReader, number: int, count: int) -> list[Span]:
+    """Parts of the recording in which a topic of so many messages has some each."""
+    begin, length = reader.start_time, reader.end_time - reader.start_time
+    if not number or number * _EACH >= count:
+        return [(None, None)]
+    if not _indexed(reader):
+        return [(begin, begin + round(length * number * _EACH / count))]
+    width = _EACH / count
+    starts = begin + np.linspace(0.0, (1.0 - width) * length, number).astype(np.int64)
+    return [(start, start + round(width * length) + 1) for start in starts.tolist()]
+
+
+def _indexed(reader: AnyReader) -> bool:
+    """Whether a part can be read without what is before it: not in mcap files without chunks."""
+    storages = [getattr(r, "storage", None) for r in reader.readers]
+    files = [file for s in storages for file in getattr(s, "storages", [s])]
+    return all(getattr(file, "chunks", True) for file in files)
+
+
+def _read(source: BagSource, reader: AnyReader, found: Survey, number: int, show: Show) -> None:
+    """Read so many parts, or everything if it is 0."""
+    takers, usual = _takers(source, reader, found), _usual(found)
+    total, done = sum(t.count for t in found.topics.values()), 0
+    spans = _spans(reader, number, usual)
+    found.complete = spans == [(None, None)]
+    if not found.complete:
+        length = (reader.end_time - reader.start_time) * 1e-9
+        found.slack = length / (len(spans) - 1) if len(spans) > 1 else np.inf
+    # What comes more rarely than the clouds has parts of its own.
+    rare = [t for t in takers if found.topics[t].count < usual and not found.complete]
+    jobs: list[tuple[str | None, Span]] = [(None, span) for span in spans]
+    jobs += [(t, span) for t in rare for span in _spans(reader, number, found.topics[t].count)]
+    for name, span in jobs:
+        names = [name] if name else [t for t in found.topics if t not in rare]
+        chosen = {t: found.topics[t] for t in names}
+        for topic in chosen.values():
+            topic.stamps.append([])
+            topic.recorded.append([])
+        try:
+            for connection, when, data in _messages(source, reader, name, span):
+                if (read := chosen.get(connection.topic)) is not None:
+                    _take(takers.get(read.name), read, when, data, reader)
+                done += 1
+                if done % 100 == 0:
+                    show("reading", done, total)
+        except SequenceError as error:
+            lacks = "a recording that can be read to its end"
+            if str(error) not in [fault.text for fault in found.faults]:
+                found.faults.append(Fault(str(error), "points", lacks))
+    if found.path and found.reference is not None:
+        take = partial(_take_poses, PATH, reader, found)
+        _try(take, found.topics[found.reference], reader.end_time, found.path, reader)
+    show("reading", total, total)
+
+
+def _messages(
+    source: BagSource, reader: AnyReader, topic: str | None, span: Span
+) -> Iterator[tuple[Connection, int, bytes]]:
+    asked: Span = span if _indexed(reader) else (None, None)
+    for connection, when, data in source.read(reader, topic, asked):
+        if span[1] is not None and when >= span[1]:
+            return
+        yield connection, when, data
+
+
+def _take(take: Take | None, topic: Reading, when: int, data: bytes, reader: AnyReader) -> None:
+    """Keep when a message was made and recorded, and decode it where it is used."""
+    topic.recorded[-1].append(when)
+    stamp = header_stamp(data, reader.is2) if topic.stamped else None
+    if stamp is not None:
+        topic.stamps[-1].append(stamp)
+    if take is not None:
+        _try(take, topic, when, data, reader)
+
+
+def _try(take: Take, topic: Reading, when: int, data: bytes, reader: AnyReader) -> None:
+    try:
+        take(data)
+    except Exception as error:  # deserializers raise whatever damaged data leads them to
+        seconds = (when - reader.start_time) * 1e-9
+        topic.undecoded.append((seconds, str(error) or type(error).__name__))
+
+
+def _takers(source: BagSource, reader: AnyReader, found: Survey) -> dict[str, Take]:
+    """What decodes the messages of the topics that adaptune would use."""
+    takers: dict[str, Take] = {}
+    if found.points is not None:
+        try:
+            source.check(None, None)
+            takers[found.points] = partial(_take_cloud, source.loader(reader), reader, found)
+        except SequenceError as error:
+            found.faults.append(Fault(str(error), "points", "point clouds that can be read"))
+    if found.reference is not None:
+        kind = found.topics[found.reference].kind
+        poses = partial(_take_poses, kind, reader, found)
+        # Each path repeats the one before: the last one will do.
+        takers[found.reference] = partial(setattr, found, "path") if kind == PATH else poses
+    if found.imu is not None:
+        takers[found.imu] = partial(_take_measurement, reader)
+    return takers
+
+
+def _take_cloud(
+    load: Callable[[bytes, str], Scan], reader: AnyReader, found: Survey, data: bytes
+) -> None:
+    scan = load(data, "message")
+    found.valid.append(n_valid(scan))
+    if found.first is None and found.points is not None:
+        found.first = scan, reader.deserialize(data, found.topics[found.points].kind)
+
+
+def _take_poses(kind: str, reader: AnyReader, found: Survey, data: bytes) -> None:
+    found.poses += POSES[kind](reader.deserialize(data, kind))
+
+
+def _take_measurement(reader: AnyReader, data: bytes) -> None:
+    message: Any = reader.deserialize(data, IMU_TYPES[0])
+    w, a = message.angular_velocity, message.linear_acceleration
+    if not np.isfinite([w.x, w.y, w.z, a.x, a.y, a.z]).all():
+        raise SequenceError("a measurement is not finite")
+
+
+def n_valid(scan: Scan) -> int:
+    """Points that an odometry can use."""
+    with np.errstate(over="ignore"):
+        return geometry.count_within(scan.points, 0.0, FARTHEST)

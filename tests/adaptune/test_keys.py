@@ -1,0 +1,77 @@
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from adaptune.study.keys import complete
+from adaptune.study.mistakes import Mistake, validated
+from offline.config import OfflineStudyConfig
+
+HEAVY = ("scipy", "numba", "open3d", "optuna", "matplotlib", "rosbags", "sklearn", "small_gicp")
+
+
+@pytest.mark.parametrize(
+    ("incomplete", "completed"),
+    [
+        ("offline.tr", ["offline.trials="]),
+        ("online.switching.c", ["online.switching.catch_up_scans=", "online.switching.cores="]),
+        ("offline.sets=", ["offline.sets=shared", "offline.sets=own", "offline.sets=both"]),
+        ("online.switching.mechanism=h", ["online.switching.mechanism=hand_over"]),
+        ("offline.trials=", []),
+        ("offline.sampler=gr", ["offline.sampler=grid"]),
+        ("nonsense", []),
+        ("nonsense=", []),
+    ],
+)
+def test_keys_and_values_are_completed(incomplete, completed):
+    assert complete(OfflineStudyConfig, incomplete, {"offline.sampler": ["tpe", "grid"]}) == (
+        completed
+    )
+
+
+def complaints(key):
+    """What is said of a study with an odd value of a key."""
+    data: Any = [[1]]
+    for part in reversed(key.split(".")):
+        data = {part: data}
+    mistakes: list[Mistake] = []
+    validated(OfflineStudyConfig, data, (), mistakes)
+    return " ".join(mistake.message for mistake in mistakes)
+
+
+def test_all_keys_are_keys_of_a_study():
+    names = [key.rstrip("=") for key in complete(OfflineStudyConfig, "")]
+    assert {"sub_trajectory", "health.max_speed", "descriptor.window"} <= set(names)
+    assert len(names) == len(set(names)) > 40
+    for name in names:
+        assert "unknown key" not in complaints(name), name
+    assert "unknown key" in complaints("offline.no_such_key")
+
+
+ZSH = {
+    "_ADAPTUNE_COMPLETE": "complete_zsh",
+    "_TYPER_COMPLETE_ARGS": "adaptune offline my.yaml -o offline.tr",
+}
+BASH = {
+    "_ADAPTUNE_COMPLETE": "complete_bash",
+    "COMP_WORDS": "adaptune offline my.yaml -o offline.tr",
+    "COMP_CWORD": "4",
+}
+
+
+@pytest.mark.parametrize("shell", [BASH, ZSH], ids=["bash", "zsh"])
+def test_the_shell_is_answered(shell, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "adaptune"],
+        cwd=tmp_path,
+        env=os.environ | shell,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "offline.trials=" in done.stdout
+    imported = {line.rpartition("|")[2].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert "pydantic" in imported
+    assert not imported & set(HEAVY)

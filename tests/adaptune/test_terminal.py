@@ -1,0 +1,82 @@
+import dataclasses
+import io
+import logging
+import sys
+import time
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from adaptune import report, terminal
+from adaptune.cli import app
+from adaptune.model import ErrorModel
+from adaptune.next_command import say_next
+
+ODD = "my[v2] [/b] :x: [red]"
+
+
+def test_text_is_printed_as_it_is(capsys):
+    terminal.say(ODD)
+    terminal.console.print(report.table(f"title {ODD}", [{f"key {ODD}": ODD}], f"caption {ODD}"))
+    terminal.errors.print(ODD)
+    out, err = capsys.readouterr()
+    assert " ".join(out.split()).count(ODD) == 5
+    assert ODD in err
+
+
+def test_bars_print_names_as_they_are(monkeypatch):
+    screen = Console(file=io.StringIO(), force_terminal=True, width=200)
+    monkeypatch.setattr(terminal, "errors", screen)
+    with terminal.progress() as show:
+        show(ODD, 1, 2, f"remark {ODD}")
+    text = screen.file.getvalue()
+    assert text.count(ODD) >= 2
+
+
+def test_a_line_is_not_broken(capsys):
+    terminal.say("x" * 500)
+    assert "x" * 500 in capsys.readouterr().out
+
+
+def test_errors_print_names_as_they_are(study_file):
+    done = CliRunner().invoke(app, ["offline", str(study_file.with_name("my[v2] [b] :x:.yaml"))])
+    assert "my[v2] [b] :x:.yaml: there is no such file" in done.stderr
+
+
+def test_model_show_prints_what_a_file_says_as_it_is(trained_folder, tmp_path):
+    model = ErrorModel.load(trained_folder / "model.safetensors")
+    file = tmp_path / "my[v2].safetensors"
+    dataclasses.replace(model, provenance={"made by": ODD}).save(file)
+    done = CliRunner().invoke(app, ["model", "show", str(file)])
+    assert ODD in " ".join(done.stdout.split())
+    assert "my[v2].safetensors" in done.stdout
+
+
+def test_a_log_has_a_line_of_progress_now_and_then(caplog, monkeypatch):
+    monkeypatch.setattr(terminal, "errors", Console(file=io.StringIO(), force_terminal=False))
+    clock = iter(range(100))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    with caplog.at_level(logging.INFO), terminal.progress() as show:
+        for i in range(21):
+            show("trials", i / 2, 10, "best rte 1.0")
+    assert [record.message for record in caplog.records] == [
+        "trials: 2 of 10, about 15 s left, best rte 1.0",
+        "trials: 5 of 10, about 9 s left, best rte 1.0",
+        "trials: 8 of 10, about 3 s left, best rte 1.0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("called", "found", "typed"),
+    [
+        (".venv/bin/adaptune", None, ".venv/bin/adaptune"),
+        ("/usr/bin/adaptune", "/usr/bin/adaptune", "adaptune"),
+        ("adaptune/__main__.py", None, "adaptune"),
+    ],
+)
+def test_the_next_command_can_be_copied(capsys, monkeypatch, called, found, typed):
+    monkeypatch.setattr(sys, "argv", [called])
+    monkeypatch.setattr("shutil.which", lambda _: found)
+    say_next("why", "offline", "my study.yaml")
+    assert capsys.readouterr().out == f"Next: {typed} offline 'my study.yaml'    # why\n"

@@ -1,0 +1,57 @@
+import pytest
+
+from offline import workers
+from offline.offline_study import load_study
+from offline.train import train
+from offline.workers import Task, TaskProgress, TaskResult, now_and_then, run
+
+
+class TwoWords:
+    """A pool of one worker that tells how far it is before it is done."""
+
+    def __init__(self):
+        self.said = [TaskProgress("reading", 5, 10), TaskProgress("running", 2, 10)]
+
+    def workers(self):
+        return [0]
+
+    def start(self, worker, task):
+        pass
+
+    def wait(self):
+        return [(0, self.said.pop(0) if self.said else TaskResult([], None))]
+
+
+def test_tasks_tell_how_far_they_are():
+    task, told = Task("one", (0, 1), ({}, {})), []
+    finished = list(run(TwoWords(), [task], lambda *about: told.append(about)))
+    assert told == [
+        (task, TaskProgress("reading", 5, 10)),
+        (task, TaskProgress("running", 2, 10)),
+    ]
+    assert [done for done, *_ in finished] == [task]
+
+
+def test_workers_report_now_and_then_and_at_the_end(monkeypatch):
+    times = iter([0.0, *(0.1 * i for i in range(1, 21))])
+    monkeypatch.setattr(workers.time, "monotonic", lambda: next(times))
+    told = []
+    report = now_and_then(told.append)
+    for i in range(1, 21):
+        report(TaskProgress("running", i, 20))
+    assert [progress.done for progress in told] == [6, 12, 18, 20]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_offline_shows_scans_and_runs(study_file, tmp_path, workers):
+    calls = []
+    overrides = ["offline.trials=4", f"offline.workers={workers}"]
+    train(load_study(study_file, overrides, tmp_path), lambda *call: calls.append(call))
+    for name in ("one", "two"):
+        assert (f"reading {name}", 40, 40, "") in calls
+    for what, total in (("runs", 8), ("whole runs", 4)):
+        done = [call[1] for call in calls if call[0] == what]
+        assert done[-1] == total
+        if workers == 1:
+            assert done == sorted(done)
+        assert {call[2] for call in calls if call[0] == what} == {total}

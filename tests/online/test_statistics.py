@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from adaptune.metrics import KittiError, kitti_error
+from adaptune.trajectory import Trajectory, read_kitti
+from online.statistics import ComparisonRow, Reference, StandardErrors, pooled
+
+
+def trajectory(T, first=0):
+    return Trajectory(np.arange(first, first + len(T)) * 10**8, T)
+
+
+def straight(n, step=1.0):
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, 0, 3] = step * np.arange(n)
+    return T
+
+
+def row(sequence, standard, mode="fixed"):
+    return ComparisonRow(sequence, mode, 1.0, 1.0, 0, 0, 0, standard=standard)
+
+
+def test_errors_of_a_recorded_pair_are_those_of_evo_and_kitti(recorded):
+    folder = recorded / "kitti_00"
+    truth = trajectory(read_kitti(folder / "ground_truth_kitti.txt"))
+    found = Reference(truth, 100.0).standard(trajectory(read_kitti(folder / "kiss_icp_kitti.txt")))
+    assert found.ape == pytest.approx(3.500719, abs=1e-6)
+    assert found.rpe == pytest.approx(0.034188, abs=1e-6)
+    assert found.kitti.translation == pytest.approx(0.5283, abs=5e-5)
+    cells = row("00", found).standard_columns()
+    assert cells["APE [m]"] == found.ape
+    assert cells["[deg/100 m]"] == pytest.approx(0.1887, abs=1e-4)
+    assert cells["over [m]"] == "100-800"
+    files = row("00", found).columns()
+    assert files["_kitti_lengths_m"] == "100 200 300 400 500 600 700 800"
+    assert files["_kitti_deg_per_m"] == found.kitti.rotation
+
+
+@pytest.mark.parametrize(("metres", "lengths"), [(99, None), (150, "100"), (250, "100-200")])
+def test_kittis_error_is_there_from_100_m_on(metres, lengths):
+    truth = straight(metres + 2)
+    found = Reference(trajectory(truth), 25.0).standard(trajectory(straight(metres + 2, 1.01)))
+    cells = row("a", found).standard_columns()
+    assert cells["over [m]"] == lengths
+    assert np.isfinite(cells["KITTI [%]"]) == (lengths is not None)
+    assert cells["APE [m]"] > 0.1
+    assert cells["RPE [m]"] == pytest.approx(0.01)
+
+
+def test_scans_without_reference_do_not_count():
+    truth, odometry = straight(60), trajectory(straight(100, 1.01))
+    late = Reference(trajectory(truth, 20), 25.0).standard(odometry)
+    assert late.rpe == pytest.approx(0.01)
+    assert Reference(None, 25.0).standard(odometry) is None
+    # One pose says nothing.
+    assert Reference(trajectory(truth[:1], 20), 25.0).standard(odometry) is None
+
+
+def test_a_sequence_without_reference_has_empty_cells():
+    cells = row("street", None).standard_columns()
+    assert set(list(cells.values())[2:]) == {None}
+
+
+def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
+    truth = straight(400)
+    truth[:, 1, 3] = np.sin(0.05 * np.arange(400))
+    estimate = truth.copy()
+    estimate[:, 1, 3] *= 1.1
+    parts = [kitti_error(truth, estimate, (length,)) for length in (100.0, 200.0, 300.0)]
+    want = kitti_error(truth, estimate)
+    assert len({part.n for part in parts}) == 3  # the mean of the means is another
+    short = KittiError(np.nan, np.nan, ())
+    rows = [row(f"s{i}", StandardErrors(1.0 + i, 0.1, k)) for i, k in enumerate([*parts, short])]
+    (found,) = pooled([*rows, row("blind", None)])
+    assert found.standard.ape == pytest.approx(2.5)
+    assert found.standard.rpe == pytest.approx(0.1)
+    assert found.standard.kitti[:2] == pytest.approx(want[:2])
+    assert found.standard.kitti[2:] == want[2:]
+    assert pooled([row("a", None)])[0].standard is None
+    assert np.isnan(pooled([row("a", StandardErrors(1.0, 0.1, short))])[0].standard.kitti[0])

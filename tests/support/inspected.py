@@ -1,0 +1,28 @@
+"""What tests look for in an inspected recording."""
+
+from typing import Any
+
+from pydantic import TypeAdapter
+from rich.console import Console
+
+from adaptune import yaml
+from adaptune.inspect import Inspection
+from adaptune.rendering import render_inspection
+from adaptune.sequence import SequenceConfig
+
+
+def inspection_text(inspection: Any, width: int = 100) -> str:
+    console = Console(width=width, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(render_inspection(inspection))
+    return capture.get()
+
+
+def entry(inspection: Any) -> dict[str, SequenceConfig]:
+    """The proposed entry, read back as a study would."""
+    data = yaml.Document(inspection.entry).data["sequences"]
+    return TypeAdapter(dict[str, SequenceConfig]).validate_python(data)
+
+
+def texts(inspection: Inspection) -> list[str]:
+    return [fault.text for fault in inspection.faults]

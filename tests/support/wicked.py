@@ -1,0 +1,21 @@
+"""Modules of users that go wrong when they are imported, and what is said then."""
+
+from pathlib import Path
+
+IMPORTS = {
+    "exit": ("import sys\nprint('no licence')\nsys.exit(0)", "ended with code 0: no licence"),
+    "end": ("import os\nos._exit(3)", "ended with code 3"),
+    "segmentation fault": ("import ctypes\nctypes.string_at(0)", "ended by SIGSEGV"),
+    "sleep": ("import time\ntime.sleep(1e9)", "cannot be imported: that took longer than 1 s"),
+    "raise": ("raise ValueError('no camera')", "ended with code 1: .*ValueError: no camera"),
+    "kill": ("import os\nos.killpg(0, 9)", "ended by SIGKILL"),
+}
+
+
+def gone(process):
+    """Whether a process has ended, or waits for nothing but its parent's notice."""
+    try:
+        stat = Path(f"/proc/{process}/stat").read_text()
+        return stat.rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
