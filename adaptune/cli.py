@@ -160,15 +160,12 @@ def offline(
             show_default="processes of this machine",
         ),
     ] = None,
-    again: Annotated[
-        bool, typer.Option("--again", help="Compute again what depends on what has changed.")
-    ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Renew what has changed.")] = False,
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
-    Each trial runs one parameter set on every training sequence. The table shows the *baseline*
-    (the odometry's own parameters), the *fixed* set (the best set over all training sequences),
-    and the best set of each sequence. Stop it with Ctrl-C, and run it again to resume.
+    The table shows the *baseline* (the odometry's own parameters), the *fixed* set (the best over
+    all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
     """
     loaded = _load(study, override, folder)
     from adaptune import report

@@ -2,14 +2,13 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Frames, Summary
 from adaptune.descriptor import averaged
-from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import span
 from adaptune.model import ModelError, TrainingData
 from adaptune.model.bank_weights import POOL
@@ -21,6 +20,9 @@ from offline.config import Metric, OfflineStudyConfig
 from offline.objective import choose_fixed, few, margin, mean_value, repeated, weighted
 from offline.search import owner
 from offline.whole_runs import mean_values, read_whole_runs, whole_values
+
+if TYPE_CHECKING:
+    from adaptune.descriptor.pca import ScaledPCA
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +127,10 @@ class LabelledData(NamedTuple):
             return choose_fixed(whole, bounds)
         return min(bounds, key=lambda n: bounds[n])
 
-    def training_data(self) -> tuple[TrainingData, ScaledPCA]:
+    def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
+        from adaptune.descriptor.pca import ScaledPCA  # takes long to import
+
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
         number = places([s.name for s in self.sequences])
         blocks = self.sequences[0].blocks

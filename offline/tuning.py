@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from adaptune.descriptor.pca import ScaledPCA
 from adaptune.metrics import cap
 from adaptune.model import BankRule, BankSettings, PairedExpectedRatio, PairedSettings, TrainingData
 from adaptune.model.bank_weights import (
@@ -18,6 +18,9 @@ from adaptune.model.bank_weights import (
     smooth_weights,
 )
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
+
+if TYPE_CHECKING:
+    from adaptune.descriptor.pca import ScaledPCA
 
 MIN_SEQUENCES = 6
 """With fewer training sequences, a rule does not adapt: they say too little about other places."""
@@ -162,7 +165,7 @@ def bank_data(others: LabelledData, data: TrainingData, members: Sequence[int]) 
 
 
 def bank_evidence(
-    sequence: LabelledSequence, data: TrainingData, pca: ScaledPCA, settings: BankSettings
+    sequence: LabelledSequence, data: TrainingData, pca: "ScaledPCA", settings: BankSettings
 ) -> NearProducts:
     """What a rule that is fitted to `data` finds near to the first scan of every period."""
     assert sequence.simulation is not None
