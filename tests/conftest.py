@@ -45,6 +45,7 @@ SLOW = [
     "offline/test_storage.py",
     "adaptune/odometry/test_isolation.py",
     "adaptune/odometry/test_process.py",
+    "adaptune/test_mistakes.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 
