@@ -57,6 +57,7 @@ SLOW = [
     "online/test_replay_picture.py",
     "offline/test_pictures.py",
     "adaptune/odometry/test_guarded.py",
+    "adaptune/test_mistakes.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 

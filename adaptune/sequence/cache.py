@@ -51,7 +51,10 @@ _ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
 def folder() -> Path:
     """Where decoded sequences are kept: ``$ADAPTUNE_CACHE``, or in the user's cache folder."""
     if given := os.environ.get("ADAPTUNE_CACHE"):
-        return expand_user(given)
+        try:
+            return expand_user(given)
+        except AdaptuneError as error:
+            raise AdaptuneError(f"ADAPTUNE_CACHE: {error}") from error
     return platformdirs.user_cache_path("adaptune", appauthor=False)
 
 

@@ -11,7 +11,7 @@ from adaptune.odometry.command import Command
 from adaptune.odometry.declaration import declare
 from adaptune.odometry.registry import is_user_class, where
 from adaptune.plain_words import Key
-from adaptune.sequence.cache import cap
+from adaptune.sequence import cache
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
@@ -59,7 +59,9 @@ def read_study(
     ConfigurationError
         It lists all mistakes, each with its line, its key and what to do.
     """
-    cap()  # a wrong variable is no mistake of the study
+    # A wrong variable is no mistake of the study.
+    cache.folder()
+    cache.cap()
     document = _read(path)
     data: Any = document.data
     overridden = [_override(data, text) for text in overrides]

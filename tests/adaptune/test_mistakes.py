@@ -179,6 +179,12 @@ def test_a_wrong_size_of_the_cache_is_told_once(study_file, monkeypatch, given):
         load_study(study_file)
 
 
+def test_a_wrong_folder_of_the_cache_is_told_once(study_file, monkeypatch):
+    monkeypatch.setenv("ADAPTUNE_CACHE", "~nobodyx/a")
+    with pytest.raises(Exception, match=r"^ADAPTUNE_CACHE: ~nobodyx/a: there is no such user"):
+        load_study(study_file)
+
+
 @pytest.mark.parametrize("kind", ["folder", "device", "large"])
 def test_what_cannot_be_a_study_is_not_read(tmp_path, kind):
     path = tmp_path / "study.yaml"
