@@ -22,7 +22,7 @@ LINES: dict[str, dict[str, Any]] = {
 POINTS: dict[str, dict[str, Any]] = {
     "baseline": {"marker": "s", "color": "#999999"},
     "fixed": {"marker": "*", "color": "#0072b2"},
-    "bank": {"marker": "D", "color": "#d55e00"},
+    "one set": {"marker": "D", "color": "#d55e00"},
     "paired": {"marker": "o", "color": "#e69f00"},
     "paper": {"marker": "^", "color": "#000000"},
     "oracle, sequence": {"marker": "_", "color": "#009e73"},

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO, NoReturn
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.hosting import Bounds, quoting, verdict
 from adaptune.keeper import adopt_orphans, keep
 from adaptune.odometry.wire import send
@@ -95,9 +95,8 @@ def _run(
         code = 0
     except MemoryError:
         os.write(2, f"\n{bounds.full}\n".encode())
-    except BaseException:
-        sys.excepthook(*sys.exc_info())
-        sys.stderr.flush()
+    except BaseException as error:
+        os.write(2, f"\n{in_a_line(error)}\n".encode(errors="replace"))
     finally:
         # Exit handlers belong to the server.
         os._exit(code)

@@ -8,10 +8,10 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.frame_check import contradiction
 from adaptune.odometry.isolation import MOST_FAULTS
 from adaptune.study.run_folder import CONFIGURATION
-from offline.campaign import Progress
+from offline.campaign import Progress, watched
 from offline.offline_study import OfflineStudy
 from offline.whole_runs import whole_run
-from offline.workers import Pool, Task, run
+from offline.workers import Pool, Task
 
 MOST_WITHOUT_POSE = 0.1
 """Share of the scans from which an odometry that gives no pose for them has failed."""
@@ -46,10 +46,9 @@ def run_baseline(
     ]
     done = []
     try:
-        for task, result, _ in run(workers, tasks):
+        for task, result in watched(workers, tasks, "baseline", progress):
             check_baseline(study.odometry.name, task.sequence, result.trials[0])
             done.append((task, result))
-            progress("baseline", len(done), len(tasks), "")
     except AdaptuneError:
         if not any(archive.folder.glob("*/*.npz")):
             # Nothing binds the folder to this configuration: it may be mended.

@@ -16,7 +16,7 @@ from offline.offline_study import OfflineStudy
 from offline.pruning import rungs
 from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
 from offline.storage import MirrorRow, open_mirror
-from offline.workers import Pool, Task, TaskProgress, run
+from offline.workers import Pool, Task, TaskProgress, TaskResult, run
 
 Progress = Callable[[str, float, int, str], None]
 """Called with what is being done, how much of it is done, how much there is, and a remark."""
@@ -265,6 +265,14 @@ def _best(config: OfflineConfig, stage: Stage) -> str:
 def watch_tasks(
     archive: Archive, workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
 ) -> None:
+    """Run tasks and store their results, see `watched`."""
+    for task, result in watched(workers, tasks, what, progress):
+        _store(archive, task, result)
+
+
+def watched(
+    workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
+) -> Iterator[tuple[Task, TaskResult]]:
     """Run tasks; `progress` is called with `what` and the number of runs that are done."""
     under_way, total = _UnderWay(progress), sum(len(task.numbers) for task in tasks)
     done = 0
@@ -273,10 +281,11 @@ def watch_tasks(
         under_way.report(task, of_task)
         progress(what, done + under_way.runs, total, "")
 
-    for task, _ in run_tasks(archive, workers, tasks, report):
+    for task, result, _ in run(workers, tasks, report):
         under_way.end(task)
         done += len(task.numbers)
         progress(what, done + under_way.runs, total, "")
+        yield task, result
 
 
 def run_tasks(
@@ -290,8 +299,12 @@ def run_tasks(
     `report` is called about tasks that go on.
     """
     for task, result, running in run(workers, tasks, report):
-        if result.frames is not None:
-            archive.write_frames(task.sequence, result.frames)
-        for number, trial in zip(task.numbers, result.trials, strict=True):
-            archive.write(task.sequence, number, trial, task.whole)
+        _store(archive, task, result)
         yield task, running
+
+
+def _store(archive: Archive, task: Task, result: TaskResult) -> None:
+    if result.frames is not None:
+        archive.write_frames(task.sequence, result.frames)
+    for number, trial in zip(task.numbers, result.trials, strict=True):
+        archive.write(task.sequence, number, trial, task.whole)

@@ -73,8 +73,7 @@ class LeftOutResults(NamedTuple):
 
 def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
     """Draw results on the sequences left out; `path` is that of the PNG."""
-    default = "bank" if "bank" in found.ratios else "paired"
-    panels: list[Callable[[Any, LeftOutResults, str], None]] = [_draw_sequences]
+    panels: list[Callable[[Any, LeftOutResults], None]] = [_draw_sequences]
     if not np.isnan(found.familiarity).all():
         panels.append(_draw_familiarity)
     panels.append(_draw_sizes)
@@ -86,14 +85,14 @@ def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
             axes = part.subplots()
             # Wide, to be seen below what is equal to it.
             axes.axhline(1.0, **LINES["fixed"], label="fixed set")
-            draw(axes, found, default)
+            draw(axes, found)
             axes.set_ylabel(RATIO)
             handles, labels = axes.get_legend_handles_labels()
             ncols = 3 if draw is _draw_sequences else 1
             part.legend(handles, labels, loc="outside lower center", ncols=ncols)
 
 
-def _draw_sequences(axes: Any, found: LeftOutResults, _: str) -> None:
+def _draw_sequences(axes: Any, found: LeftOutResults) -> None:
     """Ratios of every mode on each sequence, side by side."""
     modes = [mode for mode in found.ratios if mode != "fixed"]
     at = np.arange(len(found.sequences))
@@ -104,19 +103,19 @@ def _draw_sequences(axes: Any, found: LeftOutResults, _: str) -> None:
     log_scale(axes)
 
 
-def _draw_familiarity(axes: Any, found: LeftOutResults, default: str) -> None:
-    """Gain of the default rule over familiarity."""
+def _draw_familiarity(axes: Any, found: LeftOutResults) -> None:
+    """Gain of `paired` over familiarity."""
     known = ~np.isnan(found.familiarity)
     familiarity, gain = found.familiarity[known], found.gain[known]
     parts = [p for p in np.array_split(np.argsort(familiarity, kind="stable"), 10) if len(p)]
     means = [np.exp(np.log(gain[p]).mean()) for p in parts]
     mean = [familiarity[p].mean() for p in parts]
-    axes.plot(mean, means, label=f"{default}, mean of a tenth of the frames", **POINTS[default])
+    axes.plot(mean, means, label="paired, mean of a tenth of the frames", **POINTS["paired"])
     axes.set_xlabel("familiarity [-] (0: unlike all training)")
     axes.set_title("where scans are known and new")
 
 
-def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
+def _draw_sizes(axes: Any, found: LeftOutResults) -> None:
     """Ratio over the number of sets, of members and of training sequences."""
     from matplotlib.ticker import MaxNLocator
 
@@ -124,9 +123,9 @@ def _draw_sizes(axes: Any, found: LeftOutResults, default: str) -> None:
     known = "best of so many sets, if known"
     axes.plot(sizes, found.portfolio, "s--", color="#999999", label=known)
     most = max(1.0, float(found.portfolio.max()))
-    fewer, number = f"{default}, trained on so many", ["sets"]
+    fewer, number = "paired, trained on so many", ["sets"]
     for rows, column, counted, look, label in (
-        (found.banks, "instances", "members", POINTS["bank"], "bank of so many members"),
+        (found.banks, "instances", "members", POINTS["paired"], "bank of so many members"),
         (found.learning, "sequences", "training sequences", _FEWER, fewer),
     ):
         if rows:

@@ -97,9 +97,7 @@ def train(
         sets = {n: verdicts[n].parameters for n in sorted({0, *best})}
         health = study.config.health
         whole = run_whole(study.training, sets, health, archive, workers, progress)
-    rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
-    values = mean_values(list(whole_values(config, rivals).values()))
-    fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
+    fixed, remark = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, verdicts, fixed)
     finished = {
         name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
@@ -116,8 +114,17 @@ def train(
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     rows = _training_rows(config, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
-    remark = rivalry(config, values, best[0], fixed)
     return Training(model, means, fixed, rows, remark)
+
+
+def _fixed(
+    config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeRuns
+) -> tuple[int, str | None]:
+    """Trial number of the fixed set, one of the best, and what `rivalry` says of it."""
+    rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
+    values = mean_values(list(whole_values(config, rivals).values()))
+    fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
+    return fixed, rivalry(config, values, best[0], fixed)
 
 
 def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:

@@ -12,7 +12,7 @@ from adaptune import sequence
 from adaptune.archive import Frames, Trial
 from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.odometry.base import OdometryInstance, prepared_bytes
@@ -22,7 +22,7 @@ from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
-from offline.trial_run import DrivenRun, TrialRun, fault_of
+from offline.trial_run import DrivenRun, TrialRun
 
 Advance = Callable[[int, int], None]
 """Called with how many scans of a sequence are done, and how many there are."""
@@ -134,7 +134,7 @@ class PreparedSequence:
         except Exception as error:
             raise AdaptuneError(
                 f"sequences.{self.name}: the odometry fails with its own parameters, the baseline, "
-                f"when it is to prepare a scan: {fault_of(error)}; mend the odometry "
+                f"when it is to prepare a scan: {in_a_line(error)}; mend the odometry "
                 f"(odometry in the study), and run the same command again"
             ) from error
 

@@ -1,7 +1,6 @@
 """Runs of an odometry on frames whose reference is known."""
 
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from adaptune.archive import Frames
-from adaptune.errors import AdaptuneError
+from adaptune.errors import in_a_line
 from adaptune.geometry import Poses, invert, steps
 from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.health import HealthCheck
@@ -60,7 +59,7 @@ class TrialRun:
             try:
                 self._step(i, prepared)
             except Exception as error:
-                self._failure = (fault_of(error),)
+                self._failure = (in_a_line(error),)
         if self._failure:
             self._step_without_pose(i)
 
@@ -133,12 +132,3 @@ class DrivenRun(TrialRun):
     def _step_without_pose(self, i: int) -> None:
         super()._step_without_pose(i)
         self.unhealthy["no_pose"] += 1
-
-
-def fault_of(error: Exception) -> str:
-    """An exception in a line, with the place where it was raised."""
-    if isinstance(error, AdaptuneError):
-        return str(error)
-    at = traceback.extract_tb(error.__traceback__)[-1]
-    what = traceback.format_exception_only(error)[-1].strip()
-    return f"{what} ({at.filename}, line {at.lineno})"

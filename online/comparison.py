@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from adaptune import report
 from adaptune.geometry import invert
 from adaptune.model import ErrorModel
+from adaptune.study.inputs import check_model
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
 from online.modes import ReplaySetup
@@ -101,6 +102,10 @@ def _check_replays(study: Study, setup: ReplaySetup) -> None:
     """Refuse replays that are missing, or of another recording or configuration."""
     model = ErrorModel.load(study.model_path) if study.model_path.exists() else None
     own, digest = str(study.model_path.resolve()), "" if model is None else model.digest
+    places = [study.folder / "replays" / name for name in study.config.test]
+    summaries = [ReplaySummary.read(place / mode) for place in places for mode in setup.modes]
+    if model is not None and own in {summary.model_file for summary in summaries}:
+        check_model(study, model.sequences, model.provenance)
     for name in study.config.test:
         shared = shared_identity(study, name)
         for mode in setup.modes:

@@ -3,7 +3,6 @@
 import signal
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -11,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry.base import Odometry, Registration, Usage
 from adaptune.odometry.isolation import Faulting, pose_fault
@@ -138,9 +137,7 @@ class Guarded(Faulting):
             what = f"a scan took longer than isolation.seconds = {self._seconds:g}"
             raise _FaultError(what) from error
         except (Exception, SystemExit) as error:
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            what = "".join(traceback.format_exception_only(error)).strip()
-            raise _FaultError(f"{what} ({last.filename}, line {last.lineno})") from error
+            raise _FaultError(in_a_line(error)) from error
 
 
 def _checked(prepared: Any) -> Any:

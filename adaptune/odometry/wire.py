@@ -166,7 +166,7 @@ def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Serve
     try:
         checked = cls.settings_type.model_validate(settings)
     except ValidationError as error:
-        raise OdometryError(f"settings: {error}") from error
+        raise OdometryError(f"settings: {in_one_line(error, settings)}") from error
     return cls(parameters, checked), cls.describe(checked)
 
 

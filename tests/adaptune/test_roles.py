@@ -32,9 +32,6 @@ def test_parts_become_sequences_of_their_own(study_file, tmp_path):
     )
     assert first + second == [scan.stamp for scan in study.sequences.open("one")]
     assert len(first) == pytest.approx(24, abs=1)
-    study.open()
-    with pytest.raises(ConfigurationError, match="training"):
-        load_study(study_file, ["training=[one: 0-50%, two]"], tmp_path).open()
 
 
 def test_parts_are_augmented(study_file):

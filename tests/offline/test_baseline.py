@@ -27,7 +27,7 @@ def study_of(study_file, folder, *given, name="Stumbling", **settings):
 @pytest.mark.parametrize("fault", ["constructor", "prepare", "start", "register", "nothing", "NaN"])
 def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, name, fault):
     study = study_of(study_file, tmp_path / "study", name=name, fault=fault)
-    reason = {"nothing": "NoneType", "NaN": "pose"}.get(fault, "no licence")
+    reason = {"nothing": "returned None", "NaN": "pose"}.get(fault, "no licence")
     with pytest.raises(AdaptuneError, match=rf"sequences\.(one|two): .*baseline.*{reason}.*again"):
         train(study)
     assert not list(study.folder.rglob("*.npz"))

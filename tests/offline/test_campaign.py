@@ -164,7 +164,7 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
         return worker
 
     monkeypatch.setattr(Workers, "_spawn", doomed)
-    with pytest.raises(WorkerError, match=r"died \(exit code -9\) on one, trials 0"):
+    with pytest.raises(WorkerError, match=r"died \(its process was ended by SIGKILL\) on one"):
         train(study)
 
 

@@ -12,6 +12,7 @@ from adaptune.model.base import Rule
 from adaptune.selection import Selection
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import driven
+from adaptune.study.mistakes import ConfigurationError
 from offline import tuning
 from offline import validate as validation_of_study
 from offline.bank_simulation import BankSimulation
@@ -260,8 +261,10 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     ]
     for name in ("validation", "learning", "banks"):
         assert (study.folder / f"{name}.csv").exists()
+    other_range = "odometry.parameters.keyframe_interval.high=20"
+    with pytest.raises(ConfigurationError, match=r"keyframe_interval\.high has another value"):
+        validate(load_study(study_file, [other_range], study.folder))
     for other, text in (
-        ("odometry.parameters.keyframe_interval.high=20", "other parameters or ranges"),
         ("training=[one]", "other training sequences"),
         ("descriptor.window=0", "other training sequences or descriptors"),
     ):

@@ -49,7 +49,8 @@ def test_offline_shows_scans_and_runs(study_file, tmp_path, workers):
     train(load_study(study_file, overrides, tmp_path), lambda *call: calls.append(call))
     for name in ("one", "two"):
         assert (f"reading {name}", 40, 40, "") in calls
-    for what, total in (("runs", 8), ("whole runs", 4)):
+    # Two sequences; the baseline's whole runs come first.
+    for what, total in (("baseline", 2), ("runs", 8), ("whole runs", 2 * 3)):
         done = [call[1] for call in calls if call[0] == what]
         assert done[-1] == total
         if workers == 1:
