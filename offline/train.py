@@ -95,8 +95,7 @@ def train(
         verdicts = run_batches(study, archive, workers, progress)
         best = candidates(config, verdicts)
         sets = {n: verdicts[n].parameters for n in sorted({0, *best})}
-        health = study.config.health
-        whole = run_whole(study.training, sets, health, archive, workers, progress)
+        whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, verdicts, fixed)
     finished = {

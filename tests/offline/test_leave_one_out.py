@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tables import table
 
+from adaptune.errors import AdaptuneError
 from adaptune.metrics import sub_trajectory_vectors
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.base import Rule
@@ -268,7 +269,7 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
         ("training=[one]", "other training sequences"),
         ("descriptor.window=0", "other training sequences or descriptors"),
     ):
-        with pytest.raises(ModelError, match=text):
+        with pytest.raises(AdaptuneError, match=text):
             validate(load_study(study_file, [other], study.folder))
     assert "no whole runs" not in caplog.text
     validate(load_study(study_file, ["health.max_speed=30"], study.folder))

@@ -55,7 +55,15 @@ def rows(name, numbers):
 
 
 def test_modes_with_equal_errors_are_all_seen(tmp_path):
-    modes = ["baseline", "fixed", "paired", "paper", "one set", "oracle, sequence", "oracle, period"]
+    modes = [
+        "baseline",
+        "fixed",
+        "paired",
+        "paper",
+        "one set",
+        "oracle, sequence",
+        "oracle, period",
+    ]
     path = tmp_path / "validation.png"
     draw_validation(path, "study", results(modes))
     said = texts(path)
