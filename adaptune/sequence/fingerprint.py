@@ -23,6 +23,8 @@ MANY = 64
 """So many files have one hash together."""
 
 _BLOCK = 1 << 20
+_LONG = 1 << 30
+"""Bytes that take more than a second to read."""
 _SIZE = 16
 
 _log = logging.getLogger(__name__)
@@ -94,9 +96,8 @@ def _fingerprints(files: Sequence[Path], stop: threading.Event, tell: bool = Fal
     try:
         remember, keys = _total(files) >= SMALL, [_key(file) for file in files]
         known = remember and _known(files)
-        if tell and remember and not known:
-            size = _total(files) / 1e9
-            _log.info("%s: reading %.1f GB to see whether it has changed", file, size)
+        if tell and remember and not known and (size := _total(files)) > _LONG:
+            _log.info("%s: reading %.1f GB to know it by its content", file, size / 1e9)
         new: dict[str, str] = {}
         found = []
         for file, key in zip(files, keys, strict=True):
