@@ -99,8 +99,9 @@ class Faulting(OdometryInstance):
     def note_fault(self, what: str) -> Registration:
         """Note a fault and end; the pose of a scan with a fault."""
         self.close()
+        if what not in self.faults:
+            _log.warning("%s with %s: %s", self.name, self.parameters, what)
         self.faults = [*self.faults, what]
-        _log.warning("%s with %s: %s", self.name, self.parameters, what)
         if self.given_up:
             _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
         return Registration(np.full((4, 4), np.nan), registered=False)

@@ -77,6 +77,17 @@ def test_faults_are_told_and_another_start_goes_on(fault, caplog):
     assert odometry.register(scan(6)).T_odom_sensor[0, 3] == 1.0
 
 
+def test_equal_faults_are_told_once(caplog):
+    odometry = Process({}, program("no pose"), Limits(seconds=20.0))
+    for _ in range(2):
+        odometry.start(scan(0), np.eye(4))
+        for i in (1, 2, 3):
+            odometry.register(scan(i))
+    first, second = odometry.faults
+    assert first == second
+    assert len(caplog.messages) == 1
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
