@@ -1,6 +1,7 @@
 """One parameter set on one sequence, or several at once on one pass over it."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, Self
@@ -91,12 +92,14 @@ class PreparedSequence:
         self._odometry: OdometryInstance | None = None
         self._kept: list[Any] = []
         self.nbytes = 0
-        describe = Describer(settings.descriptors)
+        with _of_sequence(name):
+            describe = Describer(settings.descriptors)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
         for scan in _watched(scans, scans.n_messages, advance):
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
-            descriptors.append(_described(describe, scan, name))
+            with _of_sequence(name):
+                descriptors.append(describe(scan))
             elevations.append(lowest_elevation(scan))
             if full:
                 continue
@@ -147,9 +150,11 @@ def _watched(scans: Iterable[Any], n: int, advance: Advance) -> Iterator[Any]:
     advance(done, done)
 
 
-def _described(describe: Describer, scan: sequence.Scan, name: str) -> NDArray[np.float32]:
+@contextmanager
+def _of_sequence(name: str) -> Iterator[None]:
+    """Name the sequence in errors of descriptors."""
     try:
-        return describe(scan)
+        yield
     except DescriptorError as error:
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
