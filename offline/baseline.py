@@ -7,7 +7,6 @@ from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.frame_check import contradiction
 from adaptune.odometry.isolation import MOST_FAULTS
-from adaptune.study.run_folder import CONFIGURATION
 from offline.campaign import Progress, watched
 from offline.offline_study import OfflineStudy
 from offline.whole_runs import whole_run
@@ -45,15 +44,9 @@ def run_baseline(
         if whole_run(archive, name, 0, health) is None
     ]
     done = []
-    try:
-        for task, result in watched(workers, tasks, "baseline", progress):
-            check_baseline(study.odometry.name, task.sequence, result.trials[0])
-            done.append((task, result))
-    except AdaptuneError:
-        if not any(archive.folder.glob("*/*.npz")):
-            # Nothing binds the folder to this configuration: it may be mended.
-            (study.folder / CONFIGURATION).unlink(missing_ok=True)
-        raise
+    for task, result in watched(workers, tasks, "baseline", progress):
+        check_baseline(study.odometry.name, task.sequence, result.trials[0])
+        done.append((task, result))
     for task, result in done:
         if result.frames is not None:
             archive.write_frames(task.sequence, result.frames)

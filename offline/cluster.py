@@ -13,7 +13,6 @@ import io
 import logging
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple, Self
 from uuid import uuid4
 
@@ -25,7 +24,9 @@ from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.sequence import Scan, SequenceConfig, cache
+from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.imu import Imu, ImuNoise
+from adaptune.sequence.opening import sequence_files
 from adaptune.sequence.views import WithImu
 from adaptune.study.sequences import StudySequences
 from offline.trial import TrialSetup
@@ -36,7 +37,6 @@ CHUNK = 1 << 26
 
 _TIMEOUT = 10.0
 _PERIOD = 1.0
-_SAMPLE = 1 << 16
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class Cluster:
         self._sequences = setup.sequences
         self._memory = memory
         self._address = address
-        self._digests = {name: fingerprint(setup.sequences.config(name)) for name in names}
+        self._digests = {name: recording_digest(setup.sequences.config(name)) for name in names}
         self._away = _away(setup, self._digests)
         # Distinguishes this campaign from others on the same workers.
         self._token = uuid4().hex
@@ -269,30 +269,20 @@ def _pack(sequence: Any, stamps: NDArray[np.int64], *, imu: bool) -> str:
     return base64.b64encode(packed.getvalue()).decode()
 
 
-def fingerprint(config: SequenceConfig) -> str:
-    """Digest of a recording and its settings; paths and times of change do not count.
+def recording_digest(config: SequenceConfig) -> str:
+    """Digest of a recording's content and its settings; paths and times of change do not count.
 
     Raises
     ------
-    OSError
-        If a file cannot be read.
+    AdaptuneError
+        If a file is missing or cannot be read.
     """
     settings = config.model_dump_json(exclude={"bag", "kitti", "folder", "reference", "cache"})
-    digest = hashlib.blake2b(f"{__version__} {settings}".encode(), digest_size=16)
-    paths = config.paths()
-    if Path(config.reference or "") not in paths:
-        digest.update(f"{config.reference}".encode())
-    for path in paths:
-        inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else []
-        for file in inside:
-            digest.update(f"{file.relative_to(path)} {file.stat().st_size}".encode())
-        if not inside:
-            with path.open("rb") as stream:
-                size = path.stat().st_size
-                digest.update(f"{size} ".encode() + stream.read(_SAMPLE))
-                stream.seek(max(size - _SAMPLE, 0))
-                digest.update(stream.read(_SAMPLE))
-    return digest.hexdigest()
+    files = sequence_files(config)
+    topic = None if files.reference else config.reference
+    found = [*fingerprints(files.recording), *fingerprints(files.reference)]
+    about = f"{__version__} {settings} {topic} {' '.join(found)}"
+    return hashlib.blake2b(about.encode(), digest_size=16).hexdigest()
 
 
 # What follows runs on the workers.
@@ -302,7 +292,7 @@ def fingerprint(config: SequenceConfig) -> str:
 class AwaySequences(StudySequences):
     """The sequences of a study on a worker, which may not have the recordings."""
 
-    digests: Mapping[str, str]  # `fingerprint` of every sequence at the driver
+    digests: Mapping[str, str]  # `recording_digest` of every sequence at the driver
 
     def open(self, name: str) -> Any:
         """See `StudySequences.open`.
@@ -314,7 +304,7 @@ class AwaySequences(StudySequences):
         """
         digest = self.digests[name]
         with contextlib.suppress(AdaptuneError, OSError):
-            if fingerprint(self.config(name)) == digest:
+            if recording_digest(self.config(name)) == digest:
                 return super().open(name)
         entry = cache.find(digest)
         if entry is None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import count, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +53,7 @@ class Search:
     ):
         self.sequences = list(sequences)
         self.verdicts: list[Verdict] = []
+        self._closed: list[int] = []  # trial numbers of the verdicts
         self.best = 0
         self.numbers: list[int] = []
         self.order = self.sequences
@@ -70,7 +72,14 @@ class Search:
 
     def number(self, i: int) -> int:
         """Trial number in the study of trial `i` of this search."""
+        if i < len(self._closed):
+            return self._closed[i]
         return OF_SLOT * self._slot + i if i else 0
+
+    def _next_numbers(self, n: int) -> list[int]:
+        """Numbers for the next trials: of a finite space, later ones may have been run before."""
+        every = map(self.number, count(len(self._closed)))
+        return list(islice((number for number in every if number not in self._closed), n))
 
     @property
     def done(self) -> dict[int, Verdict]:
@@ -86,7 +95,7 @@ class Search:
             return False
         first, size = len(self.verdicts), self._config.batch
         stop = first + size if self._limit is None else min(first + size, self._limit)
-        self.numbers = [self.number(i) for i in range(first, stop)]
+        self.numbers = self._next_numbers(stop - first)
         self._sets = {n: self._known[n] for n in self.numbers if n in self._known}
         if first and self._config.pruning != "none":
             self.order = self._hardest_first()
@@ -125,6 +134,7 @@ class Search:
         first = len(self.verdicts)
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
+        self._closed += self.numbers
         candidates = (self.best, *range(first, len(self.verdicts)))
         self.best = min(candidates, key=lambda i: _rank(self.verdicts[i]))
         if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:

@@ -6,7 +6,9 @@ import os
 import signal
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
@@ -37,6 +39,7 @@ class Task(NamedTuple):
     sets: tuple[ParameterSet, ...]  # the parameter sets of the trials
     whole: bool = False  # run them from end to end, without restarts at the reference
     frames: bool = False  # return the frames, which all trials on the sequence share, too
+    apart: bool = False  # run classes of the user in processes of their own, also clean ones
 
     def __str__(self) -> str:
         trials = f"trials {', '.join(map(str, self.numbers))}" if self.numbers else "its scans"
@@ -133,7 +136,7 @@ class _Queue(Generic[W]):
         self.finished: list[tuple[Task, TaskResult]] = []
         self.failure: AdaptuneError | None = None
         self._pool, self._report = pool, report
-        self._deaths: dict[int, int] = {}
+        self._deaths = Counter[tuple[str, tuple[int, ...]]]()
         self._near: dict[W, set[str]] = {}
 
     @property
@@ -167,9 +170,11 @@ class _Queue(Generic[W]):
                 self._again(task, outcome)
 
     def _again(self, task: Task, death: Death) -> None:
+        # A class that is not as clean as it says then costs its own trial only.
+        task = task._replace(apart=True)
         self.waiting.insert(0, task)
-        self._deaths[id(task)] = self._deaths.get(id(task), 0) + 1
-        if self._deaths[id(task)] == MOST_DEATHS:
+        self._deaths[task.sequence, task.numbers] += 1
+        if self._deaths[task.sequence, task.numbers] == MOST_DEATHS:
             self.failure = WorkerError(
                 f"{MOST_DEATHS} workers died ({death.cause}) on {task}; if they were out of "
                 f"memory, lower offline.memory or offline.workers"
@@ -188,25 +193,29 @@ class Sequences:
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
+        self._apart = replace(setup, odometry=replace(setup.odometry, user_code=False))
         self._memory = memory
-        self._ready: dict[str, PreparedSequence] = {}
+        self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 
     def run(self, task: Task, report: Report) -> TaskResult:
         """Do a task."""
-        sequence = self._prepared(task.sequence, report)
+        setup = self._apart if task.apart else self._setup
+        sequence = self._prepared(setup, task, report)
         advance = partial(_report, report, "running")
-        trials = self._setup.run(sequence, task.sets, task.whole, advance)
+        trials = setup.run(sequence, task.sets, task.whole, advance)
         return TaskResult(trials, sequence.frames if task.frames else None)
 
-    def _prepared(self, name: str, report: Report) -> PreparedSequence:
-        sequence = self._ready.pop(name, None)
+    def _prepared(self, setup: TrialSetup, task: Task, report: Report) -> PreparedSequence:
+        key = task.sequence, task.apart
+        sequence = self._ready.pop(key, None)
         if sequence is None:
             # Make room: drop the sequences that were not used for longest.
             while self._ready and sum(s.nbytes for s in self._ready.values()) > self._memory / 2:
                 del self._ready[next(iter(self._ready))]
             free = self._memory - sum(s.nbytes for s in self._ready.values())
-            sequence = self._setup.prepare(name, free, partial(_report, report, "reading"))
-        self._ready[name] = sequence
+            advance = partial(_report, report, "reading")
+            sequence = setup.prepare(task.sequence, free, advance)
+        self._ready[key] = sequence
         return sequence
 
 
@@ -298,6 +307,7 @@ class Workers:
 def _serve(connection: Connection, setup: TrialSetup, core: int, memory: float) -> None:
     # Ctrl-C reaches all processes; the driver decides what happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.setsid()  # user code may end its process group
     pin(core)
     sequences = Sequences(setup, memory)
     report = now_and_then(connection.send)

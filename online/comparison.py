@@ -1,6 +1,8 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,31 +101,55 @@ def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
 
 
 def _check_replays(study: Study, setup: ReplaySetup) -> None:
-    """Refuse replays that are missing, or of another recording or configuration."""
-    model = ErrorModel.load(study.model_path) if study.model_path.exists() else None
-    own, digest = str(study.model_path.resolve()), "" if model is None else model.digest
-    places = [study.folder / "replays" / name for name in study.config.test]
-    summaries = [ReplaySummary.read(place / mode) for place in places for mode in setup.modes]
-    if model is not None and own in {summary.model_file for summary in summaries}:
-        check_model(study, model.sequences, model.provenance)
+    """Refuse replays that are missing, or of another recording, model or configuration."""
+    made = {
+        (name, mode): ReplaySummary.read(study.folder / "replays" / name / mode)
+        for name in study.config.test
+        for mode in setup.modes
+    }
+    path, model = _model_of(study, made.values())
+    for (name, mode), summary in made.items():
+        now, about = shared_identity(study, name), summary.about.model_dump()
+        if model is not None:
+            whole = setup.identity(mode, model, model.digest)
+            now |= {key: whole[key] for key in ("model", "parameters")}
+            if not _is_automatic(study, whole["switching"], about["switching"]):
+                now["switching"] = whole["switching"]
+        if differing := [key for key, value in now.items() if about[key] != value]:
+            own = path == study.model_path.resolve()
+            raise StoredReplayError(
+                f"{study.folder / 'replays' / name / mode}: was replayed with another "
+                f"{', '.join(differing)}; run `adaptune online{'' if own else f' --model {path}'}` "
+                f"with this study"
+            )
     for name in study.config.test:
-        shared = shared_identity(study, name)
-        for mode in setup.modes:
-            now = dict(shared)
-            folder = study.folder / "replays" / name / mode
-            summary = ReplaySummary.read(folder)
-            made = summary.about.model_dump()
-            if model is not None and summary.model_file == own:
-                now |= {
-                    key: setup.identity(mode, model, digest)[key] for key in ("model", "parameters")
-                }
-            if differing := [key for key, value in now.items() if made[key] != value]:
-                raise StoredReplayError(
-                    f"{folder}: was replayed with another {', '.join(differing)}; run `adaptune "
-                    f"online` with this study"
-                )
         if not is_reference_of(study.folder / "replays" / name, study.sequences.reference(name)):
             raise StoredReplayError(
                 f"{study.folder / 'replays' / name}: was judged by another reference; run "
                 f"`adaptune online` with this study, which replays nothing for it"
             )
+
+
+def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:
+    """File of the model that all replays are of, and the model if the file is still there."""
+    own = study.model_path.resolve()
+    files = {s.about.model: s.model_file for s in summaries if s.about.model is not None}
+    if len(files) > 1:
+        raise StoredReplayError(
+            f"{study.folder / 'replays'}: holds replays with different models "
+            f"({' and '.join(sorted(set(files.values())))}); run `adaptune online` again"
+        )
+    path = Path(next(iter(files.values()), own))
+    if not path.exists():
+        return path, None
+    model = ErrorModel.load(path)
+    if path == own:
+        check_model(study, model.sequences, model.provenance)
+    return path, model
+
+
+def _is_automatic(study: Study, now: Any, made: Any) -> bool:
+    """Whether a replay differs only in the mechanism that this machine would choose."""
+    if study.config.online.switching.mechanism != "auto" or None in (now, made):
+        return False
+    return bool(now["mechanism"] != made["mechanism"])

@@ -61,7 +61,7 @@ def run_replays(
         sub-trajectories, or what the study's own model was fitted to has changed.
     """
     model = ErrorModel.load(model_path)
-    if model_path == study.model_path:
+    if model_path.resolve() == study.model_path.resolve():
         check_model(study, model.sequences, model.provenance)
     length = study.config.sub_trajectory
     model.check_study(study.odometry.identity, study.odometry.space, length, model_path)

@@ -23,4 +23,6 @@ def test_stages_needs_its_argument_only(recorded, monkeypatch):
     monkeypatch.chdir(recorded.parent)
     stages.main(Path(recorded.name))
     bags = {sequence.bag for study in measured for sequence in study.config.sequences.values()}
-    assert bags == {str(recorded / "hall.bag"), str(recorded / "street.bag")}
+    assert {Path(bag).resolve() for bag in bags} == {
+        (recorded / name).resolve() for name in ("hall.bag", "street.bag")
+    }

@@ -21,7 +21,7 @@ Content = dict[str, str]
 """By what it is of, in words, a version or the hash of a file."""
 
 
-def odometry_content(name: str, settings: Any) -> Content:
+def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     """What the poses of an odometry depend on besides its name, settings and parameters.
 
     Parameters
@@ -30,6 +30,8 @@ def odometry_content(name: str, settings: Any) -> Content:
         See `adaptune.odometry.registry.odometry_class`.
     settings
         Its settings, which name the files of a program.
+    module
+        Module in which the class is written, if another one exports it.
     """
     if name in PROGRAMS:
         return _program(settings)
@@ -37,7 +39,7 @@ def odometry_content(name: str, settings: Any) -> Content:
         adapter = ODOMETRIES[name].split(":")[0].removeprefix("adaptune.odometry.").split(".")[0]
         package = PACKAGES.get(adapter, adapter)
         return {f"version of {package}": _version(package)}
-    return _python(name, ENTRY_POINTS)
+    return _python(name, ENTRY_POINTS, module)
 
 
 def descriptor_content(names: Iterable[str]) -> Content:
@@ -49,7 +51,7 @@ def descriptor_content(names: Iterable[str]) -> Content:
     return found
 
 
-def _python(name: str, group: str) -> Content:
+def _python(name: str, group: str, written_in: str = "") -> Content:
     """Source of a module, and version of the distribution that it is from."""
     versions: Content = {}
     if ":" not in name:
@@ -65,7 +67,8 @@ def _python(name: str, group: str) -> Content:
         # This takes half a second.
         for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
             versions[f"version of {package}"] = _version(package)
-    return versions | {f"module {module}": fingerprint(file)}
+    files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
+    return versions | {f"module {m}": fingerprint(f) for m, f in files.items()}
 
 
 def module_file(name: str) -> Path | None:
@@ -86,8 +89,9 @@ def _program(settings: Any) -> Content:
     program, *arguments = settings.command or ("",)
     for name in (shutil.which(program), *arguments, getattr(settings, "template", None)):
         # Arguments may be anything, also too long for a path.
-        if name and os.path.isfile(name):  # noqa: PTH113
-            found[name] = fingerprint(Path(name))
+        for file in (name or "", *(name or "").split("=", 1)[1:]):
+            if os.path.isfile(file):  # noqa: PTH113
+                found[file] = fingerprint(Path(file))
     return found
 
 

@@ -36,12 +36,15 @@ class Declaration:
         None if the odometry cannot be described without sound settings.
     clean : bool
         Whether instances in one process know nothing of each other, see `Odometry`.
+    module : str
+        Module in which its class is written.
     """
 
     settings: Any
     mistakes: list[Mistake]
     description: Description | None
     clean: bool
+    module: str
 
     def sound(self, name: str) -> tuple[Any, Description]:
         """Settings and description.
@@ -85,6 +88,7 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
         [Mistake(tuple(key), message) for key, message in answer["mistakes"]],
         Description(space, answer["live"], answer["needs_imu"], warm_up, answer["whole"]),
         answer["clean"],
+        answer["module"],
     )
 
 
@@ -96,7 +100,7 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     found: Any = validated(cls.settings_type, settings, (), mistakes, context)
     is_class = issubclass(cls, Odometry)
     described = cls.describe(found) if is_class or found is not None else None
-    return Declaration(found, mistakes, described, is_class and cls.clean)
+    return Declaration(found, mistakes, described, is_class and cls.clean, cls.__module__)
 
 
 @cache

@@ -38,6 +38,7 @@ def _declared(name: str, message: wire.Message) -> dict[str, Any]:
         "warm_up": list(described.warm_up),
         "whole": described.whole,
         "clean": found.clean,
+        "module": found.module,
         "settings": found.settings and found.settings.model_dump(mode="json"),
         "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
     }

@@ -13,7 +13,7 @@ from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.process import Process
 from adaptune.odometry.program_input import ProgramInput
-from adaptune.odometry.registry import is_user_class, odometry_class, versions
+from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, versions
 from adaptune.space import ParameterSet, ParameterSpace
 
 
@@ -38,6 +38,8 @@ class OdometryFactory:
         the user can do without may allow it.
     description : Description
         What a study must know of the odometry.
+    module : str
+        Module in which its class is written.
     """
 
     name: str
@@ -47,6 +49,7 @@ class OdometryFactory:
     program_input: Callable[[str], ProgramInput] | None = None
     user_code: bool = False
     description: Description = field(init=False)
+    module: str = field(init=False)
     _clean: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -56,6 +59,7 @@ class OdometryFactory:
             ("settings", settings),
             ("description", description),
             ("_clean", declared.clean),
+            ("module", declared.module),
         ):
             object.__setattr__(self, name, value)
 
@@ -63,6 +67,11 @@ class OdometryFactory:
     def identity(self) -> dict[str, Any]:
         """Name and settings, by which a model knows the odometry that it was made for."""
         return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
+
+    @property
+    def apart(self) -> bool:
+        """Whether it runs in processes of their own, which have limits."""
+        return self.name in PROGRAMS or not self._clean or is_user_class(self.name)
 
     @property
     def versions(self) -> dict[str, str]:

@@ -136,7 +136,7 @@ class Guarded(Faulting):
         except _LateError as error:
             what = f"a scan took longer than isolation.seconds = {self._seconds:g}"
             raise _FaultError(what) from error
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             raise _FaultError(in_a_line(error)) from error
 
 

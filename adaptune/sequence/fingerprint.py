@@ -94,7 +94,7 @@ def _fingerprints(files: Sequence[Path], stop: threading.Event, tell: bool = Fal
         return []
     file = files[0]
     try:
-        remember, keys = _total(files) >= SMALL, [_key(file) for file in files]
+        remember, keys = _total(files) >= SMALL, [status_key(file) for file in files]
         known = remember and _known(files)
         if tell and remember and not known and (size := _total(files)) > _LONG:
             _log.info("%s: reading %.1f GB to know it by its content", file, size / 1e9)
@@ -115,7 +115,7 @@ def _total(files: Sequence[Path]) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-def _key(file: Path) -> str:
+def status_key(file: Path) -> str:
     """Hash of all by which a file shows that it is the same as before."""
     status, path = file.stat(), os.fsencode(file.absolute())
     times = f" {status.st_ino} {status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}"
@@ -130,14 +130,14 @@ def hash_file(file: Path, key: str, stop: threading.Event) -> str:
             digest.update(block)
             if stop.is_set():
                 raise _StoppedError
-    if _key(file) != key:
+    if status_key(file) != key:
         raise FingerprintError(f"{file}: changes while it is read; run again when it is complete")
     return digest.hexdigest()
 
 
 def _known(files: Sequence[Path]) -> bool:
     """Whether the hashes of all files are known, here or on disk."""
-    keys = set(map(_key, files))
+    keys = set(map(status_key, files))
     if not keys <= remembered.keys():
         with suppress(OSError, UnicodeDecodeError):
             for line in (cache.folder() / FILE).read_text("ascii").splitlines():

@@ -1,5 +1,6 @@
 """Open the sequences that a study describes."""
 
+import math
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from pathlib import Path
@@ -73,9 +74,18 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
     return SequenceFiles(source.files, source.pose_files if own is None else own)
 
 
-def section_of(config: SequenceConfig) -> Section:
-    """The part of its recording that a sequence is; a SequenceError if it cannot be opened."""
-    return _recorded(config).section
+def interval_of(config: SequenceConfig) -> tuple[float, float]:
+    """From which stamp to before which one a sequence uses its recording, in nanoseconds.
+
+    Raises
+    ------
+    SequenceError
+        If it cannot be opened.
+    """
+    recorded = _recorded(config)
+    section, (first, _) = recorded.section, recorded.source.span() or (0, 0)
+    stop = math.inf if section.stop is None else first + 1e9 * section.stop
+    return first + 1e9 * section.start, stop
 
 
 def _recorded(config: SequenceConfig) -> RecordedSequence:

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adaptune import __version__
+from adaptune.archive import Archive
 from adaptune.files import write_text
 from adaptune.odometry.content import descriptor_content, odometry_content
-from adaptune.sequence.fingerprint import MANY
+from adaptune.sequence.fingerprint import MANY, status_key
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.study.run_folder import differences
 from adaptune.study.study import Study
@@ -25,6 +26,7 @@ class Stale(NamedTuple):
     name: str
     changes: Sequence[str]  # what has changed, in words
     odometry: bool  # whether this concerns all sequences
+    trials: Sequence[int] | None = None  # which of its trials; None for all
 
 
 class InputNotes:
@@ -34,16 +36,37 @@ class InputNotes:
         self._study = study
         # What runs is what is there now, whatever becomes of the files.
         self._odometry, self._descriptors = odometry_inputs(study), described_by(study)
+        lacking = [name for name in study.training if not _path(study, name).exists()]
+        self._statuses = {name: _statuses(study, name) for name in lacking}
 
     def __call__(self, name: str) -> None:
-        """Write the note of a sequence, if it has none."""
+        """Write the note of a sequence, if it has none.
+
+        Raises
+        ------
+        ConfigurationError
+            If a file of the sequence has changed since this was made: what was read is not known.
+        """
         path = _path(self._study, name)
         if path.exists():
             return
+        now, before = _statuses(self._study, name), self._statuses.get(name)
+        if before is not None and now != before:
+            changed = next(iter(dict(now.items() ^ before.items())))
+            raise ConfigurationError(
+                f"{changed}: has changed while {name} was read, and nothing on {name} is stored; "
+                f"run the same command again"
+            )
         of_sequence = self._study.sequences.identity(name) | self._study.sequences.reference(name)
         about = {"adaptune": __version__, "odometry": self._odometry}
         about |= {"descriptors": self._descriptors}
         write_text(path, json.dumps(about | of_sequence, indent=1) + "\n")
+
+
+def _statuses(study: Study, name: str) -> dict[Path, str]:
+    """By file of a sequence, what shows that it is the same as before."""
+    files = study.sequences.files(name)
+    return {file: status_key(file) for file in (*files.recording, *files.reference)}
 
 
 def odometry_inputs(study: Study) -> dict[str, Any]:
@@ -52,8 +75,10 @@ def odometry_inputs(study: Study) -> dict[str, Any]:
     about = {
         **odometry.identity,
         "parameters": odometry.space.dump(),
-        "content": odometry_content(odometry.name, odometry.settings),
+        "content": odometry_content(odometry.name, odometry.settings, odometry.module),
     }
+    if odometry.apart:
+        about["limits"] = study.config.isolation.model_dump()
     plain: dict[str, Any] = json.loads(json.dumps(about))
     return plain
 
@@ -88,6 +113,11 @@ def stale(study: Study) -> list[Stale]:
             changes += _sequence_changes(study, name, before)
         if changes:
             found.append(Stale(name, changes, odometry))
+        elif keys := sorted(_other_limits(before["odometry"], now)):
+            runs = Archive(study.folder / "trials").finished(name)
+            if faulty := [n for n, run in runs.items() if run.faults]:
+                values = [f"isolation.{key} has another value" for key in keys]
+                found.append(Stale(name, values, odometry=False, trials=faulty))
     return found
 
 
@@ -102,7 +132,12 @@ def check_inputs(study: Study) -> None:
     if not (found := stale(study)):
         return
     changes = dict.fromkeys(change for one in found for change in one.changes)
-    results = [f"{n_trials(study, one.name)} trials on {one.name}" for one in found]
+    results = [
+        f"{n_trials(study, one.name)} trials on {one.name}"
+        if one.trials is None
+        else f"{len(one.trials)} trials with faults on {one.name}"
+        for one in found
+    ]
     results += ["the model"] if study.model_path.exists() else []
     everything = any(one.odometry for one in found)
     replays = [
@@ -180,6 +215,13 @@ def _remove_stale(study: Study) -> None:
     found = stale(study)
     for one in found:
         folder = study.folder / "trials" / one.name
+        if one.trials is not None:
+            for path in (path for n in one.trials for path in folder.glob(f"{n:05d}*.npz")):
+                path.unlink()
+            note = _read(study, one.name) or {}
+            note["odometry"] |= {"limits": odometry_inputs(study).get("limits")}
+            write_text(folder / FILE, json.dumps(note, indent=1) + "\n")
+            continue
         # The note goes last: until then, the trials are known to be stale.
         for path in (*folder.glob("*.npz"), folder / FILE):
             path.unlink(missing_ok=True)
@@ -247,6 +289,12 @@ def _odometry_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iter
             yield f"the {what} is {is_}, and was {was}"
         else:
             yield f"{what} has other content than when the trials were run"
+
+
+def _other_limits(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[str]:
+    """Limits on the odometry's processes that differ; only trials with faults depend on them."""
+    limits = now.get("limits")
+    return differences(before.get("limits", limits), limits)
 
 
 def _sequence_changes(study: Study, name: str, before: Mapping[str, Any]) -> Iterator[str]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.fingerprint import MANY, fingerprint
-from adaptune.sequence.opening import section_of, sequence_files
+from adaptune.sequence.opening import interval_of, sequence_files
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import Mistake
 
@@ -58,7 +58,6 @@ def _scan_files(config: SequenceConfig) -> Sequence[Path]:
 
 
 def _same_time(a: SequenceConfig, b: SequenceConfig) -> bool:
-    """Whether two sections of one recording overlap."""
-    one, other = section_of(a), section_of(b)
-    ends = [float("inf") if section.stop is None else section.stop for section in (one, other)]
-    return one.start < ends[1] and other.start < ends[0]
+    """Whether sections overlap, by the stamps of their recordings."""
+    (begin, end), (other_begin, other_end) = interval_of(a), interval_of(b)
+    return begin < other_end and other_begin < end

@@ -83,7 +83,8 @@ def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
         raise ValueError("each part is an entry of its own, as in [hall: 0-60%, town: 0-60%]")
     name = next(iter(entry)) if isinstance(entry, dict) else entry
     if name not in known or name in origins:
-        raise ValueError(f"there is no sequence {name!r}: {nearest(str(name), map(str, known))}")
+        whole = [str(other) for other in known if other not in origins]
+        raise ValueError(f"there is no sequence {name!r}: {nearest(str(name), whole)}")
     if isinstance(entry, str):
         return _Named(name, name, _WHOLE)
     try:
@@ -104,7 +105,11 @@ def _check(role: str, named: _Named, found: dict[str, list[_Named]]) -> None:
     split = f"to split it, write training: [{name}: 0-60%], test: [{name}: 60-100%]"
     if named in found[role]:
         raise ValueError(f"{named.name!r} is named twice")
-    for other in found["training"] if role == "test" else ():
+    if role == "training":
+        for other in filter(named.overlaps, found[role]):
+            raise ValueError(f"{named.name} overlaps {other.name}; name parts that share no scan")
+        return
+    for other in found["training"]:
         if named == other:
             raise ValueError(f"{name!r} is a training sequence, and proves nothing here; {split}")
         if named.overlaps(other):

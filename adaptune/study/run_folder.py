@@ -39,7 +39,9 @@ def check_folder(
             f"{path}: is damaged ({error}); give this study another folder (--folder), or remove "
             f"that one"
         ) from error
-    if differing := sorted(differences(before, lasting(resolved))):
+    differing = sorted(differences(before, lasting(resolved)))
+    # Without trials, nothing binds the folder to a configuration.
+    if differing and any(folder.glob("trials/*/*.npz")):
         raise ConfigurationError(
             f"{folder} was begun with other values of {', '.join(differing)}; give this study "
             f"another folder (--folder), or remove that one"

@@ -143,7 +143,9 @@ class Study(Generic[C_co]):
         return {
             "odometry": self.odometry.name,
             "settings": self.odometry.settings.model_dump(mode="json"),
-            "content": odometry_content(self.odometry.name, self.odometry.settings),
+            "content": odometry_content(
+                self.odometry.name, self.odometry.settings, self.odometry.module
+            ),
             "sequences": {name: self._measured_on(name) for name in self.config.training},
             "mechanism": self.mechanism,
             "warm_up": self.warm_up._asdict(),

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -234,3 +235,31 @@ def test_the_refusal_is_one_sentence_after_the_other(load, tmp_path):
         r"nothing else; or give this study another folder \(--folder\)",
         refused(study),
     )
+
+
+def test_what_changes_while_it_is_read_is_not_noted(load, tmp_path):
+    study = load()
+    note = InputNotes(study)
+    poses = tmp_path / "one.tum"
+    poses.write_text(poses.read_text().replace(" 0.3", " 0.4", 1) + "\n")
+    with pytest.raises(ConfigurationError, match=r"one\.tum: has changed while one was read"):
+        note("one")
+    assert not (study.folder / "trials/one/inputs.json").exists()
+    note("two")
+    InputNotes(study)("one")
+
+
+def test_trials_with_faults_depend_on_the_limits(load, tmp_path):
+    overrides, _ = mine(tmp_path)
+    study = load(*overrides)
+    archive = Archive(study.folder / "trials", InputNotes(study))
+    for number, faults in ((0, ()), (1, ("late",))):
+        archive.write("one", number, replace(trial({"x": number}), faults=faults))
+    archive.write("two", 0, trial({"x": 0}))
+    other = load(*overrides, "isolation.seconds=20")
+    words = r"isolation\.seconds has another value\. On this depend 1 trials with faults on one\."
+    with pytest.raises(ConfigurationError, match=words):
+        check_inputs(other)
+    resume(other, again=True)
+    assert sorted(Archive(study.folder / "trials").finished("one")) == [0]
+    check_inputs(other)

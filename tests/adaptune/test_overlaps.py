@@ -89,3 +89,12 @@ def test_two_names_of_one_course(load):
     with pytest.raises(ConfigurationError, match="'b' is the recording of the training"):
         load(*names)
     load(*names, "courses.b.seed=2")
+
+
+def test_sections_of_several_bags_are_compared_by_their_stamps(load, tmp_path):
+    earlier = [(stamp - 10 * 10**9, *rest) for stamp, *rest in drives.scans(9, 40)]
+    drives.write_bag(tmp_path / "earlier.bag", earlier)
+    both = ["sequences.one.bag=[earlier.bag, one.bag]", "sequences.one.start=11"]
+    with pytest.raises(ConfigurationError, match="proves nothing here"):
+        load(*both, "sequences.three.stop=2")
+    load(*both, "sequences.three.stop=1")

@@ -62,6 +62,16 @@ def test_parts_of_a_course_share_its_recording(study_file, tmp_path):
         ({"training": [{"ones": "0-60%"}]}, "training.0", "did you mean 'one'?"),
         ({"training": [{"one": "0-60%", "two": "0-60%"}]}, "training.0", "an entry of its own"),
         ({"training": [{"one": "0-60%"}] * 2}, "training.1", "named twice"),
+        (
+            {"training": [{"one": "0-60%"}, {"one": "50-100%"}]},
+            "training.1",
+            "overlaps one_0-60; name parts that share no scan",
+        ),
+        (
+            {"test": ["one_0-60"], "training": [{"one": "0-60%"}]},
+            "test.0",
+            "there is 'one', 'three', 'two'",
+        ),
         ({"training": ["one"], "test": ["one"]}, "test.0", "[one: 0-60%], test: [one: 60-100%]"),
         ({"training": ["one"], "test": [{"one": "60-100%"}]}, "test.0", "[one: 0-60%]"),
         (

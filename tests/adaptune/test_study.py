@@ -316,6 +316,12 @@ def test_folder_goes_on_only_with_the_same_study(study_file, tmp_path):
     load_study(study_file, [], folder).open()
     load_study(study_file, ["offline.trials=99", "test=[]", "online.period=2"], folder).open()
     other = load_study(study_file, ["offline.seed=9", "sub_trajectory=2"], folder)
+    other.open()
+    load_study(study_file, [], folder).open()
+    # From the first trial on, results depend on the configuration.
+    trial = folder / "trials/one/00000.npz"
+    trial.parent.mkdir(parents=True)
+    trial.touch()
     with pytest.raises(ConfigurationError, match=r"values of offline\.seed, sub_trajectory;"):
         other.open()
     # A test sequence may change: only replays depend on it, and they know what they are made of.

@@ -112,14 +112,14 @@ def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, wor
 def test_recordings_that_workers_lack_are_sent_once(
     study_file, tmp_path, scheduler, local, monkeypatch
 ):
-    own, digests = cluster.fingerprint, []
+    own, digests = cluster.recording_digest, []
 
     def elsewhere(config):
         digests.append(f"{own(config)}-sent")
         return digests[-1]
 
     # The workers, which are not patched, find that theirs are other recordings.
-    monkeypatch.setattr(cluster, "fingerprint", elsewhere)
+    monkeypatch.setattr(cluster, "recording_digest", elsewhere)
     monkeypatch.setattr(cluster, "CHUNK", 1 << 18)
     sent = []
     run = distributed.Client.run

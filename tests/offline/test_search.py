@@ -2,23 +2,27 @@
 
 import csv
 import itertools
+from functools import partial
 
 import drawn
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from adaptune.archive import Archive
+from adaptune.archive import Archive, Summary
 from adaptune.cli import app
 from adaptune.model import ErrorModel
 from adaptune.parameter_sets import ParameterSets
+from adaptune.space import Categorical, ParameterSpace
 from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
+from offline.config import OfflineConfig
 from offline.labelled import labelled_data
 from offline.leave_one_out import leave_one_out
 from offline.objective import best_by_trials
 from offline.offline_study import load_study
-from offline.search import make_stages, owner
+from offline.samplers import make_sampler
+from offline.search import Search, make_stages, owner
 from offline.train import train
 
 NAMES = ["one", "two", "three"]
@@ -268,3 +272,20 @@ def test_from_end_to_end(study_file, tmp_path):
 def test_pruning_needs_sets_that_are_shared(study_file):
     with pytest.raises(ConfigurationError, match="pruning spares trials further sequences"):
         load_study(study_file, ["offline.sets=own", "offline.pruning=halving"])
+
+
+def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
+    space = ParameterSpace({"k": Categorical(choices=("a", "b", "c"), baseline="a")})
+    config = OfflineConfig(trials=8, initial=2, batch=2)
+    finished: dict[str, dict[int, Summary]] = {"one": {}}
+    # Trial 100003 is known from another sequence.
+    known = {0: {"k": "a"}, 100003: {"k": "b"}}
+    sampler = partial(make_sampler, space, config)
+    search = Search(sampler, config, ["one"], finished, known, 1)
+    while search.begin(0.0):
+        for n in search.numbers:
+            finished["one"][n] = Summary(search.parameters(n), 1.0, 0, 0, 1.0)
+        search.close()
+    assert {n: v.parameters for n, v in search.done.items()} == {
+        n: run.parameters for n, run in finished["one"].items()
+    }

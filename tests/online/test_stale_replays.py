@@ -1,7 +1,9 @@
 """Replays and models whose recordings, odometry or reference have changed since they were made."""
 
+import json
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -133,6 +135,35 @@ def test_a_model_of_other_training_sequences(load):
     # A model of another study is the user's choice.
     other = shutil.copy(fewer.model_path, fewer.folder / "other.safetensors")
     assert run_replays(fewer, fewer.folder / other) == 0
+    # It is the study's own, however it is spelt.
+    with pytest.raises(AdaptuneError, match="was fitted to other training sequences"):
+        run_replays(fewer, Path(os.path.relpath(fewer.model_path)))
+
+
+def test_replays_with_two_models_are_not_compared(load):
+    study = load()
+    path = study.folder / "replays/three/paired/replay.json"
+    stored = json.loads(path.read_text())
+    stored |= {"model_file": "/gone/model.safetensors"}
+    stored["about"]["model"] = "another"
+    path.write_text(json.dumps(stored))
+    # Only one mode is adaptive here: it is of a model that is gone, and nothing else is known.
+    compare(study)
+    twice = study.folder / "replays/three/paper"
+    shutil.copytree(path.parent, twice)
+    stored["about"] |= {"mode": "paper", "model": "a third"}
+    (twice / "replay.json").write_text(json.dumps(stored))
+    both = load("online.rules=[paired, paper]")
+    with pytest.raises(StoredReplayError, match=r"different models .*run `adaptune online` again"):
+        compare(both)
+
+
+def test_other_ways_to_switch_are_not_compared(load):
+    other = load("online.switching.mechanism=hand_over", "online.switching.warm_up=3")
+    with pytest.raises(StoredReplayError, match="was replayed with another switching"):
+        compare(other)
+    assert run(other) == 1
+    compare(other)
 
 
 def test_a_model_that_is_older_than_the_trials(load):

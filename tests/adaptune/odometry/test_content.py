@@ -73,3 +73,17 @@ def test_descriptors_of_the_user_are_their_modules(package):
     after = descriptor_content(["ndt", "theirs.odometry:describe"])
     assert before.keys() == after.keys() == {"module theirs.odometry"}
     assert before != after
+
+
+def test_a_class_is_also_the_module_in_which_it_is_written(package):
+    (package / "inner.py").write_text("1")
+    before = odometry_content("theirs.odometry:Mine", None, "theirs.inner")
+    assert set(before) == {"module theirs.odometry", "module theirs.inner"}
+    (package / "inner.py").write_text("2")
+    assert odometry_content("theirs.odometry:Mine", None, "theirs.inner") != before
+
+
+def test_a_file_behind_an_option_is_part_of_a_program(tmp_path):
+    (tmp_path / "c.txt").write_text("1")
+    settings = CommandSettings(command=(sys.executable, f"--config={tmp_path}/c.txt"))
+    assert set(odometry_content("command", settings)) == {sys.executable, f"{tmp_path}/c.txt"}

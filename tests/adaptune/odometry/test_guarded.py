@@ -1,5 +1,6 @@
 """Clean classes of the user have the same faults here as in a process of their own."""
 
+import os
 import pickle
 import re
 
@@ -15,7 +16,7 @@ from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.selection import Selection
 from adaptune.sequence import Scan
 from offline.offline_study import load_study
-from offline.workers import Task, WorkerError, Workers, run
+from offline.workers import Task, Workers, run
 
 TOLD = {
     "init": "RuntimeError: no planes in init",
@@ -103,11 +104,19 @@ def study(study_file, tmp_path):
     return load_study(study_file, overrides, tmp_path / "study")
 
 
-def test_a_class_that_ends_the_workers_is_told(study):
+def test_a_class_that_ends_the_worker_then_runs_apart(study):
     setup = setup_of(study, factory("leaves", user_code=True))
-    words = r"3 workers died \(its process ended with code 3\) on one, its scans; if they were out"
-    with Workers(setup, 1, 1e9) as workers, pytest.raises(WorkerError, match=words):
+    with Workers(setup, 1, 1e9) as workers:
+        ((_, result, _),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
+    assert result.frames is not None
+    assert "its process ended with code 3" in result.trials[0].faults[0]
+
+
+def test_a_worker_may_end_its_process_group(study):
+    with Workers(setup_of(study), 1, 1e9) as workers:
         list(run(workers, [Task("one", (), (), frames=True)]))
+        (worker,) = workers._workers.values()
+        assert os.getpgid(worker.process.pid) == worker.process.pid
 
 
 def test_a_trial_of_a_class_that_raises(study):
@@ -115,3 +124,7 @@ def test_a_trial_of_a_class_that_raises(study):
     with Workers(setup, 1, 1e9) as workers:
         ((_, result, _),) = run(workers, [Task("one", (0,), ({"x": 0.5},))])
     assert "no planes in prepare" in result.trials[0].faults[0]
+
+
+def test_the_module_of_a_class_is_known_without_its_import():
+    assert factory().module == "faulty"
