@@ -152,7 +152,7 @@ def _balanced(text: str, most: int) -> list[str]:
     text = text.replace(" ", "\N{NO-BREAK SPACE}").replace("\n", " ")
     n = len(textwrap.wrap(text, most))
     widths = range(len(text) // n, most + 1)
-    lines = next(lines for w in widths if len(lines := textwrap.wrap(text, w)) <= n)
+    lines = next(fit for w in widths if len(fit := textwrap.wrap(text, w)) <= n)
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 

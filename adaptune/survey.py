@@ -112,7 +112,8 @@ def _apart(reader: AnyReader, paths: Items[Path]) -> list[Fault]:
     """Whether bags do not follow each other: the two with the longest time between them."""
     if len(paths) < 2:
         return []
-    spans = [(r.start_time, r.end_time, p.name) for r, p in zip(reader.readers, paths, strict=True)]
+    readers: Items[Any] = reader.readers
+    spans = [(r.start_time, r.end_time, p.name) for r, p in zip(readers, paths, strict=True)]
     spans = sorted(span for span in spans if span[0] < span[1])
     gaps, end, before = [], 0, ""
     for start, stop, name in spans:
