@@ -10,7 +10,7 @@ STUDY := configs/demo.yaml
 help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests"
-	@echo "make quick   run linters and the fast tests, in less than 45 seconds"
+	@echo "make quick   run linters and the fast tests, in about a minute"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 

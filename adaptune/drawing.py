@@ -25,7 +25,7 @@ POINTS: dict[str, dict[str, Any]] = {
     "one set": {"marker": "D", "color": "#d55e00"},
     "paired": {"marker": "o", "color": "#e69f00"},
     "paper": {"marker": "^", "color": "#000000"},
-    "oracle, sequence": {"marker": "_", "color": "#009e73"},
+    "oracle, sequence": {"marker": "_", "color": "#009e73", "ms": 12, "mew": 4.0},
     "oracle, period": {"marker": "x", "color": "#009e73"},
 }
 """Markers of the modes."""

@@ -132,7 +132,7 @@ def _inspect_bag(path: Path, found: Survey) -> Inspection:
     reference, problems = found.trajectory(), found.faults
     for topic in found.topics.values():
         of = next((key for key, name in used.items() if name == topic.name), "")
-        problems += _topic_faults(topic, of, found.complete)
+        problems += _topic_faults(topic, of, found.complete, found.apart)
     if found.points is not None:
         problems += faults.of_clouds(found.points, found.topics[found.points].count, found.valid)
     layout: Layout = ()
@@ -254,7 +254,7 @@ _UNDECODED = {
 }
 
 
-def _topic_faults(topic: Reading, of: str, complete: bool) -> Iterator[Fault]:
+def _topic_faults(topic: Reading, of: str, complete: bool, apart: bool = False) -> Iterator[Fault]:
     if topic.undecoded:
         (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
         help_, lacks = _UNDECODED[of]
@@ -267,7 +267,8 @@ def _topic_faults(topic: Reading, of: str, complete: bool) -> Iterator[Fault]:
         else:
             what, lacks = "are not in the sample, `--deep` reads them", ""
         yield Fault(f"{topic.name}: its {topic.count} messages {what}", of, lacks)
-    if any(topic.stamps):
+    # Between bags that do not follow each other nothing is missing.
+    if any(topic.stamps) and not apart:
         yield from faults.of_stamps(topic.name, of, topic.stamps, topic.recorded)
         if not complete:
             yield from faults.of_count(topic.name, of, topic.stamps, topic.count)
@@ -342,6 +343,6 @@ def _entry(path: Path, given: dict[str, Any], found: Survey | None = None) -> st
         return text
     if found.reference is None:
         text += "    # reference: its poses - a topic, or a TUM, KITTI or EuRoC file\n"
-    if found.points is not None:
+    if found.first is not None and found.first[0].times is not None:
         text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
     return text

@@ -129,18 +129,31 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
         # As a picture inside an SVG: it would have tens of thousands of shapes.
         dots = axes.scatter(x, y, c=z, s=0.5, vmin=low, vmax=high, rasterized=True)
         axes.plot(0, 0, "r+", markersize=12, mew=2, label="LiDAR")
-        axes.set(title=title, xlabel="x (m)", ylabel=f"{'xyz'[j]} (m)", xlim=(-reach, reach))
+        axes.set(title=title, xlabel="x [m]", ylabel=f"{'xyz'[j]} [m]", xlim=(-reach, reach))
         axes.grid(alpha=0.3)
     above.set(ylim=(-reach, reach), aspect="equal")
     above.legend(loc="upper right")
     margin = 0.1 * (high - low) + 0.5
     side.set_ylim(low - margin, high + margin)
-    figure.colorbar(dots, ax=above, label="height z (m)", shrink=0.6, extend="both")
-    text = textwrap.fill(_scan_text(inspection.scan), 90)
-    figure.suptitle(f"{inspection.path.name}, first scan\n{text}", fontsize=10)
+    figure.colorbar(dots, ax=above, label="height z [m]", shrink=0.6, extend="both")
+    text = f"{_scan_text(inspection.scan)}; drawn within {reach:.0f} m"
+    title = [*textwrap.wrap(f"{inspection.path.name}, first scan", 90), *_balanced(text, 90)]
+    figure.suptitle("\n".join(title), fontsize=10)
     kind = "svg" if path.suffix.lower() == ".svg" else "png"
     with replacing(path) as temporary:
         figure.savefig(temporary, format=kind, dpi=110)
+
+
+def _balanced(text: str, most: int) -> list[str]:
+    """Lines of about the same length that end with commas, as few as `most` characters allow."""
+    for stop in ",;":
+        text = text.replace(f"{stop} ", f"{stop}\n")
+    # Only between phrases may a line end.
+    text = text.replace(" ", "\N{NO-BREAK SPACE}").replace("\n", " ")
+    n = len(textwrap.wrap(text, most))
+    widths = range(len(text) // n, most + 1)
+    lines = next(fit for w in widths if len(fit := textwrap.wrap(text, w)) <= n)
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 
 def render_cache() -> RenderableType:

@@ -31,7 +31,9 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
     for key in keys:
         numbers = all(isinstance(row[key], int | float | None) for row in rows)
         side: Any = "right" if numbers else "left"
-        made.add_column(Text(key), justify=side, no_wrap=key == keys[0], overflow="fold")
+        # Folding would break long names inside words.
+        heading = Text(key.replace("_", "_\n"))
+        made.add_column(heading, justify=side, no_wrap=key == keys[0], overflow="fold")
     grouped = bool(rows) and len({row[keys[0]] for row in rows}) < len(rows)
     for i, row in enumerate(rows):
         if i and grouped and rows[i - 1][keys[0]] != row[keys[0]]:

@@ -36,6 +36,8 @@ SECONDS = 1.0
 _SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
 # Parts of a sample, and messages of a topic in each.
 _FEWEST, _MOST, _EACH = 5, 20, 2.5
+# Seconds. Bags of one drive are not further apart.
+_APART = 60.0
 
 
 @dataclass
@@ -65,6 +67,7 @@ class Survey:
     reference: str | None
     imu: str | None
     complete: bool = True  # whether all messages were read
+    apart: bool = False  # whether it is of bags that do not follow each other
     slack: float = 0.0  # seconds between two parts of the sample
     first: tuple[Scan, Any] | None = None  # the first scan, and its message
     valid: list[int] = field(default_factory=list)  # points of each cloud that are valid
@@ -90,6 +93,8 @@ def survey(path: Path, deep: bool, show: Show) -> Survey:
     source = _source(bag_paths([str(path)]))
     with source.open(by_index=True) as reader:
         found = _empty(reader)
+        found.faults += _apart(reader, source.paths)
+        found.apart = bool(found.faults)
         number = 0 if deep else _number(reader, source.paths, found)
         _read(_source(source.paths, found), reader, found, number, show)
     return found
@@ -101,6 +106,30 @@ def _source(paths: Items[Path], found: Survey | None = None) -> BagSource:
     topics = {} if found is None else {name: t.kind for name, t in found.topics.items()}
     points = None if found is None else found.points
     return BagSource(paths, about=about | {"topics": topics, "points": points or ""})
+
+
+def _apart(reader: AnyReader, paths: Items[Path]) -> list[Fault]:
+    """Whether bags do not follow each other: the two with the longest time between them."""
+    if len(paths) < 2:
+        return []
+    readers: Items[Any] = reader.readers
+    spans = [(r.start_time, r.end_time, p.name) for r, p in zip(readers, paths, strict=True)]
+    spans = sorted(span for span in spans if span[0] < span[1])
+    gaps, end, before = [], 0, ""
+    for start, stop, name in spans:
+        if before:
+            gaps.append(((start - end) * 1e-9, before, name))
+        if stop > end:
+            end, before = stop, name
+    seconds, before, name = max(gaps, default=(0.0, "", ""))
+    if seconds <= _APART:
+        return []
+    days = f" ({seconds / 86400.0:,.0f} days)" if seconds > 2.0 * 86400.0 else ""
+    text = (
+        f"the bags do not follow each other: {seconds:,.0f} s{days} lie between {before} and "
+        f"{name}; inspect each recording by itself, and name each as a sequence of its own"
+    )
+    return [Fault(text, "points", "bags that follow each other")]
 
 
 def _empty(reader: AnyReader) -> Survey:

@@ -80,7 +80,6 @@ def progress() -> Iterator[Show]:
         Progress,
         TextColumn,
         TimeElapsedColumn,
-        TimeRemainingColumn,
     )
 
     bars = Progress(
@@ -88,20 +87,23 @@ def progress() -> Iterator[Show]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
         TextColumn("{task.fields[remark]}", markup=False),
         console=errors,
     )
     tasks: dict[str, TaskID] = {}
+    pace, full = _Pace(), _Full()
     with bars:
 
         def show(what: str, done: float, total: int, remark: str = "") -> None:
+            if full.again(what, done, total):
+                return
             if what not in tasks:
                 over = [task.id for task in bars.tasks if task.finished]
                 for finished in over[:-MOST_FINISHED]:
                     bars.update(finished, visible=False)
                 tasks[what] = bars.add_task(what, total=total, remark="")
-            bars.update(tasks[what], completed=done, total=max(total, done), remark=remark)
+            words = ", ".join(filter(None, (pace.left(what, done, total), remark)))
+            bars.update(tasks[what], completed=done, total=max(total, done), remark=words)
 
         yield show
 
@@ -109,22 +111,51 @@ def progress() -> Iterator[Show]:
 def _logger() -> Show:
     log = logging.getLogger("adaptune")
     last = time.monotonic()
-    begun: dict[str, tuple[float, float]] = {}
+    pace, full = _Pace(), _Full()
 
     def show(what: str, done: float, total: int, remark: str = "") -> None:
         nonlocal last
+        if full.again(what, done, total):
+            return
         now = time.monotonic()
-        if done == begun.get(what, (now, done))[1]:
-            begun[what] = now, done
-        start, before = begun[what]
+        left = pace.left(what, done, total, now)
         if now - last > LOG_EVERY:
             last = now
-            rate = (done - before) / max(now - start, 1e-9)
-            left = _time_left((total - done) / rate) if rate and done < total else ""
             words = (f"{what}: {int(done)} of {total}", left, remark)
-            log.info("%s", ", ".join(word for word in words if word))
+            log.info("%s", ", ".join(filter(None, words)))
 
     return show
+
+
+class _Pace:
+    """How long each thing will take, by how long it took so far."""
+
+    def __init__(self) -> None:
+        self._begun: dict[str, tuple[float, float]] = {}
+
+    def left(self, what: str, done: float, total: int, now: float | None = None) -> str:
+        """In words; empty before a first piece is done, and in the first seconds."""
+        now = time.monotonic() if now is None else now
+        if done <= self._begun.get(what, (now, done))[1]:
+            self._begun[what] = now, done
+        start, before = self._begun[what]
+        seconds, gained = now - start, done - before
+        if gained < 1.0 or seconds < LOG_EVERY or done >= total:
+            return ""
+        return _time_left((total - done) * seconds / gained)
+
+
+class _Full:
+    """What was done completely: several workers may read the same, one after the other."""
+
+    def __init__(self) -> None:
+        self._totals: dict[str, int] = {}
+
+    def again(self, what: str, done: float, total: int) -> bool:
+        """Whether it is done once more."""
+        if done >= total:
+            self._totals[what] = total
+        return done < total == self._totals.get(what)
 
 
 def _time_left(seconds: float) -> str:

@@ -26,6 +26,16 @@ _OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
 }
 _COLUMN = {"rte": "mean"}
 """Columns that have another name in a study's objectives."""
+_HEADINGS = {
+    "mean": "mean RTE [%]",
+    "rpe": "RPE [m]",
+    "ape": "APE [m]",
+    "kitti": "KITTI [%]",
+    "ms_per_scan": "ms a scan",
+    "cpu": "cpu [%]",
+    "memory": "memory [MB]",
+}
+"""Columns as a table for reading names them."""
 _CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
 
 
@@ -97,6 +107,12 @@ def select(
         known.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
         chosen = known + unknown
     return chosen[:top]
+
+
+def with_units(table: Sequence[Row], names: Sequence[str]) -> list[Row]:
+    """Rows for reading: headings say what is measured on the sequences, and its unit."""
+    headings = _HEADINGS | {name: f"RTE [%] {name}" for name in names}
+    return [{headings.get(key, key): value for key, value in row.items()} for row in table]
 
 
 def _column(table: Sequence[Row], name: str, option: str) -> str:

@@ -215,7 +215,8 @@ class _Tally:
         self._failed += sum(run.lost > 0 or run.faults > 0 for run in runs)
 
     def _show(self) -> None:
-        remarks = [f"{self._running} running"] if self._running else []
+        n = self._running
+        remarks = [f"{n} worker{'s' if n > 1 else ''} at work"] if n else []
         remarks += [self.best] if self.best else []
         remarks += [f"{self._failed} lost track or failed"] if self._failed else []
         total = sum(search.total() for search in self._searches)
@@ -294,7 +295,7 @@ def run_tasks(
     tasks: list[Task],
     report: Callable[[Task, TaskProgress], None] = lambda *_: None,
 ) -> Iterator[tuple[Task, int]]:
-    """Run tasks; yield each one once it is in the archive, with the number of running trials.
+    """Run tasks; yield each one once it is in the archive, with the number of workers at work.
 
     `report` is called about tasks that go on.
     """

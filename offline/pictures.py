@@ -97,7 +97,7 @@ def _draw_sequences(axes: Any, found: LeftOutResults) -> None:
     modes = [mode for mode in found.ratios if mode != "fixed"]
     at = np.arange(len(found.sequences))
     for mode, shift in zip(modes, np.linspace(-0.3, 0.3, len(modes)), strict=True):
-        axes.plot(at + shift, found.ratios[mode], ls="", ms=6, label=mode, **POINTS[mode])
+        axes.plot(at + shift, found.ratios[mode], label=mode, **{"ls": "", "ms": 6} | POINTS[mode])
     axes.set_xticks(at, found.sequences, rotation=60, ha="right", rotation_mode="anchor")
     axes.set_title("on each sequence")
     log_scale(axes)

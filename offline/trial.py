@@ -19,8 +19,10 @@ from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, 
 from adaptune.odometry.base import OdometryInstance, prepared_bytes
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.health import HealthCheck, unhealthy
+from adaptune.sequence.recorded import RecordedSequence
 from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
+from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
 from offline.trial_run import DrivenRun, TrialRun
@@ -30,6 +32,8 @@ Advance = Callable[[int, int], None]
 
 MIN_POINTS = 20
 """No odometry can use a scan with fewer points."""
+_AROUND = 1.0
+"""Seconds by which a reference's clock may differ from the scans' while its length is looked at."""
 EPISODE = 4.0
 """Sub-trajectories from the beginning of an episode to the beginning of the next."""
 
@@ -71,6 +75,8 @@ class PreparedSequence:
     nbytes : int
         Bytes that the prepared scans take.
 
+    Errors of its reference name it by `key`.
+
     Raises
     ------
     AdaptuneError
@@ -85,13 +91,16 @@ class PreparedSequence:
         settings: TrialSettings,
         memory: float,
         advance: Advance = lambda *_: None,
+        key: str | None = None,
     ):
+        key = key or f"sequences.{name}"
         self.name = name
         self._scans = scans
         self._make = partial(odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
         self._kept: list[Any] = []
         self.nbytes = 0
+        reference = _reference(key, scans, settings)
         with _of_sequence(name):
             describe = Describer(settings.descriptors)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
@@ -114,7 +123,7 @@ class PreparedSequence:
                 f"`points` and what the sensor recorded"
             )
         at = np.array(stamps, np.int64)
-        T_ref_sensor = reference_poses(name, scans, at, settings)
+        T_ref_sensor = reference_poses(key, reference, at, settings)
         described = np.array(descriptors)
         # When a scan is described online, the pose of the scan before is known.
         motion = speed_and_turn_rate(at, T_ref_sensor)
@@ -159,8 +168,38 @@ def _of_sequence(name: str) -> Iterator[None]:
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
+def _reference(key: str, scans: sequence.Sequence, settings: TrialSettings) -> Trajectory:
+    """The reference; an AdaptuneError if it alone shows that no error can be measured."""
+    reference = scans.reference()
+    if reference is None:
+        raise AdaptuneError(
+            f"{key}: training needs a reference trajectory; name its topic or file (reference: ...)"
+        )
+    T = reference.T_world_sensor[_during(scans, reference)]
+    if len(T) and travelled(T)[-1] < settings.sub_trajectory:
+        raise _too_short(key, T, settings)
+    return reference
+
+
+def _during(scans: sequence.Sequence, reference: Trajectory) -> NDArray[np.bool_]:
+    """Which poses of a reference may be of the scans' time, of shape (n,)."""
+    span = scans.source.span() if isinstance(scans, RecordedSequence) else None
+    if span is None or not isinstance(scans, RecordedSequence):
+        return np.ones(len(reference), bool)
+    seconds, section = (reference.stamps - span[0]) * 1e-9, scans.section
+    stop = np.inf if section.stop is None else section.stop
+    return np.asarray((seconds > section.start - _AROUND) & (seconds < stop + _AROUND))
+
+
+def _too_short(key: str, T: Poses, settings: TrialSettings) -> AdaptuneError:
+    return AdaptuneError(
+        f"{key}: its path of {travelled(T)[-1]:.1f} m holds no sub-trajectory of "
+        f"{settings.sub_trajectory:g} m; make sub_trajectory shorter or the sequence longer"
+    )
+
+
 def reference_poses(
-    name: str, scans: sequence.Sequence, stamps: NDArray[np.int64], settings: TrialSettings
+    key: str, reference: Trajectory, stamps: NDArray[np.int64], settings: TrialSettings
 ) -> Poses:
     """Reference poses at the scans' stamps, of shape (n, 4, 4), NaN where they are not known.
 
@@ -169,30 +208,18 @@ def reference_poses(
     AdaptuneError
         If no error can be measured on the sequence.
     """
-    reference = scans.reference()
-    if reference is None:
-        raise AdaptuneError(
-            f"sequences.{name}: training needs a reference trajectory; name its topic or file "
-            f"(reference: ...)"
-        )
     T_ref_sensor = reference.at(stamps)
     if np.isnan(T_ref_sensor).all():
         raise AdaptuneError(
-            f"sequences.{name}: the reference does not overlap the scans in time; check that both "
+            f"{key}: the reference does not overlap the scans in time; check that both "
             f"are of the same recording and clock"
         )
-    length = settings.sub_trajectory
-    if not (window_ends(T_ref_sensor, length) >= 0).any():
-        known = T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])]
-        path = np.linalg.norm(np.diff(known[:, :3, 3], axis=0), axis=1).sum()
-        raise AdaptuneError(
-            f"sequences.{name}: its path of {path:.1f} m holds no sub-trajectory of {length:g} m; "
-            f"make sub_trajectory shorter or the sequence longer"
-        )
+    if not (window_ends(T_ref_sensor, settings.sub_trajectory) >= 0).any():
+        raise _too_short(key, T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])], settings)
     shortest = min(KITTI_LENGTHS)
     if "kitti" in settings.metrics and not (window_ends(T_ref_sensor, shortest) >= 0).any():
         raise AdaptuneError(
-            f"sequences.{name}: its path holds no sub-trajectory of {shortest:g} m, the shortest "
+            f"{key}: its path holds no sub-trajectory of {shortest:g} m, the shortest "
             f"of KITTI's error; judge by another metric (offline.objective, offline.limits)"
         )
     return T_ref_sensor
@@ -355,7 +382,8 @@ class TrialSetup:
     ) -> PreparedSequence:
         """Read and prepare a sequence, see `PreparedSequence`."""
         scans = self.sequences.open(name)
-        return PreparedSequence(name, scans, self.odometry, self.settings, memory, advance)
+        key = self.sequences.key(name)
+        return PreparedSequence(name, scans, self.odometry, self.settings, memory, advance, key)
 
     def run(
         self,

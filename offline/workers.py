@@ -100,7 +100,7 @@ def run(
     tasks: Sequence[Task],
     report: Callable[[Task, TaskProgress], None] = lambda *_: None,
 ) -> Iterator[tuple[Task, TaskResult, int]]:
-    """Run tasks, and yield each as it is done, with its result and the number of trials running.
+    """Run tasks, and yield each as it is done, with its result and the number of workers at work.
 
     A task goes to a worker that has prepared its sequence, if there is one. If a worker dies,
     another one runs its task again. `report` is called about tasks that go on.
@@ -117,7 +117,7 @@ def run(
         queue.start()
         finished, queue.finished = queue.finished, []
         # The workers work while their results are written.
-        n_running = sum(len(task.numbers) for task in queue.running.values())
+        n_running = len(queue.running)
         for task, result in finished:
             yield task, result, n_running
         if queue.failure is not None:

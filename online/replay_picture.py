@@ -156,6 +156,8 @@ def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool
         if not track.weights:
             values = [plain(v) if named and v != str(v) else v for v in track.choices[name]]
             axes.step(track.span, [*values, values[-1]], where="post", **LINES[mode])
+    # A line at a bound does not lie on the frame.
+    axes.margins(y=0.15)
     if log:
         log_scale(axes)
     axes.set_ylabel(name.replace("_", "\n"), fontsize="small")

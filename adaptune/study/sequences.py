@@ -12,6 +12,7 @@ from adaptune.sequence.export import Layout
 from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.names import OF_VIEW, origin
 from adaptune.sequence.opening import SequenceFiles, open_sequence, sequence_files
+from adaptune.sequence.part import part_name
 from adaptune.sequence.sequence import Sequence
 from adaptune.sequence.views import WithImu
 from adaptune.simulation.course import Course
@@ -51,6 +52,14 @@ class StudySequences:
         from adaptune.simulation.rig import as_sequence
 
         return as_sequence(self.courses[name], self.recording(name))
+
+    def key(self, name: str) -> str:
+        """The key under which the user finds a sequence: a part has none of its own."""
+        part = self.config(origin(name)).part
+        whole = origin(name) if part is None else origin(name).removesuffix(part_name("", part))
+        if part is None or whole == origin(name):
+            return f"sequences.{name}"
+        return f"training: [{whole}: {100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%]"
 
     def open(self, name: str) -> Sequence:
         """Open a sequence, a recorded course, or a view.

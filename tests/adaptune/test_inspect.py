@@ -195,6 +195,14 @@ def test_poses_that_do_not_decode_are_reported(tmp_path: Path) -> None:
     assert inspection.missing["online"] == ()
 
 
+def test_the_end_of_a_scan_is_spoken_of_only_if_points_have_times(tmp_path: Path) -> None:
+    timed, timeless = cloud(START), cloud(START)
+    timeless.fields = timeless.fields[:3]
+    for message, hint in ((timed, True), (timeless, False)):
+        bag = write(tmp_path / f"{hint}.bag", [("/points", START, message)])
+        assert ("# stamp: end" in inspect(bag).entry) == hint
+
+
 def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     inspection = inspect(write(tmp_path / "a.bag", [("/poses", START, pose(START, 0))]))
     assert inspection.missing["online"] == ("point clouds that can be read",)

@@ -25,8 +25,10 @@ def test_the_picture_is_one(tmp_path: Path) -> None:
     assert "<svg" in drawn
     # A path for each point would make files of many megabytes.
     assert drawn.count("<use") < 1000
-    for words in ("x (m)", "y (m)", "z (m)", "height z (m)", "LiDAR"):
+    for words in ("x [m]", "y [m]", "z [m]", "height z [m]", "LiDAR"):
         assert f"<!-- {words} -->" in drawn
+    assert "times spanning 0.1000 s, no rings" in drawn.replace("\n", " ")
+    assert "drawn within 2" in drawn  # where few far points are cut off
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag", ".png", ".svg"]
 
 

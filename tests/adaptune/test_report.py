@@ -26,3 +26,10 @@ def test_texts_are_printed_literally(name):
 )
 def test_numbers_have_three_digits_or_so(value, cell):
     assert cell in shown([{"a": value}]).split()
+
+
+def test_long_headings_break_at_underscores():
+    row = {"max_correspondence_distance": 1.0, "voxel_size": 3.0}
+    text = shown([row | {f"column {i}": 0.5 for i in range(7)}])
+    for word in ("max_", "correspondence_", "distance", "voxel_", "size"):
+        assert word in text.split()

@@ -225,3 +225,20 @@ def test_recorded_data(name: str, expected: Any) -> None:
     assert (inspection.reference is not None) == expected.reference
     assert ["a single cloud" in text for text in texts(inspection)] == expected.alone * [True]
     open_sequence(next(iter(entry(inspection).values())))
+
+
+@pytest.mark.usefixtures("sampled")
+def test_bags_that_do_not_follow_each_other_are_named(tmp_path: Path) -> None:
+    def bag(name: str, begin: float) -> None:
+        stamps = [START + round((begin + 0.1 * i) * 1e9) for i in range(100)]
+        write(tmp_path / name, [("/points", when, cloud(when)) for when in stamps])
+
+    bag("a.bag", 0.0)
+    bag("b.bag", 11.0)
+    assert not any("follow" in text for text in texts(inspect(tmp_path)))
+    bag("c.bag", 3e7)
+    inspection = inspect(tmp_path)
+    (text,) = texts(inspection)
+    assert "do not follow each other" in text
+    assert "(347 days) lie between b.bag and c.bag" in text
+    assert "bags that follow each other" in inspection.missing["online"]

@@ -10,7 +10,7 @@ import pytest
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.report import csv_text
 from adaptune.trajectory import read_tum
-from adaptune.trials import TrialsError, export, rows, select
+from adaptune.trials import TrialsError, export, rows, select, with_units
 from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000
@@ -65,6 +65,16 @@ def test_a_metric_that_not_all_have_is_not_told(archive):
 
 def test_columns_go_by_what_objectives_call_them_too():
     assert select(TABLE, ["rte < 1.5"], "rte") == select(TABLE, ["mean < 1.5"], "mean")
+
+
+def test_headings_for_reading_have_units(archive):
+    metrics = {"rpe": 0.1, "ape": 0.2, "kitti": 0.3, "memory": 40.0}
+    archive.write("cave", 0, replace(archive.read("cave", 0), metrics=metrics))
+    (row,) = with_units(rows(archive, ["cave"])[:1], ["cave"])
+    expected = {"mean RTE [%]", "RTE [%] cave", "RPE [m]", "APE [m]", "KITTI [%]", "memory [MB]"}
+    assert expected <= set(row)
+    assert not {"mean", "cave", *metrics} & set(row)
+    assert row["trial"] == 0
 
 
 def test_every_metric_of_an_objective_is_a_column(archive):

@@ -32,6 +32,18 @@ def test_tasks_tell_how_far_they_are():
     assert [done for done, *_ in finished] == [task]
 
 
+def test_the_remark_counts_workers_and_not_runs():
+    class TwoWorkers(TwoWords):
+        def workers(self):
+            return [0, 1]
+
+        def wait(self):
+            return [(0, TaskResult([], None))]
+
+    tasks = [Task("one", tuple(range(8)), ()), Task("one", tuple(range(8, 16)), ())]
+    assert next(run(TwoWorkers(), tasks))[2] == 1
+
+
 def test_workers_report_now_and_then_and_at_the_end(monkeypatch):
     times = iter([0.0, *(0.1 * i for i in range(1, 21))])
     monkeypatch.setattr(workers.time, "monotonic", lambda: next(times))

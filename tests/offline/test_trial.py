@@ -13,7 +13,7 @@ from adaptune.odometry import Registration
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.sequence import SequenceConfig
 from offline.offline_study import load_study
-from offline.trial import episodes
+from offline.trial import TrialSettings, episodes
 from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -272,6 +272,21 @@ def test_a_sequence_shorter_than_the_sub_trajectory_is_refused(study, tmp_path):
     drives.write_bag(tmp_path / "short.bag", drives.scans(0, 9))
     with pytest.raises(AdaptuneError, match=r"path of 2\.4 m holds no sub-trajectory of 3 m"):
         prepare(study, tmp_path / "short.bag")
+
+
+@pytest.mark.parametrize("part", [None, (0.0, 0.3)])
+def test_a_path_that_is_too_short_is_found_before_scans_are_read(study, tmp_path, part):
+    bag, name = tmp_path / "hall.bag", "hall" if part is None else "hall_0-30"
+    drives.write_bag(bag, drives.scans(0, 9 if part is None else 40))
+    config = SequenceConfig(bag=str(bag), points="/points", reference="/truth", part=part)
+    sequences = dataclasses.replace(study.sequences, recordings={name: config})
+    settings = TrialSettings(sub_trajectory=3.0 if part is None else 9.0)
+    setup = dataclasses.replace(setup_of(study), sequences=sequences, settings=settings)
+    key = r"sequences\.hall" if part is None else r"training: \[hall: 0-30%\]"
+    read = []
+    with pytest.raises(AdaptuneError, match=rf"^{key}: its path of .* holds no sub-trajectory"):
+        setup.prepare(name, 1e9, lambda *progress: read.append(progress))
+    assert read == []
 
 
 def test_a_sequence_without_reference_is_refused(study):
