@@ -103,7 +103,7 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
     if all(row.rte is not None for row in last.values()):
         found = ", ".join(f"{mode} {row.rte:.3f} %" for mode, row in last.items())
-        said.append(f"Mean RTE of {rows[-1].sequence}: {found}.")
+        said.append(f"Mean RTE of {_where(rows[-1])}: {found}.")
     if "baseline" in last and (verdict := _of_baseline(last["baseline"])):
         said.append(verdict)
     adaptive = [row for mode, row in last.items() if mode not in ("baseline", "fixed")]
@@ -131,10 +131,14 @@ def _times(row: ComparisonRow) -> str:
     return f"{row.vs_fixed:.2f} times{interval}"
 
 
+def _where(row: ComparisonRow) -> str:
+    return "all sequences" if row.sequence == ALL else row.sequence
+
+
 def _of_baseline(row: ComparisonRow) -> str | None:
     if row.vs_fixed is None:
         return None
-    has = f"on {row.sequence} the baseline has {_times(row)}"
+    has = f"on {_where(row)} the baseline has {_times(row)}"
     if not _counts(row):
         return (
             f"There is no difference that counts between the baseline and the fixed set here: "

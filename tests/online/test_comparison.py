@@ -355,8 +355,8 @@ def test_modes_that_adapt_are_told_where_they_differ():
     # All sequences together decide.
     pooled = rows_of("all", baseline=1.5, paired=1.0)
     mean, verdict = remarks([*rows, *pooled])
-    assert mean.startswith("Mean RTE of all: baseline 1.500 %")
-    assert verdict.startswith("The fixed set is better than the baseline here: on all ")
+    assert mean.startswith("Mean RTE of all sequences: baseline 1.500 %")
+    assert verdict.startswith("The fixed set is better than the baseline here: on all sequences ")
     assert remarks([replace(row, rte=None, vs_fixed=None) for row in rows]) == []
 
 
