@@ -363,11 +363,12 @@ def switching(
     from online.switch_cost import measure_switching, switch_cost_in_words
 
     with progress() as show:
-        rows = measure_switching(loaded, seconds, show)
+        rows, caption = measure_switching(loaded, seconds, show)
     console.print(
         report.table(
             f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
             rows,
+            caption,
         )
     )
     say(switch_cost_in_words(loaded))
@@ -388,39 +389,18 @@ def compare(
     recordings, not for other places.
     """
     loaded = _load(study, override, folder)
-    from adaptune import report
-    from offline.tuning import MIN_SEQUENCES
+    from adaptune.study.driven import MIN_SEQUENCES
     from online.comparison import compare as compare_replays
-    from online.comparison import remark
+    from online.comparison import remarks, tables
 
     loaded.check()
     begin_work()
     rows = compare_replays(loaded)
-    console.print(
-        report.table(
-            f"RTE over {loaded.config.sub_trajectory:g} m on test sequences",
-            [row.columns() for row in rows],
-            "Intervals of 95 %: block bootstrap over time, if the sequence is long enough; seed 0. "
-            "`all`: mean RTE, and geometric mean of the ratios.",
-        )
-    )
-    if any(row.standard for row in rows):
-        console.print(
-            report.table(
-                "Errors as evo and KITTI's benchmark define them",
-                [row.standard_columns() for row in rows],
-                "APE after alignment, RPE from scan to scan: root mean squares. KITTI: mean over "
-                "the lengths in the last column; needs 100 m. `all`: mean APE and RPE; KITTI over "
-                "the sub-trajectories of all sequences.",
-            )
-        )
-    if said := remark(rows):
+    for table in tables(rows, loaded.config.sub_trajectory):
+        console.print(table)
+    for said in remarks(rows):
         say(said)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
-    last = {row.mode: row.rte for row in rows if row.sequence == rows[-1].sequence}
-    if None not in last.values():
-        found = ", ".join(f"{mode} {rte:.3f} %" for mode, rte in last.items())
-        say(f"Mean RTE of {rows[-1].sequence}: {found}.")
     if (n := len(loaded.config.training)) < MIN_SEQUENCES:
         first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
         say_next_of_study("find out whether to adapt", "offline", study, override, folder, first)

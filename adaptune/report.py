@@ -62,11 +62,13 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def write_rows(folder: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows of equal keys as ``<name>.csv`` and ``<name>.json``."""
-    plain = [{key.lstrip("_"): value for key, value in row.items()} for row in rows]
-    write_text(folder / f"{name}.csv", csv_text(plain))
-    # JSON knows no NaN.
+    # JSON knows no NaN, and in CSV its cells are empty.
     finite = [
-        {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
-        for row in plain
+        {
+            k.lstrip("_"): None if isinstance(v, float) and not np.isfinite(v) else v
+            for k, v in row.items()
+        }
+        for row in rows
     ]
+    write_text(folder / f"{name}.csv", csv_text(finite))
     write_text(folder / f"{name}.json", json.dumps(finite, indent=2) + "\n")

@@ -17,10 +17,10 @@ from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
 from adaptune.model.base import complementary
+from adaptune.study.driven import MIN_SEQUENCES
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 from offline.tuning import (
     MIN_OTHERS,
-    MIN_SEQUENCES,
     NO_WORSE,
     TINY,
     bank_data,

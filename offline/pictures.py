@@ -74,7 +74,7 @@ class LeftOutResults(NamedTuple):
 def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
     """Draw results on the sequences left out; `path` is that of the PNG."""
     panels: list[Callable[[Any, LeftOutResults], None]] = [_draw_sequences]
-    if not np.isnan(found.familiarity).all():
+    if not np.isnan(found.familiarity).all() and (found.gain != 1.0).any():
         panels.append(_draw_familiarity)
     panels.append(_draw_sizes)
     width = max(6.0, 0.35 * len(found.sequences))

@@ -17,13 +17,12 @@ from adaptune.model.bank_weights import (
     choose_members,
     smooth_weights,
 )
+from adaptune.study.driven import MIN_SEQUENCES
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 if TYPE_CHECKING:
     from adaptune.descriptor.pca import ScaledPCA
 
-MIN_SEQUENCES = 6
-"""With fewer training sequences, a rule does not adapt: they say too little about other places."""
 MIN_OTHERS = MIN_SEQUENCES - 1
 """As many remain where one of them is left out: what holds for the study holds there, too."""
 NO_WORSE = 1.05

@@ -119,26 +119,27 @@ def _rivalry(study: OfflineStudy, data: LabelledData) -> list[str]:
 
 def _verdicts(study: OfflineStudy, online: Driven, validation: Validation) -> list[str]:
     """What `adaptune online` will drive, then the estimate for it, then for what else it drives."""
-    baseline = validation.summary("baseline")
-    estimate = (
-        f"The baseline has {baseline['geometric']:.2f} times the error of the fixed set, over "
-        f"{len(validation.left_out)} sequences left out (95 % interval {baseline['low']:.2f}-"
-        f"{baseline['high']:.2f})"
-    )
-    if baseline["geometric"] < 1.0:
-        estimate += (
-            ": there the baseline is better than the fixed set, which is chosen without them"
-        )
     said = [online.words]
     if online.mechanism is not None:
         said.append(validation.verdict(PAIRED))
-    said.append(f"{estimate}.")
+    said.append(baseline_in_words(validation))
     if "paper" not in study.rules:
         return said
     if study.mechanism == "bank":
         why = "`online` lets it choose among the bank's members, here it chooses among all sets"
         return [*said, f"`paper` has no verdict: {why}."]
     return [*said, validation.verdict("paper")]
+
+
+def baseline_in_words(validation: Validation) -> str:
+    """How the baseline compares; the study's own fixed set is another than those compared with."""
+    s = validation.summary("baseline")
+    better = ": there the baseline is better" if s["high"] < 1.0 else ""
+    return (
+        f"The baseline has {s['geometric']:.2f} times the error of the sets that are chosen "
+        f"without each sequence, over {len(validation.left_out)} sequences left out (95 % interval "
+        f"{s['low']:.2f}-{s['high']:.2f}){better}."
+    )
 
 
 def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
 from adaptune import report
 from adaptune.geometry import invert
@@ -16,9 +17,12 @@ from adaptune.trajectory import Trajectory
 from online.modes import ReplaySetup
 from online.replay_picture import Track, draw_replays
 from online.run_replays import shared_identity
-from online.statistics import ComparisonRow, Reference, compare_modes, pooled
+from online.statistics import ALL, ComparisonRow, Reference, compare_modes, pooled
 from online.stored_reference import is_reference_of
 from online.stored_replays import ReplaySummary, StoredReplay, StoredReplayError
+
+NO_DIFFERENCE = 0.01
+"""Share of the fixed set's error by which others may differ without it being told."""
 
 
 def compare(study: Study) -> list[ComparisonRow]:
@@ -67,16 +71,102 @@ def compare(study: Study) -> list[ComparisonRow]:
     return rows
 
 
-def remark(rows: Sequence[ComparisonRow]) -> str | None:
-    """In words where the baseline has less error than the fixed set."""
-    of_baseline = [row for row in rows if row.mode == "baseline" and row.vs_fixed is not None]
-    # The last row is that over all sequences.
-    if not of_baseline or not (ratio := of_baseline[-1].vs_fixed) or ratio >= 1.0:
-        return None
-    return (
-        f"The baseline is better than the fixed set here: on {of_baseline[-1].sequence} it has "
-        f"{ratio:.2f} times its error."
+def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
+    """The rows for the terminal: errors over `length` metres, and, if known, those of evo."""
+    several = rows[-1].sequence == ALL
+    caption = (
+        "Intervals of 95 %: block bootstrap over time, if the sequence is long enough; seed 0."
     )
+    if several:
+        caption += " `all`: mean RTE, and geometric mean of the ratios."
+    title = f"RTE over {length:g} m on test sequences"
+    made = [report.table(title, [row.columns() for row in rows], caption)]
+    standard = [row.standard for row in rows if row.standard]
+    if not standard:
+        return made
+    kitti = any(errors.kitti.lengths for errors in standard)
+    title = (
+        "Errors as evo and KITTI's benchmark define them" if kitti else "Errors as evo defines them"
+    )
+    caption = "APE after alignment, RPE from scan to scan: root mean squares."
+    if kitti:
+        caption += " KITTI: mean over the lengths in the last column; needs 100 m."
+    if several:
+        caption += " `all`: mean APE and RPE" + (
+            "; KITTI over the sub-trajectories of all sequences." if kitti else "."
+        )
+    return [*made, report.table(title, [row.standard_columns(kitti) for row in rows], caption)]
+
+
+def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
+    """In words: the mean errors, which modes differ, and what the health check did."""
+    said = []
+    # The last rows are those over all sequences.
+    last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
+    if all(row.rte is not None for row in last.values()):
+        found = ", ".join(f"{mode} {row.rte:.3f} %" for mode, row in last.items())
+        said.append(f"Mean RTE of {_where(rows[-1])}: {found}.")
+    if "baseline" in last and (verdict := _of_baseline(last["baseline"])):
+        said.append(verdict)
+    adaptive = [row for mode, row in last.items() if mode not in ("baseline", "fixed")]
+    if differing := [row for row in adaptive if _counts(row)]:
+        each = (
+            f"`{row.mode}` is {'better' if row.vs_fixed < 1.0 else 'worse'}, with {_times(row)}"
+            for row in differing
+            if row.vs_fixed is not None
+        )
+        said.append(f"Compared with the fixed set, {', and '.join(each)} its error.")
+    return said + _restarts(rows)
+
+
+def _counts(row: ComparisonRow) -> bool:
+    """Whether a mode differs from the fixed set by what counts, as far as it is known."""
+    if row.vs_fixed is None or abs(row.vs_fixed - 1.0) < NO_DIFFERENCE:
+        return False
+    low, high = row.ratio_interval or (row.vs_fixed, row.vs_fixed)
+    return not low <= 1.0 <= high
+
+
+def _times(row: ComparisonRow) -> str:
+    ends = row.ratio_interval
+    interval = "" if ends is None else f" (95 % interval {ends[0]:.2f}-{ends[1]:.2f})"
+    return f"{row.vs_fixed:.2f} times{interval}"
+
+
+def _where(row: ComparisonRow) -> str:
+    return "all sequences" if row.sequence == ALL else row.sequence
+
+
+def _of_baseline(row: ComparisonRow) -> str | None:
+    if row.vs_fixed is None:
+        return None
+    has = f"on {_where(row)} the baseline has {_times(row)}"
+    if not _counts(row):
+        return (
+            f"There is no difference that counts between the baseline and the fixed set here: "
+            f"{has} the fixed set's error."
+        )
+    better, other = ("baseline", "fixed set") if row.vs_fixed < 1.0 else ("fixed set", "baseline")
+    return f"The {better} is better than the {other} here: {has} the fixed set's error."
+
+
+def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
+    """For each sequence a sentence about the modes that the health check restarted."""
+    said = []
+    for name in dict.fromkeys(row.sequence for row in rows if row.first_restart is not None):
+        mine = [row for row in rows if row.sequence == name]
+        modes: dict[str, list[str]] = {}
+        for row in mine:
+            if row.first_restart is not None:
+                at = f"at {row.first_restart:.1f} s"
+                when = at if row.restarts == 1 else f"{row.restarts} times, first {at}"
+                modes.setdefault(f"{when} ({', '.join(row.unhealthy)})", []).append(row.mode)
+        each = (
+            f"{'all modes' if len(those) == len(mine) else ', '.join(those)} {what}"
+            for what, those in modes.items()
+        )
+        said.append(f"On {name} the health check restarted {'; '.join(each)}.")
+    return said
 
 
 def _track(replay: StoredReplay, reference: Reference) -> Track:

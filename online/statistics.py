@@ -21,6 +21,8 @@ from adaptune.metrics import (
 from adaptune.trajectory import Trajectory, read_tum
 from online.stored_replays import StoredReplay
 
+ALL = "all"
+"""In place of a sequence, all of them."""
 Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
 
@@ -92,7 +94,9 @@ class ComparisonRow:
     median: float | None = None  # of the sub-trajectory RTE, percent
     standard: StandardErrors | None = None
     blocks: int | None = None  # independent pieces of the recording
-    x_real_time: float | None = None  # speed of the replay
+    x_real_time: float | None = None  # speed of the odometry
+    first_restart: float | None = None  # seconds from the start
+    unhealthy: tuple[str, ...] = ()  # what the health check found
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
@@ -121,18 +125,19 @@ class ComparisonRow:
         if self.standard is None:
             return dict.fromkeys(keys)
         ape, rpe, kitti = self.standard
+        if not kitti.lengths:
+            return dict.fromkeys(keys) | {"ape_m": ape, "rpe_m": rpe}
         lengths = " ".join(f"{length:g}" for length in kitti.lengths)
         return dict(zip(keys, (ape, rpe, kitti.translation, kitti.rotation, lengths), strict=True))
 
-    def standard_columns(self) -> dict[str, Any]:
-        """The row of a table of the errors that other tools give."""
+    def standard_columns(self, kitti: bool = True) -> dict[str, Any]:
+        """The row of a table of the errors that other tools give, with KITTI's or without."""
         ape, rpe, percent, degrees, listed = self._standard().values()
+        of_evo = {"sequence": self.sequence, "mode": self.mode, "APE [m]": ape, "RPE [m]": rpe}
+        if not kitti:
+            return of_evo
         lengths = (listed or "").split()
-        return {
-            "sequence": self.sequence,
-            "mode": self.mode,
-            "APE [m]": ape,
-            "RPE [m]": rpe,
+        return of_evo | {
             "KITTI [%]": percent,
             "[deg/100 m]": None if degrees is None else 100.0 * degrees,
             "over [m]": "-".join(dict.fromkeys([*lengths[:1], *lengths[-1:]])) or None,
@@ -177,10 +182,18 @@ def compare_modes(
                 float(np.median(mine)) if len(mine) else None,
                 reference.standard(replay.trajectory),
                 len(mine) // block,
-                round(summary.duration_s / summary.replay_s, 2),
+                round(summary.duration_s / replay.seconds, 2) if replay.seconds else None,
+                _first_restart(replay),
+                tuple(summary.unhealthy),
             )
         )
     return rows
+
+
+def _first_restart(replay: StoredReplay) -> float | None:
+    stamps = replay.trajectory.stamps
+    restarts = stamps[replay.restarted]
+    return float(restarts[0] - stamps[0]) * 1e-9 if len(restarts) else None
 
 
 def _switches(replay: StoredReplay) -> int:
@@ -198,7 +211,7 @@ def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
         ratios = [row.vs_fixed for row in mine if row.vs_fixed is not None]
         made.append(
             ComparisonRow(
-                f"all {len(mine)}",
+                ALL,
                 mode,
                 float(np.mean([row.rte for row in mine if row.rte is not None])),
                 float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12))))),

@@ -19,6 +19,8 @@ from online.replay import Replay
 
 _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
+_TIMES = ("prepare_ms", "register_ms")
+"""Columns of ``frames.csv``: milliseconds of a scan."""
 
 
 class StoredReplayError(AdaptuneError):
@@ -92,6 +94,7 @@ class StoredReplay:
     summary: ReplaySummary
     trajectory: Trajectory
     restarted: NDArray[np.bool_]  # (n,): frames at which the health check restarted the odometry
+    seconds: float  # that the odometry took to prepare and register all scans
     # (m,): nanoseconds, of the scans that selections were made from; the first one of a mode that
     # keeps its parameters.
     choice_stamps: NDArray[np.int64]
@@ -114,15 +117,20 @@ class StoredReplay:
         except TrajectoryError as error:
             help_ = "run `adaptune online --again`"
             raise StoredReplayError(f"{error}; {help_}") from error
-        restarted = _columns(folder / "frames.csv").get("restarted", [])
+        frames = _columns(folder / "frames.csv")
+        restarted = np.array(frames.get("restarted", [])) == "1"
         if len(restarted) != len(trajectory):
             raise _damaged(folder / "frames.csv", ValueError("not a row for every scan"))
+        try:
+            seconds = 1e-3 * sum(float(ms) for key in _TIMES for ms in frames[key])
+        except (KeyError, ValueError) as error:
+            raise _damaged(folder / "frames.csv", error) from error
         stamps, choices, weights = _choices(folder / "selections.csv")
         if not len(stamps):
             stamps = trajectory.stamps[:1]
             kept = summary.about.parameters or {}
             choices = {name: _numbers([str(value)]) for name, value in kept.items()}
-        return cls(summary, trajectory, np.array(restarted) == "1", stamps, choices, weights)
+        return cls(summary, trajectory, restarted, seconds, stamps, choices, weights)
 
 
 def write_replay(folder: Path, replay: Replay, about: ReplayIdentity, model_file: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.geometry import Poses
-from adaptune.metrics import sub_trajectory_rte
+from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
@@ -33,6 +33,9 @@ WARM_UPS = (4.0, 8.0, 12.0)
 
 PERIOD = 5.0
 """Seconds between switches."""
+
+ENOUGH = 10
+"""Sub-trajectories one after the other, from which on the ratios tell something."""
 
 
 class Mechanism(NamedTuple):
@@ -67,7 +70,7 @@ class Alternating:
 
 def measure_switching(
     study: Study, seconds: float = 60.0, progress: Progress = lambda *_: None
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], str]:
     """Switch every 5 s to the same parameters: whatever changes is the cost of switching.
 
     Parameters
@@ -84,6 +87,8 @@ def measure_switching(
     list of dict
         A row for every mechanism and warm-up: geometric mean over the sequences of the RTE as a
         ratio to that without switching, and mean milliseconds a scan.
+    str
+        What was measured, and whether it is enough.
 
     Raises
     ------
@@ -96,8 +101,10 @@ def measure_switching(
     mechanisms = _mechanisms(study.odometry, warm_up, catch_up_scans)
     ratios: dict[str, list[float]] = {what: [] for what in mechanisms}
     times: dict[str, list[float]] = {what: [] for what in mechanisms}
+    metres = 0.0
     for name in study.config.training:
         recording = _read(study, name, seconds)
+        metres += float(travelled(recording.T_ref_sensor)[-1])
         without = 0.0
         for what, mechanism in mechanisms.items():
             error, ms = _measure(recording, what, mechanism, study.config.health, progress)
@@ -120,7 +127,20 @@ def measure_switching(
         "rows": rows,
     }
     write_text(study.folder / "switching.json", json.dumps(found, indent=2) + "\n")
-    return rows
+    return rows, _caption(seconds, metres, study.config.sub_trajectory)
+
+
+def _caption(seconds: float, metres: float, length: float) -> str:
+    said = (
+        f"Switches every {PERIOD:g} s to the same set, on the first {seconds:g} s of each training "
+        f"sequence: {metres:.0f} m in all."
+    )
+    if metres >= ENOUGH * length:
+        return said
+    return (
+        f"{said} That is less than {ENOUGH} sub-trajectories of {length:g} m, so the ratios are "
+        f"mostly chance; take longer recordings, or --seconds more."
+    )
 
 
 def switch_cost_in_words(study: Study) -> str:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFlo
 
 from adaptune.metrics import FAILURE
 from adaptune.model.base import Rule, TrainingData, mean_errors
-from adaptune.model.evidence import NOVEL, Evidence, NearestFrames
+from adaptune.model.evidence import Evidence, NearestFrames, trust_in
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
@@ -205,7 +205,7 @@ def smooth_weights(
     for k in range(1, SMOOTHING):
         total[k:] += weights[:-k]
     mean = total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHING)[:, None]
-    trust = np.minimum(1.0, familiarity / NOVEL)
+    trust = trust_in(familiarity)
     others = np.maximum(mean[:, 1:].sum(axis=1), 1e-12)
     mean[:, 1:] *= np.minimum(1.0, trust / others)[:, None]
     mean[:, 0] = np.maximum(0.0, 1.0 - mean[:, 1:].sum(axis=1))

@@ -20,13 +20,13 @@ class Evidence(NamedTuple):
     frames: tuple[NDArray[np.intp], ...]
     squared: NDArray[np.float64]  # (n_scans, n_sequences): mean squared distance of these frames
     # (n_scans,): share of the training frames that are farther from the other sequences than each
-    # scan is from all of them.
+    # scan is from all of them; NaN of a single sequence, which has no others.
     familiarity: NDArray[np.float64]
 
     @property
     def trust(self) -> NDArray[np.float64]:
-        """How far the evidence counts, from 0 to 1, of shape (n_scans,)."""
-        return np.minimum(1.0, self.familiarity / NOVEL)
+        """See `trust_in`."""
+        return trust_in(self.familiarity)
 
     def weights(self, sharpness: float) -> NDArray[np.float64]:
         """Weights of the training sequences: the nearer their frames, the larger.
@@ -59,6 +59,11 @@ class Evidence(NamedTuple):
         for s, frames in enumerate(self.frames):
             means[:, s] = values[frames].mean(axis=1, dtype=np.float64)
         return means
+
+
+def trust_in(familiarity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far evidence counts, from 0 to 1: fully where familiarity is unknown."""
+    return np.asarray(np.fmin(1.0, familiarity / NOVEL))
 
 
 class NearestFrames:
@@ -105,7 +110,7 @@ class NearestFrames:
 
     def _familiarity(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         if not len(self.distances_):
-            return np.ones(len(squared))
+            return np.full(len(squared), np.nan)
         below = np.searchsorted(self.distances_, squared, side="left")
         return np.asarray(1.0 - below / len(self.distances_))
 

@@ -165,7 +165,7 @@ class PairedExpectedRatio(Rule):
         at = self.candidates_.index(current) if current in self.candidates_ else None
         # In a place unlike all training, a switch back to the fixed set need not pay. Nor need a
         # switch away from a set that is expected to be worse than the fixed one.
-        weighs = self.switch_cost > 0.0 and familiarity >= NOVEL
+        weighs = self.switch_cost > 0.0 and not familiarity < NOVEL
         if weighs and at is not None and cautious[best] + self.switch_cost >= cautious[at] <= 1.0:
             best = at
         fixed = float(weights @ near.fixed[0])

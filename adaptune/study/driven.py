@@ -6,9 +6,13 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
+from adaptune.sequence.names import origin
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import Mechanism, Study
+
+MIN_SEQUENCES = 6
+"""With fewer training sequences, a rule does not adapt: they say too little about other places."""
 
 
 class ModeError(AdaptuneError):
@@ -49,8 +53,12 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
         return Driven(mechanism, f"`online` will drive one set at a time as `paired`, {how}.")
-    why = "leaving out one training sequence after the other did not show that adapting pays"
-    return Driven(None, f"{fixed} {why} (this needs six sequences or more).")
+    if (n := len({origin(name) for name in model.sequences})) < MIN_SEQUENCES:
+        are = "is one" if n == 1 else f"are {n}"
+        why = f"adapting takes {MIN_SEQUENCES} training sequences, and there {are}"
+    else:
+        why = "leaving out one training sequence after the other did not show that adapting pays"
+    return Driven(None, f"{fixed} {why}.")
 
 
 def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool) -> Mechanism:

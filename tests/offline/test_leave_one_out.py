@@ -246,6 +246,8 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     validation, rows, learning, banks, verdicts = validate(study, curve=True, sizes=True)
     # Two sequences show nothing: the fixed set is driven.
     assert verdicts[0].startswith("`online` will drive the fixed set")
+    assert verdicts[0].endswith("because adapting takes 6 training sequences, and there are 2.")
+    assert all(np.isnan(one.familiarity).all() for one in validation.left_out)
     assert "Adapt" not in "".join(verdicts)
     assert [row["left out"] for row in rows] == ["one", "two", "geometric", "arithmetic", "worst"]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
@@ -372,7 +374,8 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     assert "`paired` kept the fixed set" in found.verdicts[1]
     _, found = judged(six, study, monkeypatch, [("paired", DO_NOT_ADAPT), given[1]])
     assert found.verdicts[0].startswith("`online` will drive the fixed set (trial ")
-    assert found.verdicts[1].startswith("The baseline has ")
+    assert found.verdicts[0].endswith("did not show that adapting pays.")
+    assert "sets that are chosen without each sequence, over 6 seq" in found.verdicts[1]
     assert not found.validation.bank
     assert "one set" not in found.rows[0]
     # Where it cannot be judged it says what is driven.

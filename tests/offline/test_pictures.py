@@ -42,7 +42,7 @@ def results(modes, **changed):
         ratios={mode: np.full(6, 1.0) for mode in modes},
         sequences=[f"drive_{i}" for i in range(6)],
         familiarity=np.linspace(0.0, 1.0, 50),
-        gain=np.full(50, 1.0),
+        gain=np.linspace(0.9, 1.1, 50),
         portfolio=np.full(6, 1.0),
         learning=[],
         banks=[],
@@ -86,6 +86,13 @@ def test_curves_are_explained_where_they_are_drawn(tmp_path):
     assert "number of sets, or members, or training sequences [-]" in said
     assert {"bank of so many members", "paired, trained on so many"} <= set(said)
     assert not [text for text in said if "familiarity" in text]
+
+
+def test_familiarity_is_not_drawn_where_nothing_adapts(tmp_path):
+    path = tmp_path / "validation.png"
+    for gain, drawn in ((np.full(50, 1.0), 0), (np.full(50, 0.9), 1)):
+        draw_validation(path, "study", results(["fixed", "paired"], gain=gain))
+        assert texts(path).count("where scans are known and new") == drawn
 
 
 def test_wide_intervals_do_not_shrink_the_rest(tmp_path):

@@ -1,6 +1,7 @@
 import csv
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 
@@ -10,15 +11,16 @@ import pytest
 from pictures import texts
 
 from adaptune.errors import AdaptuneError
+from adaptune.metrics import KittiError
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.selection import Selection
 from adaptune.study.driven import ModeError, bank_members
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.offline_study import load_study
-from online.comparison import compare, remark
+from online.comparison import compare, remarks, tables
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
-from online.statistics import ComparisonRow
+from online.statistics import ComparisonRow, StandardErrors
 from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
@@ -65,7 +67,7 @@ def test_rows_and_files(replayed):
     ):
         assert 0.0 < row.standard.rpe < row.standard.ape * 10
         assert (written["ape_m"], written["rpe_m"]) == (row.standard.ape, row.standard.rpe)
-        assert (written["kitti_percent"], written["kitti_lengths_m"]) == (None, "")
+        assert (written["kitti_percent"], written["kitti_lengths_m"]) == (None, None)
 
 
 def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(replayed):
@@ -233,7 +235,7 @@ def test_rows_over_several_sequences(replayed, study_file, tmp_path):
     )
     run_replays(study, replayed.folder / "model.safetensors")
     rows = compare(study)
-    assert [row.sequence for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all 2"] * 4
+    assert [row.sequence for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all"] * 4
     a, b, all_ = rows[3], rows[7], rows[11]
     assert all_.rte == pytest.approx((a.rte + b.rte) / 2)
     assert all_.standard.ape == pytest.approx((a.standard.ape + b.standard.ape) / 2)
@@ -315,16 +317,101 @@ def test_a_warning_of_selections_that_rest_on_one_sequence(caplog):
     assert caplog.messages[0].startswith("b: 1 of 2 selections of another set")
 
 
-def test_a_baseline_that_is_better_is_told():
-    rows = [
-        ComparisonRow("a", mode, 1.0, ratio, 0, 0, 0)
-        for mode, ratio in (("baseline", 0.5), ("fixed", 1.0), ("paired", 0.4))
+def rows_of(sequence="a", **ratios):
+    return [
+        ComparisonRow(sequence, mode, ratio, ratio, 0, 0, 0)
+        for mode, ratio in (ratios | {"fixed": 1.0}).items()
     ]
-    assert (
-        remark(rows) == "The baseline is better than the fixed set here: on a it has 0.50 times "
-        "its error."
-    )
+
+
+@pytest.mark.parametrize(
+    ("ratio", "interval", "words"),
+    [
+        (0.5, None, "The baseline is better than the fixed set here: on a the baseline has 0.50 "),
+        (
+            1.25,
+            (1.1, 1.4),
+            "The fixed set is better .* 1.25 times \\(95 % interval 1.10-1.40\\) the",
+        ),
+        (0.996, None, "There is no difference that counts .* 1.00 times the fixed set's error"),
+        (
+            0.7,
+            (0.4, 1.2),
+            "There is no difference that counts .* 0.70 times \\(95 % interval 0.40-1",
+        ),
+    ],
+)
+def test_baseline_and_fixed_set_are_compared_in_words(ratio, interval, words):
+    baseline, *others = rows_of(baseline=ratio, paired=1.005)
+    mean, said = remarks([replace(baseline, ratio_interval=interval), *others])
+    assert mean.startswith("Mean RTE of a: baseline ")
+    assert re.match(words, said)
+
+
+def test_modes_that_adapt_are_told_where_they_differ():
+    rows = rows_of(baseline=0.5, paired=0.4, paper=2.0)
+    said = "Compared with the fixed set, `paired` is better, with 0.40 times, and `paper` is worse"
+    assert remarks(rows)[2] == f"{said}, with 2.00 times its error."
     # All sequences together decide.
-    assert remark([*rows, replace(rows[0], sequence="all 2", vs_fixed=1.1)]) is None
-    assert remark([replace(rows[0], vs_fixed=1.0), *rows[1:]]) is None
-    assert remark([replace(rows[0], rte=None, vs_fixed=None)]) is None
+    pooled = rows_of("all", baseline=1.5, paired=1.0)
+    mean, verdict = remarks([*rows, *pooled])
+    assert mean.startswith("Mean RTE of all sequences: baseline 1.500 %")
+    assert verdict.startswith("The fixed set is better than the baseline here: on all sequences ")
+    assert remarks([replace(row, rte=None, vs_fixed=None) for row in rows]) == []
+
+
+def test_restarts_are_told_with_their_reason():
+    baseline, fixed = rows_of(baseline=1.0)
+    once = {"restarts": 1, "first_restart": 10.12, "unhealthy": ("max_acceleration",)}
+    both = [replace(baseline, **once), replace(fixed, **once)]
+    said = "On a the health check restarted all modes at 10.1 s (max_acceleration)."
+    assert remarks(both)[-1] == said
+    more = once | {"restarts": 3, "unhealthy": ("max_speed", "max_turn_rate")}
+    assert remarks([replace(baseline, **more), both[1]])[-1] == (
+        "On a the health check restarted baseline 3 times, first at 10.1 s (max_speed, "
+        "max_turn_rate); fixed at 10.1 s (max_acceleration)."
+    )
+
+
+def test_restarts_and_speed_are_those_of_the_stored_replay(own):
+    folder = own.folder / "replays/three/paired"
+    lines = (folder / "frames.csv").read_text().splitlines()
+    head = lines[0].split(",")
+    rows = [dict(zip(head, line.split(","), strict=True)) for line in lines[1:]]
+    for i, row in enumerate(rows):
+        row |= {"restarted": str(int(i in (5, 9))), "prepare_ms": "4.0", "register_ms": "6.0"}
+    (folder / "frames.csv").write_text(
+        "\n".join([lines[0], *(",".join(row.values()) for row in rows)]) + "\n"
+    )
+    summary = json.loads((folder / "replay.json").read_text())
+    # Reading took long.
+    summary |= {"restarts": 2, "unhealthy": {"max_speed": 2}, "replay_s": 1000.0}
+    (folder / "replay.json").write_text(json.dumps(summary))
+    found = compare(own)
+    row = next(row for row in found if row.mode == "paired")
+    assert row.x_real_time == pytest.approx(3.9 / 0.4, abs=0.01)
+    assert remarks(found)[-1] == (
+        "On three the health check restarted paired 2 times, first at 0.5 s (max_speed)."
+    )
+    (folder / "frames.csv").write_text("restarted\n" + "0\n" * 40)
+    with pytest.raises(StoredReplayError, match=r"frames\.csv: is damaged .*--again"):
+        compare(own)
+
+
+def test_unknown_cells_are_empty_and_kittis_are_left_out(replayed):
+    rows = compare(replayed)
+    text = (replayed.folder / "comparison/comparison.csv").read_text()
+    assert "nan" not in text
+    of_rte, standard = tables(rows, 3.0)
+    assert [str(column.header) for column in standard.columns] == [
+        "sequence",
+        "mode",
+        "APE [m]",
+        "RPE [m]",
+    ]
+    assert "KITTI" not in f"{standard.title} {standard.caption}"
+    assert "all" not in f"{of_rte.caption} {standard.caption}".replace("`all`", "all").split()
+    known = StandardErrors(1.0, 0.1, KittiError(0.5, 0.01, (100.0,)))
+    _, standard = tables([*rows, replace(rows[0], sequence="all", standard=known)], 3.0)
+    assert "over [m]" in [str(column.header) for column in standard.columns]
+    assert "KITTI over the sub-trajectories" in str(standard.caption)

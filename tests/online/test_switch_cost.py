@@ -15,7 +15,7 @@ def test_the_switch_cost_of_every_mechanism(study_file, tmp_path, monkeypatch):
     given = ["online.switching.mechanism=hand_over", "online.switching.warm_up=0.3"]
     study = load_study(study_file, given, tmp_path)
     seen = []
-    rows = switch_cost.measure_switching(study, 10.0, lambda *step: seen.append(step))
+    rows, caption = switch_cost.measure_switching(study, 10.0, lambda *step: seen.append(step))
     ratios = {row["mechanism"]: row["RTE ratio"] for row in rows}
     # All of the drive lies within every warm-up but the last.
     assert list(ratios) == [
@@ -27,6 +27,11 @@ def test_the_switch_cost_of_every_mechanism(study_file, tmp_path, monkeypatch):
         "hand_over, 0.3 s",
         "bank",
     ]
+    said = "Switches every 1 s to the same set, on the first 10 s of each training sequence: "
+    assert caption.startswith(f"{said}23 m in all. That is less than 10 sub-trajectories of 3 m")
+    short = load_study(study_file, [*given, "sub_trajectory=2"], tmp_path / "short")
+    monkeypatch.setattr(switch_cost, "WARM_UPS", ())
+    assert switch_cost.measure_switching(short, 10.0)[1] == f"{said}23 m in all."
     assert ratios["none"] == 1.0
     assert ratios["live"] == pytest.approx(1.0, abs=1e-3)
     assert ratios["bank"] == pytest.approx(1.0, abs=1e-9)

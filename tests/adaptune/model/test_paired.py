@@ -319,6 +319,19 @@ def test_beyond_all_training_it_takes_the_fixed_set():
     assert len(set(np.round(ratios, 6))) > 2
 
 
+def test_of_a_single_sequence_familiarity_is_unknown_and_all_counts():
+    errors = np.tile(np.array([[1.0, 0.5]], np.float32), (50, 1))
+    features = np.random.default_rng(0).normal(size=(50, 2))
+    sets = table([[0.0, 0.0], [1.0, 1.0]])
+    data = TrainingData(features, np.zeros(50, np.intp), errors, sets, 0)
+    selection = PairedExpectedRatio().fit(data).select(np.full(2, 50.0))
+    assert selection.trial == 1
+    assert math.isnan(selection.familiarity)
+    # A switch must pay here, too.
+    dear = PairedExpectedRatio(switch_cost=0.9).fit(data)
+    assert dear.select(np.zeros(2), current=0).trial == 0
+
+
 def test_a_switch_must_pay():
     data = two_sets(1.0, 0.8)
     data.errors[:, 1] = 0.8
