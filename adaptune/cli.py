@@ -10,7 +10,12 @@ import typer
 
 from adaptune import tools
 from adaptune.errors import AdaptuneError
-from adaptune.next_command import say_next, say_next_of_study, say_next_online
+from adaptune.next_command import (
+    say_next,
+    say_next_of_study,
+    say_next_of_trained,
+    say_next_online,
+)
 from adaptune.terminal import Commands, begin_work, console, errors, progress, say
 
 if TYPE_CHECKING:
@@ -184,27 +189,15 @@ def offline(
             "is driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
         )
     )
-    own, fixed = (
-        sum(row[f"{mode}, whole run"] for row in training.rows) / len(training.rows)
-        for mode in ("baseline", "fixed")
-    )
-    say(
-        f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % in whole runs in training "
-        f"({_sequences(len(training.rows))})."
-    )
-    say(f"Parameters of the fixed set: {_short(model.sets[model.fixed])}")
-    say(f"Parameters of the baseline: {_short(loaded.odometry.space.baseline)}")
+    for sentence in training.words:
+        say(sentence)
+    say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
-    if training.remark:
-        say(training.remark)
     say(driven(loaded, model).words)
     say(f"Error model: {loaded.model_path}")
-    if len(loaded.training) > 1:
-        say_next_of_study("would adapting pay elsewhere?", "validate", study, override, folder)
-    else:
-        say_next_online(loaded.config.test, study, override, folder)
+    say_next_of_trained(loaded.training, loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -237,6 +230,7 @@ def trials(
     from adaptune import report
     from adaptune import trials as table
     from adaptune.archive import Archive
+    from offline.budget import all_done
 
     names = loaded.training
     archive = Archive(loaded.folder / "trials")
@@ -252,7 +246,11 @@ def trials(
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
-        say_next_of_study("run the trials that are left, fit", "offline", study, override, folder)
+        if all_done(loaded.config.offline, loaded.folder, (row["trial"] for row in finished)):
+            say_next_of_trained(loaded.training, loaded.config.test, study, override, folder)
+        else:
+            why = "run the trials that are left, fit"
+            say_next_of_study(why, "offline", study, override, folder)
     if export is not None:
         begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
@@ -338,8 +336,10 @@ def online(
             made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
-    test = _sequences(len(loaded.config.test))
-    say(f"{made} replays made, of {test} in every mode: {loaded.folder / 'replays'}/")
+    # Besides the rules, the baseline and the fixed set.
+    n = len(loaded.config.test) * (len(loaded.rules) + 2)
+    there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
+    say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
 
 
@@ -390,6 +390,7 @@ def compare(
     """
     loaded = _load(study, override, folder)
     from adaptune.study.driven import MIN_SEQUENCES
+    from offline.budget import TRIALS, more_trials
     from online.comparison import compare as compare_replays
     from online.comparison import remarks, tables
 
@@ -401,23 +402,17 @@ def compare(
     for said in remarks(rows):
         say(said)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
-    if (n := len(loaded.config.training)) < MIN_SEQUENCES:
+    say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
+    n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
+    if n < MIN_SEQUENCES and more is not None:
+        why = f"try {TRIALS} sets; {MIN_SEQUENCES} training sequences show whether to adapt"
+        say_next_of_study(why, "offline", study, more, folder)
+    elif n < MIN_SEQUENCES:
         first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
         say_next_of_study("find out whether to adapt", "offline", study, override, folder, first)
     else:
         why = "what it has learned; docs/adapting-live.md brings it to the robot"
         say_next(why, "model", "show", loaded.model_path)
-
-
-def _sequences(n: int) -> str:
-    return f"{n} sequence{'' if n == 1 else 's'}"
-
-
-def _short(parameters: dict[str, Any]) -> str:
-    return ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in parameters.items()
-    )
 
 
 def main() -> None:

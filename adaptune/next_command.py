@@ -37,6 +37,20 @@ def say_next_online(
     say_next_of_study(why, "online", study, override, folder, first)
 
 
+def say_next_of_trained(
+    training: Sequence[str],
+    test: Sequence[str],
+    study: Path,
+    override: Sequence[str],
+    folder: Path | None,
+) -> None:
+    """Name what follows training: nothing can be left out of one sequence."""
+    if len(training) > 1:
+        say_next_of_study("would adapting pay elsewhere?", "validate", study, override, folder)
+    else:
+        say_next_online(test, study, override, folder)
+
+
 def _program() -> str:
     """The command line as the user can call it."""
     called = Path(sys.argv[0])

@@ -14,6 +14,7 @@ from adaptune.terminal import begin_work, console, progress, say
 
 if TYPE_CHECKING:
     from adaptune.inspect import Inspection
+    from adaptune.trajectory import Trajectory
 
 
 def inspect(
@@ -39,20 +40,21 @@ def inspect(
     else:
         found = inspect_file(file)
     console.print(render_inspection(found))
-    if png is not None:
+    _begin_study(found)
+    if png is not None:  # last: the lines of the study are to be copied in one piece
         draw_inspection(found, png)
         say(f"First scan: {png}")
-    _begin_study(found)
 
 
 LENGTHS = (25.0, 10.0, 5.0, 2.0, 1.0)
-"""Metres of a sub-trajectory: the first of which a path holds ten."""
+"""Metres of a sub-trajectory: the first of which the path of the test holds ten."""
+TRAINING = 0.6
+"""Share of a recording's duration that is proposed for training, before the test."""
 
 
 def _begin_study(found: "Inspection") -> None:
     """Print the rest of a study of this recording alone, and the command that begins it."""
     from adaptune import yaml
-    from adaptune.metrics import travelled
 
     named = (yaml.Document(found.entry).data or {}).get("sequences")
     if not named:
@@ -63,15 +65,24 @@ def _begin_study(found: "Inspection") -> None:
             "only be a `test` sequence"
         )
         return
-    path = travelled(found.reference.T_world_sensor)[-1]
-    length = next((length for length in LENGTHS if length <= path / 10.0), LENGTHS[-1])
-    (name,) = named
+    (name,), share = named, f"{100 * TRAINING:.0f}"
     say(
-        f"training: [{name}: 0-60%]\ntest: [{name}: 60-100%]\nsub_trajectory: {length}\n"
+        f"training: [{name}: 0-{share}%]\ntest: [{name}: {share}-100%]\n"
+        f"sub_trajectory: {proposed_sub_trajectory(found.reference)}\n"
         "odometry: {name: gicp}    # or another one, see docs/your-odometry.md\n"
     )
     first = f"put the lines from `sequences:` on in {name}.yaml; then "
     say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
+
+
+def proposed_sub_trajectory(reference: "Trajectory") -> float:
+    """Metres that the test's part of the path holds ten times, or the least."""
+    from adaptune.metrics import travelled
+
+    first, last = reference.stamps[[0, -1]]
+    tested = reference.T_world_sensor[reference.stamps >= first + TRAINING * (last - first)]
+    path = travelled(tested)[-1]
+    return next((length for length in LENGTHS if length <= path / 10.0), LENGTHS[-1])
 
 
 class CacheAction(StrEnum):
@@ -128,12 +139,20 @@ def serve(
 
 def show(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An error model.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="FILE", help="An error model, or a study's folder.", show_default=False
+        ),
     ],
 ) -> None:
     """Describe an error model: its sets, sequences, provenance, and validation."""
     from adaptune.model import ErrorModel
     from adaptune.model.show import render
+    from adaptune.study.run_folder import CONFIGURATION, MODEL
 
+    file = file / MODEL if file.is_dir() else file
     console.print(render(ErrorModel.load(file), file))
-    say_next("replay the test sequences of STUDY with it", "online", "STUDY", "--model", file)
+    if (study := file.parent / CONFIGURATION).exists():
+        other = [] if file.name == MODEL else ["--model", file]
+        why = "replay the test sequences with it"
+        say_next(why, "online", study, "--folder", file.parent, *other)

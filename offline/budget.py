@@ -2,10 +2,12 @@
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from adaptune.archive import OF_SLOT
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from offline.config import OfflineConfig
@@ -62,6 +64,42 @@ def spent(
     if config.stagnation is not None and since >= config.stagnation:
         return f"none of {since} trials was better than trial {number}"
     return None
+
+
+def all_done(config: OfflineConfig, folder: Path, numbers: Iterable[int]) -> bool:
+    """Whether a study has no trials left, and the model is fitted to those that it has.
+
+    Parameters
+    ----------
+    config
+        The budgets.
+    folder
+        The study's. ``trials.csv``, which a run writes at its end, is newer than all trials then.
+    numbers
+        Numbers of the finished trials.
+    """
+    table, limit = folder / "trials.csv", max_trials(config)
+    if not table.exists():
+        return False
+    ended = table.stat().st_mtime_ns
+    if any(path.stat().st_mtime_ns > ended for path in (folder / "trials").glob("*/*.npz")):
+        return False
+    if limit is None or config.sampler == "grid":
+        return True
+    if any((config.hours, config.stagnation, config.target)):
+        return True
+    # Every search shares trial 0.
+    searches = Counter(n // OF_SLOT for n in numbers if n)
+    return min(searches.values(), default=0) + 1 >= limit
+
+
+def more_trials(config: OfflineConfig, override: Sequence[str]) -> list[str] | None:
+    """Values to run as many trials with as without a budget; None if the budget allows as many."""
+    limit = max_trials(config)
+    if limit is None or limit >= TRIALS or config.sampler == "grid":
+        return None
+    rest = [text for text in override if not text.startswith("offline.trials=")]
+    return rest if len(rest) < len(override) else [*rest, f"offline.trials={TRIALS}"]
 
 
 class Clock:

@@ -53,6 +53,33 @@ class Training(NamedTuple):
     rows: list[dict[str, Any]]
     remark: str | None  # see `rivalry`
 
+    @property
+    def words(self) -> list[str]:
+        """What the fixed set is, and what it gains in training."""
+        own, fixed = (
+            sum(row[f"{mode}, whole run"] for row in self.rows) / len(self.rows)
+            for mode in ("baseline", "fixed")
+        )
+        sets, n = self.model.sets, len(self.rows)
+        baseline = f"Parameters of the baseline: {_short(sets.space.baseline)}"
+        where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
+        if self.fixed == 0:
+            beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
+            return [f"{beaten}; the fixed set is the baseline.", baseline]
+        return [
+            f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
+            f"Parameters of the fixed set: {_short(sets[self.fixed])}",
+            baseline,
+            *([self.remark] if self.remark else []),
+        ]
+
+
+def _short(parameters: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in parameters.items()
+    )
+
 
 def train(
     study: OfflineStudy,

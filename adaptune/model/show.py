@@ -31,12 +31,12 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
     """
     n_frames, n_sets = model.errors.shape
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
-    window = f", mean of {model.window} selections" if model.window > 1 else ""
-    size = path.stat().st_size / 1e6
+    window = f", as a mean over {model.window} selections in a row" if model.window > 1 else ""
+    size, n = path.stat().st_size / 1e3, len(model.sequences)
     return Group(
         Text(
             f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets "
-            f"on {n_frames} frames of {len(model.sequences)} sequences, {size:.1f} MB\n"
+            f"on {n_frames} frames of {n} sequence{'s' if n > 1 else ''}, {size:,.0f} kB\n"
             f"Errors over {model.length:g} m. Scans are described by {blocks}{window}."
         ),
         *_named("Settings", model.odometry.get("settings", {})),
@@ -60,10 +60,10 @@ def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
     if not model.bank:
         return
     if not bank.adapt:
-        yield Text("Bank: it was not shown to pay, and is not used.")
-    else:
-        share = 100 * bank.min_fixed_share
-        yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
+        yield Text("Bank: it was not shown to pay, and `paired` does not use it.")
+        return
+    share = 100 * bank.min_fixed_share
+    yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
     yield report.table(f"The bank's {len(model.bank)} members", _sets(model, model.bank))
 
 
@@ -95,6 +95,8 @@ def _words(value: Any) -> str:
 
 def _validation(model: ErrorModel) -> list[RenderableType]:
     """Numbers in a table, and the rest in words."""
+    if len(model.sequences) < 2:
+        return [Text("One training sequence cannot show whether adapting pays elsewhere.")]
     if not model.validation:
         return [Text("Not validated yet: `adaptune validate` shows whether adapting pays.")]
     found = {
@@ -121,7 +123,7 @@ def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
         errors = model.errors[model.sequence == s]
         run = ~np.isnan(errors).all(axis=0) if len(errors) else np.zeros(len(model.sets), bool)
         row: dict[str, Any] = {"sequence": name, "frames": len(errors), "sets": int(run.sum())}
-        row |= {"fixed [%]": None, "best [%]": None, "best set": None, "lost, fixed [%]": None}
+        row |= {"fixed [%]": None, "best [%]": None, "best set": None, "lost frames, fixed": None}
         if run.any():
             means = np.full(len(run), np.inf)
             means[run] = np.nanmean(cap(errors[:, run]), axis=0)
@@ -129,7 +131,7 @@ def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
             row |= {"best [%]": float(means[best]), "best set": model.sets.trials[best]}
         if run.any() and run[fixed]:
             row["fixed [%]"] = float(means[fixed])
-            row["lost, fixed [%]"] = float(100.0 * np.isinf(errors[:, fixed]).mean())
+            row["lost frames, fixed"] = int(np.isinf(errors[:, fixed]).sum())
         rows.append(row)
     return rows
 

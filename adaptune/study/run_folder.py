@@ -11,6 +11,8 @@ from adaptune.study.mistakes import ConfigurationError
 
 CONFIGURATION = "study.yaml"
 """The resolved configuration."""
+MODEL = "model.safetensors"
+"""The error model."""
 
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""

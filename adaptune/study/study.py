@@ -20,7 +20,7 @@ from adaptune.sequence.names import OF_VIEW
 from adaptune.space import ParameterSpace
 from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.mistakes import ConfigurationError
-from adaptune.study.run_folder import check_folder, open_folder
+from adaptune.study.run_folder import MODEL, check_folder, open_folder
 from adaptune.study.sequences import StudySequences
 
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
@@ -45,7 +45,7 @@ class Study(Generic[C_co]):
     @property
     def model_path(self) -> Path:
         """File of the error model."""
-        return self.folder / "model.safetensors"
+        return self.folder / MODEL
 
     @cached_property
     def sequences(self) -> StudySequences:

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from adaptune import tools
 from adaptune.archive import Archive
 from adaptune.cli import app
+from adaptune.trajectory import Trajectory
+from offline.offline_study import load_study
 
 
 def adaptune(*arguments, cwd):
@@ -48,12 +51,34 @@ def test_one_bag_is_enough_and_every_command_names_the_next(study_file, tmp_path
         done = adaptune(*words, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         words = next_words(done)
-        assert words[1:] == ["one.yaml", "--folder", "my study[v2]", "-o", "offline.trials=4"]
+        fewer = [] if command == "compare" else ["-o", "offline.trials=4"]
+        assert words[1:] == ["one.yaml", "--folder", "my study[v2]", *fewer]
         lines = [line for line in done.stdout.splitlines() if line.strip()]
         assert len(set(lines)) == len(lines)
+        assert (command == "online") != ("Fixed set: my study[v2]/fixed.yaml" in done.stdout)
     assert "one_60-100" in done.stdout
-    assert "name 6 training sequences or more, the study has 1; then" in done.stdout
+    assert "# try 64 sets; 6 training sequences show whether to adapt" in done.stdout
     assert (tmp_path / "my study[v2]/comparison/one_60-100.png").exists()
+
+
+def test_what_inspect_prints_with_a_picture_is_a_study(study_file, tmp_path):
+    bag = study_file.parent / "one.bag"
+    done = CliRunner().invoke(app, ["inspect", str(bag), "--png", str(tmp_path / "one.png")])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[-1] == f"First scan: {tmp_path / 'one.png'}"
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    assert load_study(tmp_path / "one.yaml", [], tmp_path / "run").training == ["one_0-60"]
+
+
+@pytest.mark.parametrize(
+    ("tested", "length"), [(0.4, 1.0), (8.0, 1.0), (20.0, 2.0), (99.0, 5.0), (1e3, 25.0)]
+)
+def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
+    stamps = np.arange(101) * 10**9
+    T = np.tile(np.eye(4), (101, 1, 1))
+    T[:, 0, 3] = np.concatenate([np.linspace(0, 5e3, 61), 5e3 + np.linspace(0, tested, 41)[1:]])
+    assert tools.proposed_sub_trajectory(Trajectory(stamps, T)) == length
 
 
 def test_inspect_says_what_to_do_without_a_reference(tmp_path):
@@ -67,7 +92,8 @@ def test_inspect_says_what_to_do_without_a_reference(tmp_path):
 @pytest.mark.parametrize(
     ("command", "following"),
     [
-        (["trials"], "offline"),
+        (["trials"], "validate"),
+        (["trials", "-o", "offline.trials=12"], "offline"),
         (["validate"], "online"),
         (["switching", "--seconds", "10"], "online"),
         (["model", "show", "MODEL"], "online"),
@@ -88,6 +114,21 @@ def test_other_commands_name_the_next_too(study_file, trained_folder, tmp_path, 
     assert next_words(done)[0] == following
     csv = adaptune("trials", study_file, "--folder", folder, "--csv", cwd=tmp_path)
     assert "Next" not in csv.stdout
+
+
+def test_a_model_in_a_study_folder_names_a_command_that_works(study_file, tmp_path):
+    folder = tmp_path / "my run"
+    roles = ("-o", "training=[one]", "-o", "test=[two]", "-o", "offline.trials=4")
+    assert adaptune("offline", study_file, *roles, "--folder", folder, cwd=tmp_path).returncode == 0
+    done = adaptune("model", "show", folder, cwd=tmp_path)
+    assert "One training sequence cannot show whether adapting pays" in done.stdout
+    done = adaptune(*next_words(done), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4 replays made" in done.stdout
+    done = adaptune("online", folder / "study.yaml", "--folder", folder, cwd=tmp_path)
+    assert "All 4 replays were there already" in done.stdout
+    shutil.copy(folder / "model.safetensors", tmp_path)
+    assert "Next:" not in adaptune("model", "show", "model.safetensors", cwd=tmp_path).stdout
 
 
 def test_parts_of_a_course_are_recorded_once(study_file, tmp_path):
@@ -112,7 +153,7 @@ def test_the_whole_way(study_file, tmp_path):
     assert next_words(done)[:2] == ["validate", str(study_file)]
     done = adaptune("online", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "4 replays made" in done.stdout
+    assert "4 of 4 replays made" in done.stdout
     assert next_words(done)[:2] == ["compare", str(study_file)]
     done = adaptune("compare", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -48,9 +48,10 @@ def test_model_show_prints_what_a_file_says_as_it_is(trained_folder, tmp_path):
     model = ErrorModel.load(trained_folder / "model.safetensors")
     file = tmp_path / "my[v2].safetensors"
     dataclasses.replace(model, provenance={"made by": ODD}).save(file)
+    (tmp_path / "study.yaml").touch()
     done = CliRunner().invoke(app, ["model", "show", str(file)])
     assert ODD in " ".join(done.stdout.split())
-    assert "my[v2].safetensors" in done.stdout
+    assert f"--model '{file}'" in done.stdout
 
 
 def test_a_log_has_a_line_of_progress_now_and_then(caplog, monkeypatch):

@@ -52,6 +52,18 @@ def trained(finished, tmp_path):
     return load(tmp_path)
 
 
+def test_parameters_are_told_once_where_no_set_beat_the_baseline(trained):
+    training = train(trained)._replace(remark="More of it.")
+    beaten, *baseline = training._replace(fixed=0).words
+    assert beaten.startswith("No set clearly beat the baseline's ")
+    assert beaten.endswith("(2 sequences); the fixed set is the baseline.")
+    assert [text.split(":")[0] for text in baseline] == ["Parameters of the baseline"]
+    gain, fixed, _, remark = training._replace(fixed=2).words
+    assert gain.startswith("Fixed: ")
+    assert fixed.startswith("Parameters of the fixed set: max_correspondence_distance ")
+    assert remark == "More of it."
+
+
 def test_frames_that_are_damaged_or_removed_are_made_again(trained):
     frames = trained.folder / "trials/one/frames.npz"
     before = frames.read_bytes()

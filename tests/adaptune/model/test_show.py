@@ -53,10 +53,10 @@ def shown(model, folder):
 def test_a_model_is_explained(model, tmp_path):
     text = shown(model, tmp_path)
     for said in (
-        "gicp: 3 parameter sets on 4 frames of 2 sequences",
-        "ndt (90 numbers), mean of 3 selections",
-        "cave 2 3 4.000 1.000 1 0.000",
-        "street 2 3 2.000 2.000 0 0.000",
+        "gicp: 3 parameter sets on 4 frames of 2 sequences, 2 kB",
+        "ndt (90 numbers), as a mean over 3 selections in a row",
+        "cave 2 3 4.000 1.000 1 0",
+        "street 2 3 2.000 2.000 0 0",
         "distance [1, 10] log 4 4",
         "kernel none, [huber] none none",
         "0, fixed 3.000 4 none",
@@ -157,11 +157,11 @@ def test_a_bank_is_shown(model, tmp_path):
     assert "Bank" not in shown(model, tmp_path)
     vectors = np.zeros((4, 2, 3), np.float32)
     for settings, said in (
-        (BankSettings(adapt=False), "it was not shown to pay, and is not used."),
+        (BankSettings(adapt=False), "it was not shown to pay, and `paired` does not use it."),
         (BankSettings(min_fixed_share=0.25), "has 25 % of the weight at least"),
     ):
         of_two = dataclasses.replace(model, bank=[0, 2], vectors=vectors, bank_settings=settings)
         text = shown(of_two, tmp_path)
-        assert "The bank's 2 members" in text
-        assert "0, fixed 3.000 4 none 2 11.8 9 none" in text
+        assert ("The bank's 2 members" in text) == settings.adapt
+        assert ("0, fixed 3.000 4 none 2 11.8 9 none" in text) == settings.adapt
         assert said in text
