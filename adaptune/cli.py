@@ -230,8 +230,10 @@ def trials(
     from adaptune import report
     from adaptune import trials as table
     from adaptune.archive import Archive
+    from adaptune.study.inputs import warn_of_stale
     from offline.budget import all_done
 
+    warn_of_stale(loaded)
     names = loaded.training
     archive = Archive(loaded.folder / "trials")
     finished = table.rows(archive, names)

@@ -154,6 +154,8 @@ def switch_cost_in_words(study: Study) -> str:
     online = driven(study, ErrorModel.load(study.model_path))
     if online.switches:
         return f"{online.words} Then {cost}."
+    if online.paper in ("live", "hand_over"):
+        return f"{online.words} It never switches; `paper` does, and then {cost}."
     return f"{online.words} It never switches, so there is no switch cost."
 
 

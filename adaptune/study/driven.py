@@ -22,8 +22,9 @@ class ModeError(AdaptuneError):
 class Driven(NamedTuple):
     """What is driven, and by what."""
 
-    mechanism: Mechanism | None  # None if the fixed set is never left
+    mechanism: Mechanism | None  # of `paired`; None if it never leaves the fixed set
     words: str  # a sentence
+    paper: Mechanism | None = None  # of `paper`, if the study names it
 
     @property
     def switches(self) -> bool:
@@ -40,25 +41,34 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         If the model does not go with the study's bank.
     """
     number = f"trial {model.fixed}" + ("" if model.fixed else ", the baseline")
-    fixed = f"`online` will drive the fixed set ({number}), because"
-    if "paired" not in study.rules:
-        why = "the study does not name the rule `paired` (online.rules)"
+    fixed = f"`online` will drive the fixed set ({number})"
+    if not study.rules:
+        why = "no rule is named (online.rules)"
         if study.odometry.description.whole:
             why = "a program that runs whole recordings cannot change its parameters"
-        return Driven(None, f"{fixed} {why}.")
-    mechanism = mechanism_of("paired", model, study.mechanism, study.odometry.description.live)
+        return Driven(None, f"{fixed} only, because {why}.")
+    mechanism, paper = (
+        mechanism_of(mode, model, study.mechanism, study.odometry.description.live)
+        if mode in study.rules
+        else None
+        for mode in ("paired", "paper")
+    )
+    if mechanism is None:
+        return Driven(None, "`online` will drive `paper`, and not `paired` (online.rules).", paper)
     if mechanism == "bank":
         members = ", ".join(map(str, bank_members(study.config.online.switching, model)))
-        return Driven("bank", f"`online` will drive the bank of trials {members} as `paired`.")
+        words = f"`online` will drive the bank of trials {members} as `paired`."
+        return Driven("bank", words, paper)
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
-        return Driven(mechanism, f"`online` will drive one set at a time as `paired`, {how}.")
+        words = f"`online` will drive one set at a time as `paired`, {how}."
+        return Driven(mechanism, words, paper)
     if (n := len({origin(name) for name in model.sequences})) < MIN_SEQUENCES:
         are = "is one" if n == 1 else f"are {n}"
         why = f"adapting takes {MIN_SEQUENCES} training sequences, and there {are}"
     else:
         why = "leaving out one training sequence after the other did not show that adapting pays"
-    return Driven(None, f"{fixed} {why}.")
+    return Driven(None, f"{fixed} as `paired`, because {why}.", paper)
 
 
 def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool) -> Mechanism:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ from adaptune.study.study import Study
 FILE = "inputs.json"
 """In the folder of a sequence's trials: what they depend on."""
 AGAIN = "`adaptune offline --again` with this study"
+
+_log = logging.getLogger(__name__)
 
 
 class Stale(NamedTuple):
@@ -150,6 +153,14 @@ def check_inputs(study: Study) -> None:
         f"{study.folder}: {'; '.join(changes)}. On this depend {', '.join(results)}. {AGAIN} "
         f"computes them again, and nothing else; or give this study another folder (--folder)"
     )
+
+
+def warn_of_stale(study: Study) -> None:
+    """Log what `check_inputs` refuses, where old results may still be looked at."""
+    try:
+        check_inputs(study)
+    except ConfigurationError as error:
+        _log.warning("%s", error)
 
 
 def check_model(study: Study, sequences: Sequence[str], provenance: Mapping[str, Any]) -> None:

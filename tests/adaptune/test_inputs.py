@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.study.inputs import InputNotes, check_inputs, resume
+from adaptune.study.inputs import InputNotes, check_inputs, resume, warn_of_stale
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import write_tum
 from offline.offline_study import load_study
@@ -263,3 +263,14 @@ def test_trials_with_faults_depend_on_the_limits(load, tmp_path):
     resume(other, again=True)
     assert sorted(Archive(study.folder / "trials").finished("one")) == [0]
     check_inputs(other)
+
+
+def test_the_table_of_stale_trials_says_so(load, tmp_path, caplog):
+    study = load()
+    archive = Archive(study.folder / "trials", InputNotes(study))
+    archive.write("one", 0, trial({"x": 0}))
+    warn_of_stale(study)
+    assert not caplog.messages
+    (tmp_path / "one.tum").write_text((tmp_path / "one.tum").read_text() + "\n")
+    warn_of_stale(study)
+    assert "one.tum has other content" in caplog.text

@@ -58,7 +58,7 @@ def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_p
         monkeypatch.setattr(ErrorModel, "load", lambda _: made)
         return switch_cost.switch_cost_in_words(study)
 
-    assert said().startswith(f"`online` will drive the fixed set (trial {model.fixed}), because")
+    assert said().startswith(f"`online` will drive the fixed set (trial {model.fixed}) as `paired`")
     assert said().endswith("It never switches, so there is no switch cost.")
     members = ", ".join(map(str, model.bank))
     bank = said(bank_adapts=True)
@@ -67,6 +67,14 @@ def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_p
     assert said(adapts=True) == (
         "`online` will drive one set at a time as `paired`, changed live. "
         "Then a switch costs 25.0% of the RTE."
+    )
+    handed = load_study(study_file, ["online.switching.mechanism=hand_over"], folder)
+    assert said(study=handed).endswith(
+        "It never switches; `paper` does, and then a switch costs 0.0% of the RTE."
+    )
+    only = load_study(study_file, ["online.rules=[paper]"], folder)
+    assert said(study=only).startswith(
+        "`online` will drive `paper`, and not `paired` (online.rules)."
     )
     study.model_path.unlink()
     assert "If `online` will drive one set at a time, a switch costs 25.0%" in said()
