@@ -137,8 +137,8 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     side.set_ylim(low - margin, high + margin)
     figure.colorbar(dots, ax=above, label="height z [m]", shrink=0.6, extend="both")
     text = f"{_scan_text(inspection.scan)}; drawn within {reach:.0f} m"
-    title = [*textwrap.wrap(f"{inspection.path.name}, first scan", 90), *_balanced(text, 90)]
-    figure.suptitle("\n".join(title), fontsize=10)
+    heading = [*textwrap.wrap(f"{inspection.path.name}, first scan", 90), *_balanced(text, 90)]
+    figure.suptitle("\n".join(heading), fontsize=10)
     kind = "svg" if path.suffix.lower() == ".svg" else "png"
     with replacing(path) as temporary:
         figure.savefig(temporary, format=kind, dpi=110)
