@@ -185,7 +185,7 @@ def _during(scans: sequence.Sequence, reference: Trajectory) -> NDArray[np.bool_
     """Which poses of a reference may be of the scans' time, of shape (n,)."""
     span = scans.source.span() if isinstance(scans, RecordedSequence) else None
     if span is None or not isinstance(scans, RecordedSequence):
-        return np.ones(len(reference), bool)
+        return np.ones(len(reference.stamps), bool)
     seconds, section = (reference.stamps - span[0]) * 1e-9, scans.section
     stop = np.inf if section.stop is None else section.stop
     return np.asarray((seconds > section.start - _AROUND) & (seconds < stop + _AROUND))

@@ -85,7 +85,8 @@ def cluster_of(study, address):
     return Cluster(setup_of(study), study.training, 1e9, address)
 
 
-def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler):
+def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler, monkeypatch):
+    monkeypatch.setattr(cluster, "_TIMEOUT", 2.0)
     study = load_study(study_file, [], tmp_path / "study")
     with pytest.raises(ClusterError, match="has no workers; start some with `dask worker tcp"):
         cluster_of(study, scheduler[0])
