@@ -46,8 +46,9 @@ def inspect(
         say(f"First scan: {png}")
 
 
-LENGTHS = (25.0, 10.0, 5.0, 2.0, 1.0)
-"""Metres of a sub-trajectory: the first of which the path of the test holds ten."""
+LENGTHS = {25.0: 8, 10.0: 8, 5.0: 3, 2.0: 3}
+"""Metres of a sub-trajectory, and how many of them the path of the test must hold: over short ones,
+the noise of the reference counts too much."""
 TRAINING = 0.6
 """Share of a recording's duration that is proposed for training, before the test."""
 
@@ -82,7 +83,7 @@ def proposed_sub_trajectory(reference: "Trajectory") -> float:
     first, last = reference.stamps[[0, -1]]
     tested = reference.T_world_sensor[reference.stamps >= first + TRAINING * (last - first)]
     path = travelled(tested)[-1]
-    return next((length for length in LENGTHS if length <= path / 10.0), LENGTHS[-1])
+    return next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)
 
 
 class CacheAction(StrEnum):
