@@ -46,7 +46,7 @@ def inspect(
         say(f"First scan: {png}")
 
 
-LENGTHS = {25.0: 8, 10.0: 8, 5.0: 2, 2.0: 2}
+LENGTHS = {25.0: 8, 10.0: 8, 5.0: 1.4, 2.0: 2}
 """Metres of a sub-trajectory, and how many of them the path of the test must hold: over short ones,
 the noise of the reference counts too much."""
 TRAINING = 0.6
