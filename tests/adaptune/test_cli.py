@@ -72,7 +72,8 @@ def test_what_inspect_prints_with_a_picture_is_a_study(study_file, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("tested", "length"), [(0.4, 1.0), (6.0, 2.0), (8.0, 5.0), (20.0, 5.0), (99.0, 10.0), (1e3, 25.0)]
+    ("tested", "length"),
+    [(0.4, 1.0), (6.0, 2.0), (8.0, 5.0), (20.0, 5.0), (99.0, 10.0), (1e3, 25.0)],
 )
 def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
     stamps = np.arange(101) * 10**9
