@@ -328,6 +328,7 @@ def online(
     """
     loaded = _load(study, override, folder)
     from adaptune.cores import pin
+    from online.modes import ReplaySetup
     from online.run_replays import run_replays
 
     # Ask for the number of cores before the replays are bound to one.
@@ -338,8 +339,7 @@ def online(
             made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
-    # Besides the rules, the baseline and the fixed set.
-    n = len(loaded.config.test) * (len(loaded.rules) + 2)
+    n = len(loaded.config.test) * len(ReplaySetup.of(loaded).modes)
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)

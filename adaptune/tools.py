@@ -77,7 +77,7 @@ def _begin_study(found: "Inspection") -> None:
 
 
 def proposed_sub_trajectory(reference: "Trajectory") -> float:
-    """Metres that the test's part of the path holds ten times, or the least."""
+    """The first of `LENGTHS` for which the test's part of the path is long enough; 1 m if none."""
     from adaptune.metrics import travelled
 
     first, last = reference.stamps[[0, -1]]

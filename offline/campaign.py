@@ -230,7 +230,7 @@ class _UnderWay:
     def __init__(self, progress: Progress):
         self._progress = progress
         self._read: dict[str, int] = {}
-        self._runs: dict[int, float] = {}
+        self._runs: dict[tuple[str, tuple[int, ...]], float] = {}
 
     @property
     def runs(self) -> float:
@@ -244,11 +244,11 @@ class _UnderWay:
             self._read[name] = max(done, self._read.get(name, 0))
             self._progress(f"reading {name}", self._read[name], total, "")
         else:
-            self._runs[id(task)] = len(task.numbers) * done / max(total, 1)
+            self._runs[task.key] = len(task.numbers) * done / max(total, 1)
 
     def end(self, task: Task) -> None:
         """Forget a task."""
-        self._runs.pop(id(task), None)
+        self._runs.pop(task.key, None)
 
 
 def _best(config: OfflineConfig, stage: Stage) -> str:

@@ -18,6 +18,7 @@ from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.hosting import verdict
+from adaptune.odometry.registry import is_user_class
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
@@ -40,6 +41,11 @@ class Task(NamedTuple):
     whole: bool = False  # run them from end to end, without restarts at the reference
     frames: bool = False  # return the frames, which all trials on the sequence share, too
     apart: bool = False  # run classes of the user in processes of their own, also clean ones
+
+    @property
+    def key(self) -> tuple[str, tuple[int, ...]]:
+        """What identifies it among the tasks of a run, also when it is run again."""
+        return self.sequence, self.numbers
 
     def __str__(self) -> str:
         trials = f"trials {', '.join(map(str, self.numbers))}" if self.numbers else "its scans"
@@ -173,8 +179,8 @@ class _Queue(Generic[W]):
         # A class that is not as clean as it says then costs its own trial only.
         task = task._replace(apart=True)
         self.waiting.insert(0, task)
-        self._deaths[task.sequence, task.numbers] += 1
-        if self._deaths[task.sequence, task.numbers] == MOST_DEATHS:
+        self._deaths[task.key] += 1
+        if self._deaths[task.key] == MOST_DEATHS:
             self.failure = WorkerError(
                 f"{MOST_DEATHS} workers died ({death.cause}) on {task}; if they were out of "
                 f"memory, lower offline.memory or offline.workers"
@@ -192,8 +198,9 @@ class Sequences:
     """The sequences that a worker has prepared, as many as its memory holds."""
 
     def __init__(self, setup: TrialSetup, memory: float):
-        self._setup = setup
-        self._apart = replace(setup, odometry=replace(setup.odometry, user_code=False))
+        self._setup = self._apart = setup
+        if setup.odometry.user_code and is_user_class(setup.odometry.name):
+            self._apart = replace(setup, odometry=replace(setup.odometry, user_code=False))
         self._memory = memory
         self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 
@@ -206,7 +213,7 @@ class Sequences:
         return TaskResult(trials, sequence.frames if task.frames else None)
 
     def _prepared(self, setup: TrialSetup, task: Task, report: Report) -> PreparedSequence:
-        key = task.sequence, task.apart
+        key = task.sequence, setup is self._setup
         sequence = self._ready.pop(key, None)
         if sequence is None:
             # Make room: drop the sequences that were not used for longest.

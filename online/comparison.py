@@ -198,10 +198,13 @@ def _check_replays(study: Study, setup: ReplaySetup) -> None:
         for mode in setup.modes
     }
     path, model = _model_of(study, made.values())
+    digest = "" if model is None else model.digest
+    # Both read what they are about.
+    shared = {name: shared_identity(study, name) for name in study.config.test}
     for (name, mode), summary in made.items():
-        now, about = shared_identity(study, name), summary.about.model_dump()
+        now, about = dict(shared[name]), summary.about.model_dump()
         if model is not None:
-            whole = setup.identity(mode, model, model.digest)
+            whole = setup.identity(mode, model, digest)
             now |= {key: whole[key] for key in ("model", "parameters")}
             if not _is_automatic(study, whole["switching"], about["switching"]):
                 now["switching"] = whole["switching"]

@@ -132,8 +132,12 @@ def check_inputs(study: Study) -> None:
     ConfigurationError
         It says what has changed, which results depend on it, and what to do.
     """
-    if not (found := stale(study)):
-        return
+    if found := stale(study):
+        raise _refusal(study, found)
+
+
+def _refusal(study: Study, found: Sequence[Stale]) -> ConfigurationError:
+    """What has changed, which results depend on it, and what to do."""
     changes = dict.fromkeys(change for one in found for change in one.changes)
     results = [
         f"{n_trials(study, one.name)} trials on {one.name}"
@@ -149,7 +153,7 @@ def check_inputs(study: Study) -> None:
         if everything or path.parent.name != "baseline"
     ]
     results += [f"{len(replays)} replays"] if replays else []
-    raise ConfigurationError(
+    return ConfigurationError(
         f"{study.folder}: {'; '.join(changes)}. On this depend {', '.join(results)}. {AGAIN} "
         f"computes them again, and nothing else; or give this study another folder (--folder)"
     )
@@ -214,16 +218,16 @@ def resume(study: Study, again: bool = False) -> None:
     ------
     ConfigurationError
     """
-    if not again:
-        check_inputs(study)
+    found = stale(study)
+    if found and not again:
+        raise _refusal(study, found)
     study.open()
-    _remove_stale(study)
+    _remove_stale(study, found)
     _remove_other_descriptions(study)
 
 
-def _remove_stale(study: Study) -> None:
+def _remove_stale(study: Study, found: Sequence[Stale]) -> None:
     """Remove the trials that depend on something that has changed."""
-    found = stale(study)
     for one in found:
         folder = study.folder / "trials" / one.name
         if one.trials is not None:

@@ -1,9 +1,10 @@
 import pytest
 
 from offline import workers
+from offline.campaign import watched
 from offline.offline_study import load_study
 from offline.train import train
-from offline.workers import Task, TaskProgress, TaskResult, now_and_then, run
+from offline.workers import Death, Task, TaskProgress, TaskResult, now_and_then, run
 
 
 class TwoWords:
@@ -30,6 +31,14 @@ def test_tasks_tell_how_far_they_are():
         (task, TaskProgress("running", 2, 10)),
     ]
     assert [done for done, *_ in finished] == [task]
+
+
+def test_what_a_dead_worker_had_done_does_not_count():
+    pool, calls = TwoWords(), []
+    half = TaskProgress("running", 8, 10)
+    pool.said = [half, Death("it was killed"), half]
+    list(watched(pool, [Task("one", (0, 1), ({}, {}))], "runs", lambda *call: calls.append(call)))
+    assert [done for _, done, *_ in calls] == [1.6, 1.6, 2]
 
 
 def test_the_remark_counts_workers_and_not_runs():
