@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
+from adaptune.live.hop import Hops
 from adaptune.metrics import cap
 from adaptune.space import ParameterSet
 
@@ -38,6 +39,8 @@ class Frames:
         By name, in order, how many of the features are each descriptor's.
     elevations : ndarray of shape (n,)
         float32 degrees, of each scan's lowest points, see `adaptune.descriptor.lowest_elevation`.
+    hops : Hops
+        Direct registrations, one a second where they succeeded, see `adaptune.live.hop`.
     """
 
     stamps: NDArray[np.int64]
@@ -45,6 +48,7 @@ class Frames:
     descriptors: NDArray[np.float32]
     blocks: dict[str, int]
     elevations: NDArray[np.float32]
+    hops: Hops = field(default_factory=lambda: Hops.of([]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +299,7 @@ class Archive:
                 descriptors=compact(frames.descriptors),
                 blocks=_packed(frames.blocks),
                 elevations=frames.elevations.astype(np.float32),
+                **{f"hops_{name}": array for name, array in frames.hops._asdict().items()},
             )
 
     def read_frames(self, sequence: str) -> Frames:
@@ -308,6 +313,7 @@ class Archive:
                 data["descriptors"].astype(np.float32),
                 dict(_unpacked(data["blocks"])),
                 data["elevations"],
+                Hops(*(data[f"hops_{name}"] for name in Hops._fields)),
             )
         except KeyError as error:
             raise ArchiveError(f"{path}: lacks {error}; run `adaptune offline`") from error

@@ -28,6 +28,13 @@ class Selection(NamedTuple):
     n_sequences : float
         Effective number of training sequences that the selection rests on: one over the sum of
         their squared weights; NaN where they have none.
+    estimated_error, estimated_low, estimated_high : float
+        Percent, the odometry's own error over the last metres as it was measured without ground
+        truth, and its 95 % interval; NaN where nothing was measured.
+    lost : bool
+        Whether the last measurements say that the odometry, or the bank, has lost track.
+    restart : frozenset of int
+        Trial numbers of members of a bank that have lost track: they start again at its pose.
     """
 
     trial: int
@@ -37,3 +44,8 @@ class Selection(NamedTuple):
     predicted_fixed: float = math.nan
     familiarity: float = math.nan
     n_sequences: float = math.nan
+    estimated_error: float = math.nan
+    estimated_low: float = math.nan
+    estimated_high: float = math.nan
+    lost: bool = False
+    restart: frozenset[int] = frozenset()

@@ -10,14 +10,26 @@ from numpy.typing import NDArray
 from adaptune.descriptor.base import Describer, DescriptorError, lowest_elevation
 from adaptune.descriptor.motion import MOTION, SECOND, fill_in, speed_and_turn_rate
 from adaptune.geometry import Poses
+from adaptune.live.live_evidence import LiveEvidence
 from adaptune.model import RULES, BankRule, ErrorModel, make_rule
-from adaptune.model.bank_weights import SMOOTHING, smooth_weights, weighted_selection
+from adaptune.model.bank_weights import (
+    SMOOTHING,
+    measured_weights,
+    smooth_weights,
+    weighted_selection,
+)
+from adaptune.model.paired import PairedExpectedRatio
 from adaptune.odometry.base import Motions
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 
 SCANS_TO_KNOW = 10
 """The sensor is recognised by the median over this many scans that selections are made from."""
+
+WORSE = 2.0
+"""A single odometry leaves a set whose error is surely more than so many times the predicted."""
+AVOIDED = 60.0
+"""Seconds for which it does not return to that set."""
 
 _log = logging.getLogger(__name__)
 
@@ -26,11 +38,14 @@ class Selector:
     """Chooses parameters for an odometry, or weights for a bank, by an error model.
 
     Show it every scan with `observe`; ask it to `select` whenever a selection is due, usually once
-    a second. It reads no clock and no file.
+    a second, and let it `measure` after that: it compares the odometry's motion over the last
+    metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
+    is measured counts from the next selection on. The selector reads no clock and no file.
 
-    With the paired rule and a bank that was shown to pay, the selections are weights of the bank's
-    members, smoothed over the last selections. Scans of a sensor or mount that was not trained with
-    (`ErrorModel.is_foreign`) get the fixed set.
+    With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
+    the last selections. A single odometry leaves a set that does worse than predicted. Scans of a
+    sensor or mount that was not trained with (`ErrorModel.is_foreign`) get the fixed set, or in a
+    bank weights by what is measured alone.
 
     Parameters
     ----------
@@ -83,6 +98,7 @@ class Selector:
             BankRule(model.bank_settings) if weighs else make_rule(rule, model.paired, switch_cost)
         )
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
+        self._live = LiveEvidence(self.members)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -105,6 +121,9 @@ class Selector:
         self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
         self._elevations: list[float] = []
         self._warned = False
+        self._live.reset()
+        self._avoided: dict[int, float] = {}
+        self._predicted = np.nan
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """See a scan, before it is registered.
@@ -125,6 +144,7 @@ class Selector:
             while len(self._recent) > 1 and self._recent[1][0] <= self._stamp - SECOND:
                 self._recent.popleft()
         self._scan, self._stamp = scan, stamp
+        self._live.observe(stamp, scan, motions)
 
     def select(self) -> Selection:
         """Choose what to apply before the newest scan is registered.
@@ -144,13 +164,40 @@ class Selector:
         self._descriptors.append(descriptor)
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
-        selection = self._rule.select(feature, self._current)
+        selection = self._choose(feature)
+        if self._rule.gated and self._is_foreign(self._scan):
+            selection = self._without_training(selection)
         if selection.weights is not None:
             selection = self._smoothed(selection)
-        if self._rule.gated and self._is_foreign(self._scan):
-            selection = self._keep_fixed(selection)
-        self._current = selection.trial
-        return selection
+        elif selection.trial != self._current:
+            self._live.forget()  # the hops were those of another set
+        self._current, self._predicted = selection.trial, selection.predicted_error
+        return self._live.estimated(selection, self._model.length)
+
+    def measure(self) -> None:
+        """Measure how wrong the odometry, or each member of the bank, was over the last metres.
+
+        It takes some tens of milliseconds. Nothing depends on when it is called after `select`,
+        and without it only the training counts.
+        """
+        self._live.measure()
+
+    def _choose(self, feature: NDArray[np.float64]) -> Selection:
+        if isinstance(self._rule, BankRule):
+            return self._rule.weigh(feature, self._live.squares())
+        if isinstance(self._rule, PairedExpectedRatio):
+            return self._rule.select(feature, self._current, self._worse_than_predicted())
+        return self._rule.select(feature, self._current)
+
+    def _worse_than_predicted(self) -> Collection[int]:
+        """The sets that have done worse than predicted over the last metres."""
+        seconds = self._stamp * 1e-9
+        self._avoided = {t: until for t, until in self._avoided.items() if until > seconds}
+        error = self._live.own_error(self._model.length)
+        current = self._current
+        if error is not None and current is not None and error.low > WORSE * self._predicted:
+            self._avoided[current] = seconds + AVOIDED
+        return self._avoided
 
     def _motion(self) -> NDArray[np.float64]:
         """Speed and turn rate over the last second of registered scans, of shape (2,)."""
@@ -163,23 +210,28 @@ class Selector:
         """Replace the weights by the smoothed ones; what is predicted stays as it is."""
         self._found.append(selection)
         weights = np.array([[(s.weights or {})[m] for m in self.members] for s in self._found])
-        familiarity = np.array([s.familiarity for s in self._found])
-        smooth = smooth_weights(weights, familiarity)[-1].tolist()
-        weighted = weighted_selection(
-            self._model.sets, dict(zip(self.members, smooth, strict=True))
-        )
+        return self._weighted(selection, smooth_weights(weights)[-1])
+
+    def _weighted(self, selection: Selection, weights: NDArray[np.float64]) -> Selection:
+        of_members = dict(zip(self.members, weights.tolist(), strict=True))
+        weighted = weighted_selection(self._model.sets, of_members)
         return selection._replace(
             trial=weighted.trial, parameters=weighted.parameters, weights=weighted.weights
         )
 
-    def _keep_fixed(self, selection: Selection) -> Selection:
-        weights = None
-        if selection.weights is not None:
-            weights = {trial: float(trial == self.fixed) for trial in self.members}
+    def _without_training(self, selection: Selection) -> Selection:
+        """What to do where the training says nothing."""
         fixed = selection.predicted_fixed
-        return Selection(
-            self.fixed, self._model.sets[self.fixed], weights, fixed, fixed, familiarity=0.0
+        unknown = selection._replace(
+            trial=self.fixed,
+            parameters=self._model.sets[self.fixed],
+            predicted_error=fixed,
+            familiarity=0.0,
+            n_sequences=np.nan,
         )
+        if not self.members or selection.weights is None:
+            return unknown
+        return self._weighted(unknown, measured_weights(len(self.members), self._live.squares()))
 
     def _is_foreign(self, scan: Scan) -> bool:
         """Whether the scans seen so far come from a sensor that was not trained with."""
@@ -194,7 +246,7 @@ class Selector:
             known = sorted({f"{elevation:.0f}" for elevation in self._model.elevations})
             _log.warning(
                 "the scans' lowest points lie at %.0f degrees, those of training at %s: this is "
-                "another sensor or mount; the fixed set is kept",
+                "another sensor or mount, of which the training says nothing",
                 lowest,
                 ", ".join(known),
             )

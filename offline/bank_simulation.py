@@ -7,9 +7,11 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive, Frames, Trial
-from adaptune.geometry import Poses, invert, mean_motion, steps
-from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
+from adaptune.archive import Archive, Frames, Hops, Trial
+from adaptune.geometry import Poses, invert, mean_motion, rectify, steps
+from adaptune.live.live_evidence import SPACING
+from adaptune.live.squares import HopErrors, LiveSquares, live_squares
+from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors, travelled
 from adaptune.model.bank_weights import MemberWeights
 from adaptune.odometry.bank import agreement, share
 
@@ -62,9 +64,34 @@ class BankSimulation:
     period: NDArray[np.int64]  # (n_frames,): whole periods since the first scan
     length: float  # metres of a sub-trajectory
     lost_track: float  # metres a second
+    hops: Hops  # measured without the odometry's errors
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
+
+    def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
+        """What is measured of members before the first frame of each period."""
+        first = np.unique(self.period, return_index=True)[1]
+        if not len(self.hops.start):
+            return [None] * len(first)
+        T_previous_current = self.motions(members)
+        known = np.isfinite(T_previous_current).all(axis=(-2, -1))
+        T_odom_sensor = chained(np.where(known[..., None, None], T_previous_current, np.eye(4)))
+        start, end = self.hops.start, self.hops.end
+        moved = invert(T_odom_sensor[start]) @ T_odom_sensor[end]
+        metres = travelled(self.T_ref_sensor)
+        length = np.maximum(metres[end] - metres[start], SPACING)[:, None, None]
+        wrong = moved[..., :3, 3] - self.hops.T_start_end[:, None, :3, 3]
+        errors = 100.0 / length * np.einsum("hij,hmj->hmi", self.hops.projection, wrong)
+        unknown = np.concatenate([np.zeros((1, len(members)), np.intp), np.cumsum(~known, axis=0)])
+        errors[unknown[end] > unknown[start]] = np.nan
+        seconds = (self.stamps - self.stamps[0]) * 1e-9
+        hops = HopErrors(errors, metres[start], metres[end], seconds[end])
+        found = []
+        for frame in first:
+            before = HopErrors(*(array[end < frame] for array in hops))
+            found.append(live_squares(before.recent(metres[frame], seconds[frame])))
+        return found
 
     def errors(self, weights: MemberWeights) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory."""
@@ -79,12 +106,18 @@ class BankSimulation:
         moved[none] = np.where(np.isnan(T_ref_step[none]), np.eye(4), T_ref_step[none])
         # Where the reference is unknown, nothing is lost.
         lost = np.linalg.norm((moved - T_ref_step)[:, :3, 3], axis=1) > bounds
-        T_odom_sensor = np.empty_like(self.T_ref_sensor)
-        T_odom_sensor[0] = np.eye(4)
-        for i, T in enumerate(moved):
-            T_odom_sensor[i + 1] = T_odom_sensor[i] @ T
+        T_odom_sensor = chained(moved)
         lost = np.concatenate([[False], lost])
         return cap(sub_trajectory_rte(self.T_ref_sensor, T_odom_sensor, self.length, lost))
+
+
+def chained(T_previous_current: Poses) -> Poses:
+    """Poses of shape (n + 1, ..., 4, 4) from motions of shape (n, ..., 4, 4), from the identity."""
+    T = np.empty((len(T_previous_current) + 1, *T_previous_current.shape[1:]))
+    T[0] = np.eye(4)
+    for i, motion in enumerate(T_previous_current):
+        T[i + 1] = rectify(T[i] @ motion)
+    return T
 
 
 def recorded_motions(frames: Frames, trials: Sequence[Trial], lost_track: float) -> Poses:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, Self
 
@@ -24,6 +24,7 @@ from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
+from offline.hops import measured_hops
 from offline.objective import trajectory_metrics
 from offline.trial_run import DrivenRun, TrialRun
 
@@ -130,6 +131,10 @@ class PreparedSequence:
         fill_in(described[1:], describe.blocks, motion[:-1])
         elevation = np.array(elevations, np.float32)
         self.frames = Frames(at, T_ref_sensor, described, describe.blocks, elevation)
+
+    def measured_frames(self, advance: Advance = lambda *_: None) -> Frames:
+        """The frames with the hops between them, for which the scans are read again."""
+        return replace(self.frames, hops=measured_hops(self._scans, self.frames, advance))
 
     def __iter__(self) -> Iterator[Any]:
         yield from self._kept

@@ -210,7 +210,10 @@ class Sequences:
         sequence = self._prepared(setup, task, report)
         advance = partial(_report, report, "running")
         trials = setup.run(sequence, task.sets, task.whole, advance)
-        return TaskResult(trials, sequence.frames if task.frames else None)
+        frames = None
+        if task.frames:
+            frames = sequence.measured_frames(partial(_report, report, "reading"))
+        return TaskResult(trials, frames)
 
     def _prepared(self, setup: TrialSetup, task: Task, report: Report) -> PreparedSequence:
         key = task.sequence, setup is self._setup

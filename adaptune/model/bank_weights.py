@@ -7,15 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from adaptune.live.squares import LiveSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.base import Rule, TrainingData, mean_errors
-from adaptune.model.evidence import Evidence, NearestFrames, trust_in
+from adaptune.model.evidence import Evidence, NearestFrames
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
 
-RIDGE = 0.05
-"""Added to mean squares, as a share of the fixed set's, so that like members share the weight."""
+UNFAMILIAR = 0.2
+"""Share of the prior's windows that remain where a scan is unlike all training."""
+DOUBT = 2.0
+"""Mean square of a member that nobody has tried, in that of the first one."""
 SMOOTHING = 5
 """Selections whose weights are averaged: errors cancel each other while weights stay the same."""
 POOL = 64
@@ -32,8 +35,13 @@ class BankSettings(BaseModel):
     # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
     n_frames: PositiveInt = 300  # nearest frames of each sequence
-    # Minimum share of the weight that the fixed set keeps.
+    # Minimum share of the weight that the fixed set keeps where nothing was measured.
     min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    # Added to the members' mean squares, as a share of their harmonic mean: the larger, the more
+    # even are the weights.
+    even: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.05
+    # How many windows of live evidence the training counts as.
+    prior_windows: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 3.0
     # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
     # member that has lost track is left out of the mean, and does not cost what it would alone.
     clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
@@ -69,6 +77,9 @@ class BankRule(Rule):
     For each training sequence S is taken over the frames nearest to the scan and divided by the
     fixed set's mean square there. Sequences weigh as in `PairedExpectedRatio`, and no weight is
     negative.
+
+    What is measured while the robot drives (`adaptune.live`) is blended with it, each weighted by
+    the number of its windows. The less familiar the scene, the fewer the training counts as.
 
     The weights of a single scan are noise in part, and members' errors of some seconds cancel only
     while the weights stay the same. So a bank applies the mean over a few selections, see
@@ -134,14 +145,25 @@ class BankRule(Rule):
         feature: NDArray[np.float64],
         current: int | None = None,  # noqa: ARG002 - nothing is switched
     ) -> Selection:
-        """See `Rule.select`."""
+        """See `Rule.select`; by the training alone."""
+        return self.weigh(feature, None)
+
+    def weigh(self, feature: NDArray[np.float64], live: LiveSquares | None) -> Selection:
+        """Weigh the members for one scan.
+
+        Parameters
+        ----------
+        feature
+            The scan's scaled descriptor, of shape (n_features,).
+        live
+            What was measured of the members, in their order; None if nothing was.
+        """
         near = self.near(feature[None])
-        (weights,), (ratio,) = bank_weights(near, self.settings)
+        (weights,), (ratio,) = bank_weights(near, self.settings, [live])
         (of_sequences,) = near.evidence.weights(self.settings.sharpness)
         fixed = float(np.sqrt(of_sequences @ near.fixed[0]))
-        return weighted_selection(
-            self.data_.sets,
-            dict(zip(self.members_, weights.tolist(), strict=True)),
+        of_members = dict(zip(self.members_, weights.tolist(), strict=True))
+        return weighted_selection(self.data_.sets, of_members)._replace(
             predicted_error=float(ratio) * fixed,
             predicted_fixed=fixed,
             familiarity=float(near.evidence.familiarity[0]),
@@ -149,18 +171,25 @@ class BankRule(Rule):
         )
 
 
-def weighted_selection(
-    sets: ParameterSets, weights: Mapping[int, float], **predicted: float
-) -> Selection:
+def weighted_selection(sets: ParameterSets, weights: Mapping[int, float]) -> Selection:
     """A selection of a bank's weights; its set is that of the heaviest member."""
     heaviest = max(weights, key=weights.__getitem__)
-    return Selection(heaviest, sets[heaviest], weights, **predicted)
+    return Selection(heaviest, sets[heaviest], weights)
 
 
 def bank_weights(
-    near: NearProducts, settings: BankSettings
+    near: NearProducts, settings: BankSettings, live: Sequence[LiveSquares | None]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights of the members, and the root mean square that is expected of their mean.
+
+    Parameters
+    ----------
+    near
+        Of some scans.
+    settings
+        How to weigh.
+    live
+        What was measured of the members before each scan.
 
     Returns
     -------
@@ -170,32 +199,52 @@ def bank_weights(
     """
     relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
     of_sequences = near.evidence.weights(settings.sharpness)
-    squares = np.einsum("qs,qsjk->qjk", of_sequences, relative)
-    weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
-    kept = settings.min_fixed_share if settings.adapt else 1.0
-    trust = near.evidence.trust * (1.0 - kept)
-    weights *= trust[:, None]
-    weights[:, 0] += 1.0 - trust
+    learned = np.einsum("qs,qsjk->qjk", of_sequences, relative)
+    windows = settings.prior_windows * (UNFAMILIAR + (1.0 - UNFAMILIAR) * near.evidence.trust)
+    squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
+    weights = np.array([minimum_variance_weights(of_scan, settings.even) for of_scan in squares])
+    measured = np.array([0.0 if one is None else one.windows for one in live])
+    kept = settings.min_fixed_share * windows / (windows + measured)
+    weights *= (1.0 - kept)[:, None]
+    weights[:, 0] += kept
+    if not settings.adapt:
+        weights[:] = np.eye(len(near.members))[0]
     mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)
     # Where the fixed set has no error, there is none to be gained on.
     of_fixed = np.maximum(squares[:, 0, 0], 1e-12)
     return weights, np.sqrt(mean_square / of_fixed)
 
 
-def smooth_weights(
-    weights: NDArray[np.float64], familiarity: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
+def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.float64]:
+    """Weights of members of which the training says nothing.
 
-    Doubt does not wait: where a scan is unlike all training, the fixed set gets the weight that
-    this asks for at once.
+    Until something is measured, the first member has all the weight. From then on, the others get
+    theirs as far as the measurements confirm them.
+
+    Parameters
+    ----------
+    n_members
+        Number of members.
+    live
+        What was measured of them.
+
+    Returns
+    -------
+    ndarray of shape (n_members,)
+    """
+    if live is None:
+        return np.asarray(np.eye(n_members)[0])
+    prior = np.diag([1.0, *[DOUBT] * (n_members - 1)])
+    return minimum_variance_weights(blend(prior, BankSettings().prior_windows, live))
+
+
+def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
 
     Parameters
     ----------
     weights
-        Of shape (n_selections, n_members), the fixed set first.
-    familiarity
-        Of each scan, of shape (n_selections,).
+        Of shape (n_selections, n_members).
 
     Returns
     -------
@@ -204,12 +253,7 @@ def smooth_weights(
     total = weights.copy()
     for k in range(1, SMOOTHING):
         total[k:] += weights[:-k]
-    mean = total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHING)[:, None]
-    trust = trust_in(familiarity)
-    others = np.maximum(mean[:, 1:].sum(axis=1), 1e-12)
-    mean[:, 1:] *= np.minimum(1.0, trust / others)[:, None]
-    mean[:, 0] = np.maximum(0.0, 1.0 - mean[:, 1:].sum(axis=1))
-    return np.asarray(mean)
+    return np.asarray(total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHING)[:, None])
 
 
 def clip_errors(
@@ -242,20 +286,25 @@ def clip_errors(
     return kept.astype(np.float32), np.where(lost, most, 0.0).astype(np.float32)
 
 
-def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64]:
+def minimum_variance_weights(
+    squares: NDArray[np.float64], even: float = BankSettings().even
+) -> NDArray[np.float64]:
     """Weights w, none negative and adding up to 1, for which w'Sw is least.
 
     Parameters
     ----------
     squares
-        S, of shape (n, n), the fixed set first.
+        S, of shape (n, n).
+    even
+        See `BankSettings`.
 
     Returns
     -------
     ndarray of shape (n,)
     """
     n = len(squares)
-    squares = squares + np.eye(n) * (RIDGE * squares[0, 0] + 1e-12)
+    harmonic = 1.0 / (1.0 / np.maximum(squares.diagonal(), 1e-12)).mean()
+    squares = squares + np.eye(n) * (even * harmonic + 1e-9 * squares.diagonal().max() + 1e-12)
     # Up to a factor they are those for which w'Sw - 2 sum w is least.
     root = np.linalg.cholesky(squares)
     from scipy.optimize import nnls  # not needed to load a model

@@ -1,5 +1,6 @@
 """Selection by the paired expected ratio."""
 
+from collections.abc import Collection
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
@@ -156,16 +157,36 @@ class PairedExpectedRatio(Rule):
         predicted[columns] = expected[0] * float(weights[0] @ near.fixed[0])
         return predicted
 
-    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
-        """See `Rule.select`."""
+    def select(
+        self,
+        feature: NDArray[np.float64],
+        current: int | None = None,
+        avoid: Collection[int] = (),
+    ) -> Selection:
+        """See `Rule.select`.
+
+        Parameters
+        ----------
+        feature
+            The scan's scaled descriptor, of shape (n_features,).
+        current
+            Trial number of the set that the odometry has now.
+        avoid
+            Trial numbers of sets that are not chosen, unless there is no other: they did worse than
+            predicted.
+        """
         near = self.near(feature[None])
         (best,), ratios = _best_candidates(near, self._fixed_at, self.settings)
         (expected,), (cautious,), (weights,) = ratios
+        if self.candidates_[best] in avoid:
+            others = [c for c, trial in enumerate(self.candidates_) if trial not in avoid]
+            best = min(others, key=lambda c: cautious[c], default=best)
         familiarity = float(near.evidence.familiarity[0])
         at = self.candidates_.index(current) if current in self.candidates_ else None
         # In a place unlike all training, a switch back to the fixed set need not pay. Nor need a
         # switch away from a set that is expected to be worse than the fixed one.
         weighs = self.switch_cost > 0.0 and not familiarity < NOVEL
+        weighs = weighs and current not in avoid
         if weighs and at is not None and cautious[best] + self.switch_cost >= cautious[at] <= 1.0:
             best = at
         fixed = float(weights @ near.fixed[0])

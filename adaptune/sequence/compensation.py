@@ -26,7 +26,8 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     """Undo a motion of constant velocity: the points as seen from the sensor at the scan's stamp.
 
     `T_start_end` is the sensor's pose `duration` seconds after the stamp, seen from where it was at
-    the stamp. A scan whose points have no times is returned as it is.
+    the stamp. Afterwards all points have the time 0. A scan whose points have no times is returned
+    as it is.
     """
     if scan.times is None or not len(scan):
         return scan
@@ -36,7 +37,8 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     velocity = T_start_end[:3, 3] / duration
     moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
     points = _rotate(scan, moments, Rotation.from_rotvec(moments[:, None] * twist))
-    return replace(scan, points=points + scan.times[:, None] * velocity.astype(np.float32))
+    points += scan.times[:, None] * velocity.astype(np.float32)
+    return replace(scan, points=points, times=np.zeros_like(scan.times))
 
 
 def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | None, float]]:

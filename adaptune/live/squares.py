@@ -1,0 +1,125 @@
+"""How wrong the members of a bank were over the last hops, and what that says of their weights."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.live.hop import NOISE
+
+SECONDS, METRES = 30.0, 30.0
+"""A hop counts as long as it is no older, or no farther behind, than this."""
+CLIP = 5.0
+"""Percent of a hop by which a member may differ from the others' median, for weights: beyond that
+it is lost, and how far says nothing more."""
+
+
+class HopErrors(NamedTuple):
+    """Errors over some hops, the newest last."""
+
+    # (n_hops, n_members, 3): percent of the hop, in the frame of its start; NaN where a member gave
+    # no pose.
+    errors: NDArray[np.float64]
+    start: NDArray[np.float64]  # (n_hops,): metres driven at the start of each hop
+    end: NDArray[np.float64]  # (n_hops,): and at its end
+    seconds: NDArray[np.float64]  # (n_hops,): time of its end
+
+    def with_hop(
+        self, errors: NDArray[np.float64], start: float, end: float, seconds: float
+    ) -> "HopErrors":
+        """Add a hop, and drop those that no longer count."""
+        added = HopErrors(
+            np.concatenate([self.errors, errors[None]]),
+            np.append(self.start, start),
+            np.append(self.end, end),
+            np.append(self.seconds, seconds),
+        )
+        return added.recent(end, seconds)
+
+    def recent(self, metres: float, seconds: float) -> "HopErrors":
+        """Those that count when so much was driven, at this time."""
+        young = seconds - self.seconds <= SECONDS
+        kept = np.flatnonzero(young | (metres - self.start <= METRES))
+        return HopErrors(*(array[kept] for array in self))
+
+
+class LiveSquares(NamedTuple):
+    """Mean products of the errors of members over hops."""
+
+    products: NDArray[np.float64]  # (n_members, n_members): percent squared
+    noise: float  # percent squared: what of each of them is the registrations' own
+    windows: float  # number of hops that share no part of the path
+
+
+def live_squares(hops: HopErrors) -> LiveSquares | None:
+    """Mean products of the errors over hops; None if there is no hop.
+
+    The registration's error is common to all members. It adds the same to all products, so it
+    does not change the minimum-variance weights.
+    """
+    n_hops = len(hops.errors)
+    if not n_hops:
+        return None
+    length = hops.end - hops.start
+    errors, missing = clip_to_median(hops.errors)
+    products = np.einsum("hix,hjx->ij", errors, errors) / n_hops
+    products += np.diag(missing.mean(axis=0)) * CLIP**2
+    noise = float(((100.0 * NOISE / length) ** 2).mean())
+    order = np.argsort(hops.start)
+    start, end = hops.start[order], np.maximum.accumulate(hops.end[order])
+    covered = end[0] - start[0] + np.maximum(0.0, end[1:] - np.maximum(start[1:], end[:-1])).sum()
+    return LiveSquares(products, noise, max(1.0, float(covered / length.mean())))
+
+
+def clip_to_median(
+    errors: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Clip errors at `CLIP` from the members' median.
+
+    Parameters
+    ----------
+    errors
+        Of shape (n_hops, n_members, 3); NaN where a member gave no pose.
+
+    Returns
+    -------
+    errors : ndarray of the same shape
+        The median where there was none.
+    missing : ndarray of shape (n_hops, n_members)
+        Where there was none.
+    """
+    missing = np.asarray(~np.isfinite(errors).all(axis=-1))
+    known = np.where(missing[..., None], np.nan, errors)
+    known[missing.all(axis=1)] = 0.0
+    centre = np.nanmedian(known, axis=1, keepdims=True)
+    apart = np.where(missing[..., None], 0.0, known - centre)
+    lengths = np.linalg.norm(apart, axis=-1, keepdims=True)
+    return centre + apart * np.minimum(1.0, CLIP / np.maximum(lengths, 1e-9)), missing
+
+
+def blend(
+    prior: NDArray[np.float64], prior_windows: float, live: LiveSquares | None
+) -> NDArray[np.float64]:
+    """Mean products of a prior and of what was measured, each weighted by its number of windows.
+
+    What is measured is scaled to the prior: only how members compare counts, as in the prior, and
+    not how hard the place is for all of them. Without the registrations' own part, the harmonic
+    means of the members' squares are then the same.
+
+    Parameters
+    ----------
+    prior
+        Of shape (n_members, n_members).
+    prior_windows
+        How many windows it counts as.
+    live
+        None if nothing was measured.
+    """
+    if live is None:
+        return prior
+    squares = live.products.diagonal()
+    # Registrations that are as wrong as the members say little; never divide by nothing.
+    own = np.maximum(squares - live.noise, 0.25 * squares) + 1e-12
+    scale = (1.0 / own).mean() / (1.0 / np.maximum(prior.diagonal(), 1e-12)).mean()
+    total = prior_windows + live.windows
+    return np.asarray((prior_windows * prior + live.windows * scale * live.products) / total)
