@@ -96,9 +96,7 @@ def standard_error(logs: Logs, recordings: Sequence[str]) -> float:
     return float(scale * _resampled_means(logs, number).std())
 
 
-def _resampled_means(
-    logs: Logs, number: NDArray[np.intp], seed: int = 0
-) -> NDArray[np.float64]:
+def _resampled_means(logs: Logs, number: NDArray[np.intp], seed: int = 0) -> NDArray[np.float64]:
     """Means of a circular block bootstrap, whose blocks are of one recording."""
     following = np.arange(1, len(logs) + 1)
     for recording in np.unique(number):
@@ -127,6 +125,7 @@ def interval_of(logs: Logs, recordings: Sequence[str]) -> tuple[float, float]:
 def figures(logs: Logs, recordings: Sequence[str]) -> Figures:
     """All that is said of a way to adapt."""
     low, high = interval_of(logs, recordings)
-    ratios = np.exp([logs.mean(), low, high, worst_tenth(logs), logs.max()]).tolist()
-    loss = expected_loss(logs, recordings)
-    return Figures(loss, *ratios, len(logs), len(set(recordings)))
+    ratios = (logs.mean(), low, high, worst_tenth(logs), logs.max())
+    geometric, low, high, tenth, worst = (float(np.exp(ratio)) for ratio in ratios)
+    loss, n_recordings = expected_loss(logs, recordings), len(set(recordings))
+    return Figures(loss, geometric, low, high, tenth, worst, len(logs), n_recordings)

@@ -74,7 +74,8 @@ class LabelledSequence:
         """The same with some of the frames."""
         if kept.all():
             return self
-        whole = {n: float(cap(errors[kept]).mean()) for n, errors in self.whole_errors.items()}
+        few = {n: errors[kept] for n, errors in self.whole_errors.items() if kept.any()}
+        whole = {n: float(cap(errors).mean()) for n, errors in few.items()}
         return replace(
             self,
             period=self.period[kept],
@@ -86,7 +87,7 @@ class LabelledSequence:
             repeats=None if self.by_frames else self.repeats,
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
             whole=whole if self.by_frames else self.whole,
-            whole_errors={n: errors[kept] for n, errors in self.whole_errors.items()},
+            whole_errors=few,
             cuts=self.stretch[kept],
             extent=None if self.extent is None else self.extent.some(kept),
         )
@@ -182,6 +183,15 @@ class LabelledData(NamedTuple):
         lengths = [len(s.errors) for s in self.sequences]
         cuts = np.concatenate([s.stretch for s in self.sequences])
         return stretch_numbers(np.repeat(place, lengths), cuts)
+
+    def drawn(self, size: int, rng: np.random.Generator) -> "LabelledData":
+        """Some of the stretches, drawn at random, with all their views."""
+        number = self.stretches()
+        known = np.unique(number)
+        kept = np.isin(number, rng.choice(known, min(size, len(known)), replace=False))
+        ends = np.cumsum([len(s.errors) for s in self.sequences])[:-1]
+        parts = zip(self.sequences, np.split(kept, ends), strict=True)
+        return LabelledData([s.frames(of) for s, of in parts if of.any()], self.sets)
 
     def bounds(self) -> dict[int, float]:
         """The objective of every set in trials on these sequences, see `Verdict.bound`."""
@@ -318,20 +328,30 @@ def labelled_data(
         }
         own = [one is not None and origin(one) == origin(name) for one in owners]
         labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
+    return LabelledData(_with_cuts(_with_whole_runs(archive, labelled, sets, config)), sets)
+
+
+def _with_whole_runs(
+    archive: Archive,
+    labelled: Sequence[LabelledSequence],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+) -> list[LabelledSequence]:
+    """Add what is known of the whole runs of the candidates for the fixed set."""
     rivals = few(LabelledData(labelled, sets).bounds())
-    runs = read_whole_runs(archive, list(run), rivals, config.health)
+    runs = read_whole_runs(archive, [s.name for s in labelled], rivals, config.health)
     whole = whole_values(config.offline, runs)
     # Whether the objective on some frames follows from the errors there.
     by_frames = set(config.offline.objective[0]) == {"rte"}
-    data = []
+    found = []
     for s in labelled:
         of = whole[s.name]
         if by_frames and s.extent is not None:
             errors = whole_errors(archive, s.name, of, s.extent.frames)
-            data.append(replace(s, whole=of, whole_errors=errors, by_frames=True))
+            found.append(replace(s, whole=of, whole_errors=errors, by_frames=True))
         else:
-            data.append(replace(s, whole=of))
-    return LabelledData(_with_cuts(data), sets)
+            found.append(replace(s, whole=of))
+    return found
 
 
 def _with_cuts(sequences: Sequence[LabelledSequence]) -> list[LabelledSequence]:

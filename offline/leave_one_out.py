@@ -23,7 +23,7 @@ from offline.expected_loss import Figures, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 from offline.tuning import (
     MOST_FOLDS,
-    Choice,
+    Policy,
     bank_data,
     bank_errors,
     bank_evidence,
@@ -328,7 +328,7 @@ def _simulate(
     others: LabelledData,
     data: TrainingData,
     pca: ScaledPCA,
-    chosen: Choice,
+    chosen: Policy,
 ) -> tuple[NDArray[np.float64], float]:
     """A bank's errors on what is left out, and the weight that the first member did not have."""
     of_bank = bank_data(others, data, chosen.members)

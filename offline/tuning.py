@@ -54,7 +54,7 @@ Chooser = Callable[[LabelledData, int, int], list[int]]
 """Chooses a bank's members on sequences, for a fixed set, so many."""
 
 
-class Choice(NamedTuple):
+class Policy(NamedTuple):
     """What is driven."""
 
     one_set: PairedSettings  # adapts if that has less expected loss than the fixed set
@@ -72,7 +72,7 @@ def choose(
     most: int | None = None,
     one_set: bool = True,
     fixed: int | None = None,
-) -> Choice:
+) -> Policy:
     """Choose what is driven, leaving one recording or stretch after the other out.
 
     Parameters
@@ -109,7 +109,7 @@ def choose(
             recordings += [origin(left_out.name)] * len(of_fold)
     if len(recordings) < 2 or not logs[0].shape[1]:
         unknown = BankSettings(adapt=RELIES_ON_LIVE and len(members) > 1)
-        return Choice(DO_NOT_ADAPT, unknown, members, {})
+        return Policy(DO_NOT_ADAPT, unknown, members, {})
     return _best(np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0)
 
 
@@ -118,7 +118,7 @@ def _best(
     recordings: Sequence[str],
     banks: Mapping[str, list[int]],
     n_single: int,
-) -> Choice:
+) -> Policy:
     """The settings with the least loss, of one set at a time and of a bank.
 
     Parameters
@@ -147,7 +147,7 @@ def _best(
         members = list(banks.values())[way]
         if losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
-    return Choice(one_set, bank, members, expected)
+    return Policy(one_set, bank, members, expected)
 
 
 def _has_motions(data: LabelledData) -> bool:
@@ -188,22 +188,33 @@ def _logs(
     columns = []
     if one_set:
         columns += list(_paired_errors(left_out, data, pca))
+    known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for make in choosers.values():
-        members = [trial for trial in make(others, data.fixed) if trial in data.sets]
-        of_bank = bank_data(others, data, members) if len(members) > 1 else None
-        near: NearProducts | None = None
-        before: BankSettings | None = None
-        for settings in BANK_SETTINGS:
-            if of_bank is None:
-                columns.append(fixed)
-                continue
-            # Settings with the same clip and frames share what is near.
-            if near is None or before is None or _evidence(settings) != _evidence(before):
-                near, before = bank_evidence(left_out, of_bank, pca, settings), settings
-            columns.append(bank_errors(left_out, near, settings))
+        members = tuple(trial for trial in make(others, data.fixed) if trial in data.sets)
+        if members not in known:
+            of_bank = bank_data(others, data, members) if len(members) > 1 else None
+            known[members] = (
+                [fixed] * len(BANK_SETTINGS)
+                if of_bank is None
+                else list(_bank_errors(left_out, of_bank, pca))
+            )
+        columns += known[members]
     if not columns:
         return np.empty((len(np.unique(left_out.stretch)), 0))
     return np.stack([log_ratios(e, fixed, left_out.stretch) for e in columns], axis=1)
+
+
+def _bank_errors(
+    left_out: LabelledSequence, of_bank: TrainingData, pca: "ScaledPCA"
+) -> Iterator[NDArray[np.float64]]:
+    """Capped errors of a bank with each of `BANK_SETTINGS`."""
+    near: dict[tuple[float, int], NearProducts] = {}
+    for settings in BANK_SETTINGS:
+        key = _evidence(settings)
+        if key not in near:
+            # Settings that share what is near follow each other: one at a time is kept.
+            near = {key: bank_evidence(left_out, of_bank, pca, settings)}
+        yield bank_errors(left_out, near[key], settings)
 
 
 def _evidence(settings: BankSettings) -> tuple[float, int]:
@@ -247,7 +258,9 @@ def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int
     """
     errors, number = np.concatenate([s.errors for s in data.sequences]), data.stretches()
     means = mean_errors(errors, number)
-    best = [data.sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf]
+    best = [
+        data.sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf
+    ]
     pool = [t for t in best if t != fixed and all(t in s.vectors for s in data.sequences)]
     few = data.sets.subset([fixed, *pool])
     columns = data.sets.columns(few.trials)

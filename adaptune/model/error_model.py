@@ -387,7 +387,9 @@ class ErrorModel:
         if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
             raise ValueError("the errors are not of as many frames as the descriptors")
         if not self.sequence.shape == self.stretch.shape == (n_frames,):
-            raise ValueError("the errors are not of as many frames as the sequence and stretch numbers")
+            raise ValueError(
+                "the errors are not of as many frames as the sequence and stretch numbers"
+            )
         if not n_frames or len(self.sets) != n_sets or self.fixed not in self.sets:
             raise ValueError("errors and parameter sets do not go together")
         if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):
