@@ -13,6 +13,7 @@ from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevat
 from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
 from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
+from adaptune.live.hop import Hops
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.isolation import Limits
 from adaptune.odometry.registry import odometry_class
@@ -22,6 +23,7 @@ from adaptune.simulation.simulate import simulate
 from adaptune.space import ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 from offline.config import OfflineConfig
+from offline.hops import measured_hops
 from offline.labelled import LabelledData, LabelledSequence
 from offline.samplers import make_sampler
 from offline.trial import TrialSettings, run_trials
@@ -88,6 +90,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     sets = make_sampler(factory.space, config).propose([])
     one = factory()
     prepared: Any = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
+    hops = measured_hops(scans, frames)
     trials = run_trials(settings, factory, prepared, sets)
     length, lost_track = settings.sub_trajectory, settings.lost_track
     vectors = [error_vectors(frames, trial, length) for trial in trials]
@@ -102,6 +105,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
             errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
             vectors=np.stack(vectors, axis=1),
             motions=motions.astype(np.float32),
+            **{f"hops_{name}": array for name, array in hops._asdict().items()},
         )
 
 
@@ -151,6 +155,7 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
         period,
         settings.sub_trajectory,
         settings.lost_track,
+        Hops(*(found[f"hops_{name}"] for name in Hops._fields)),
         partial(np.take, motions, axis=1),
     )
     return LabelledSequence(

@@ -1,14 +1,15 @@
 """A bank on a training sequence, simulated from the motions that its members made alone."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive, Frames, Hops, Trial
+from adaptune.archive import Archive, Frames, Trial
 from adaptune.geometry import Poses, invert, mean_motion, rectify, steps
+from adaptune.live.hop import Hops
 from adaptune.live.live_evidence import SPACING
 from adaptune.live.squares import HopErrors, LiveSquares, live_squares
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors, travelled
@@ -68,29 +69,34 @@ class BankSimulation:
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
+    _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict)
 
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         """What is measured of members before the first frame of each period."""
+        if members not in self._live:
+            self._live[members] = self._measured(members)
+        return self._live[members]
+
+    def _measured(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         first = np.unique(self.period, return_index=True)[1]
-        if not len(self.hops.start):
+        start, end, T_start_end, projection = self.hops
+        if not len(start):
             return [None] * len(first)
         T_previous_current = self.motions(members)
-        known = np.isfinite(T_previous_current).all(axis=(-2, -1))
+        known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
         T_odom_sensor = chained(np.where(known[..., None, None], T_previous_current, np.eye(4)))
-        start, end = self.hops.start, self.hops.end
         moved = invert(T_odom_sensor[start]) @ T_odom_sensor[end]
-        metres = travelled(self.T_ref_sensor)
+        metres, seconds = travelled(self.T_ref_sensor), (self.stamps - self.stamps[0]) * 1e-9
         length = np.maximum(metres[end] - metres[start], SPACING)[:, None, None]
-        wrong = moved[..., :3, 3] - self.hops.T_start_end[:, None, :3, 3]
-        errors = 100.0 / length * np.einsum("hij,hmj->hmi", self.hops.projection, wrong)
+        wrong = moved[..., :3, 3] - T_start_end[:, None, :3, 3]
+        errors = 100.0 / length * np.einsum("hij,hmj->hmi", projection, wrong)
         unknown = np.concatenate([np.zeros((1, len(members)), np.intp), np.cumsum(~known, axis=0)])
         errors[unknown[end] > unknown[start]] = np.nan
-        seconds = (self.stamps - self.stamps[0]) * 1e-9
         hops = HopErrors(errors, metres[start], metres[end], seconds[end])
         found = []
         for frame in first:
             before = HopErrors(*(array[end < frame] for array in hops))
-            found.append(live_squares(before.recent(metres[frame], seconds[frame])))
+            found.append(live_squares(before.recent(float(metres[frame]), float(seconds[frame]))))
         return found
 
     def errors(self, weights: MemberWeights) -> NDArray[np.float64]:

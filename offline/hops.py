@@ -20,8 +20,8 @@ def measured_hops(
 ) -> Hops:
     """Register scans directly to those some metres before, once a second.
 
-    The reference takes the odometry's place: it gives each registration its first guess. Where it is
-    unknown, nothing is measured.
+    The reference takes the odometry's place: it gives each registration its first guess. Where it
+    is unknown, nothing is measured.
 
     Parameters
     ----------

@@ -401,6 +401,7 @@ def _labelled(
         periods_since,
         config.sub_trajectory,
         config.lost_track,
+        frames.hops,
         motions_from_archive(archive, name, frames, config.lost_track),
     )
     labelled = LabelledSequence(

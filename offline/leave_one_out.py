@@ -333,5 +333,5 @@ def _simulate(
     """A bank's errors on what is left out, and the weight that the first member did not have."""
     of_bank = bank_data(others, data, chosen.members)
     near = bank_evidence(sequence, of_bank, pca, chosen.bank)
-    weights = weights_along(near, chosen.bank)
+    weights = weights_along(sequence, near, chosen.bank)
     return bank_errors(sequence, near, chosen.bank), float(1.0 - weights.weights[:, 0].mean())

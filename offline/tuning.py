@@ -39,10 +39,16 @@ PAIRED_SETTINGS = [
 BANK_FRAMES = 1000
 """Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
-    BankSettings(sharpness=sharpness, min_fixed_share=share, clip=clip, n_frames=BANK_FRAMES)
+    BankSettings(
+        sharpness=sharpness,
+        min_fixed_share=share,
+        prior_windows=windows,
+        clip=clip,
+        n_frames=BANK_FRAMES,
+    )
     for clip in (6.0, 18.0)
     for sharpness in (12.0, 48.0)
-    for share in (0.0, 0.25, 0.5)
+    for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0))
 ]
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
@@ -292,10 +298,13 @@ def bank_evidence(
     return rule.near(pca.transform(sequence.simulation.descriptors[first]))
 
 
-def weights_along(near: NearProducts, settings: BankSettings) -> MemberWeights:
-    """Smoothed weights along a sequence."""
-    weights, _ = bank_weights(near, settings)
-    return MemberWeights(near.members, smooth_weights(weights, near.evidence.familiarity))
+def weights_along(
+    sequence: LabelledSequence, near: NearProducts, settings: BankSettings
+) -> MemberWeights:
+    """Smoothed weights along a sequence, by the training and by what is measured on the way."""
+    assert sequence.simulation is not None
+    weights, _ = bank_weights(near, settings, sequence.simulation.live(near.members))
+    return MemberWeights(near.members, smooth_weights(weights))
 
 
 def simulated(
@@ -312,7 +321,7 @@ def simulated(
     settings
         Of the bank's weights.
     """
-    return simulated_with(sequence, weights_along(near, settings))
+    return simulated_with(sequence, weights_along(sequence, near, settings))
 
 
 def simulated_with(sequence: LabelledSequence, weights: MemberWeights) -> NDArray[np.float64]:

@@ -114,23 +114,28 @@ def register(start: HopCloud, end: HopCloud, guesses: Iterable[Poses]) -> Hop | 
     """
     if start.prepared is None or end.prepared is None:
         return None
-    import small_gicp
-
     (target, tree), (source, _) = start.prepared, end.prepared
-    for T in guesses:
-        for reach in _REACHES:
-            result = small_gicp.align(
-                *(target, source, tree),
-                init_T_target_source=T,
-                max_correspondence_distance=reach,
-                max_iterations=_ITERATIONS,
-                num_threads=1,
-            )
-            T = result.T_target_source
+    for guess in guesses:
+        result = _align(target, source, tree, guess)
+        T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= MIN_INLIERS * source.size():
-            T = rectify(T)
             return Hop(T, T[:3, :3] @ _known_directions(result.H) @ T[:3, :3].T)
     return None
+
+
+def _align(target: Any, source: Any, tree: Any, T_target_guess: Poses) -> Any:
+    import small_gicp
+
+    for reach in _REACHES:
+        result = small_gicp.align(
+            *(target, source, tree),
+            init_T_target_source=T_target_guess,
+            max_correspondence_distance=reach,
+            max_iterations=_ITERATIONS,
+            num_threads=1,
+        )
+        T_target_guess = result.T_target_source
+    return result
 
 
 def _known_directions(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Live evidence: what the errors of an odometry, or of a bank's members, were over the last metres."""
+"""What the errors of an odometry, or of a bank's members, were over the last metres."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -63,9 +63,9 @@ class LiveEvidence:
     """Measures errors by hops, see `adaptune.live.hop`.
 
     Show it every scan with `observe`; once a second, `measure` registers a scan, which takes some
-    tens of milliseconds. Points that have times are motion-compensated by the odometry's last motion.
-    Memory is bounded: it keeps the scans of the last metres, one a metre, and
-    the errors of the last hops.
+    tens of milliseconds. Points that have times are motion-compensated, by the odometry's last
+    motion. Memory is bounded: it keeps the scans of the last metres, one a metre, and the errors of
+    the last hops.
 
     Parameters
     ----------
@@ -101,10 +101,10 @@ class LiveEvidence:
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """See a scan, before it is registered; see `adaptune.selector.Selector.observe`."""
         if self._last is not None:
-            self._move(*self._last, stamp, motions)
+            self._move(*self._last, motions)
         self._last = stamp, scan
 
-    def _move(self, before: int, scan: Scan, stamp: int, motions: Motions) -> None:
+    def _move(self, before: int, scan: Scan, motions: Motions) -> None:
         """Take note of the motion that ended at the scan before."""
         T = np.stack(
             [motions.T_previous_current, *(motions.members[trial] for trial in self.members)]
