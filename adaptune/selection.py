@@ -37,3 +37,5 @@ class Selection(NamedTuple):
     predicted_fixed: float = math.nan
     familiarity: float = math.nan
     n_sequences: float = math.nan
+    lost: bool = False
+    restart: frozenset[int] = frozenset()

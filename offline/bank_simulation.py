@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.geometry import Poses, invert, mean_motion, steps
+from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.model.bank_weights import MemberWeights
-from adaptune.odometry.bank import agreement, share
+from adaptune.odometry.agreement import Agreement
 
 
 def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:
@@ -70,15 +70,19 @@ class BankSimulation:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory."""
         T_previous_current = self.motions(weights.members)
         T_ref_step = steps(self.T_ref_sensor)
-        bounds = self.lost_track * np.diff(self.stamps) * 1e-9
+        seconds = np.diff(self.stamps) * 1e-9
         of_steps = weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
-        agreeing = agreement(T_previous_current, of_steps, bounds[:, None, None])
-        none = np.asarray(~agreeing.any(axis=1))
-        believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
-        moved = mean_motion(believed, share(of_steps, agreeing | none[:, None]))
-        moved[none] = np.where(np.isnan(T_ref_step[none]), np.eye(4), T_ref_step[none])
+        agreement = Agreement(len(weights.members), self.lost_track)
+        moved = np.empty_like(T_ref_step)
+        for i, T in enumerate(T_previous_current):
+            if agreement.judge(T, seconds[i], of_steps[i]).any():
+                moved[i] = agreement.T_previous_current
+                agreement.restarted(agreement.due)
+            else:
+                moved[i] = np.eye(4) if np.isnan(T_ref_step[i]).any() else T_ref_step[i]
+                agreement.start()
         # Where the reference is unknown, nothing is lost.
-        lost = np.linalg.norm((moved - T_ref_step)[:, :3, 3], axis=1) > bounds
+        lost = np.linalg.norm((moved - T_ref_step)[:, :3, 3], axis=1) > self.lost_track * seconds
         T_odom_sensor = np.empty_like(self.T_ref_sensor)
         T_odom_sensor[0] = np.eye(4)
         for i, T in enumerate(moved):
