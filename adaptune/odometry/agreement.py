@@ -130,7 +130,7 @@ class Agreement:
         ndarray of shape (n_members,)
             All False if there is no motion at all.
         """
-        known = (np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2))
+        known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
         moved = np.where(known[:, None, None], T_previous_current, np.eye(4))
         self._advance(moved, seconds)
         near, apart = self._near(known, moved, seconds)

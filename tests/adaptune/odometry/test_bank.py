@@ -79,6 +79,33 @@ def test_a_member_restarts_once_a_second_at_most():
     assert odometry.restarts == len(made[1].starts) - 1 == 4
 
 
+@pytest.mark.parametrize("place", range(4))
+def test_two_lost_members_that_agree_do_not_outvote_the_one_that_fits_the_scans(place):
+    make, _ = makes()
+    speeds = np.roll([turns.STEP, 0.0, 0.0, 3 * turns.STEP], place)
+    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)}, every(1.0))
+    weigh(bank, *[0.25] * 4)
+    scans = list(map(turns.turn, range(13)))
+    bank.start(bank.prepare(scans[0]), np.eye(4))
+    x = [bank.register(bank.prepare(scan)).T_odom_sensor[0, 3] for scan in scans[1:]]
+    np.testing.assert_allclose(x, turns.STEP * np.arange(1, 13))
+    # The other three, at the first scan and a second later.
+    assert bank.restarts == 6
+
+
+def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
+    make, _ = makes()
+    sets = {trial: {"speed": speed} for trial, speed in enumerate((0.0, 0.001, turns.STEP))}
+    x = {}
+    for lost in (False, True):
+        bank = Bank(make, sets, every(1.0))
+        bank.apply(Selection(0, {}, dict.fromkeys(range(3), 1 / 3), lost=lost))
+        bank.start(bank.prepare(turns.turn(0)), np.eye(4))
+        x[lost] = bank.register(bank.prepare(turns.turn(1))).T_odom_sensor[0, 3]
+    assert x[True] == pytest.approx(turns.STEP)
+    assert x[False] == pytest.approx(0.0005)
+
+
 def test_members_restart_where_the_selection_says_so():
     make, made = makes()
     odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
