@@ -156,6 +156,15 @@ def test_they_are_asked_only_where_nobody_has_the_most_or_the_bank_is_lost():
     asked = Asked(0.1, 0.1, 0.102, 0.3)
     heavy = np.array([0.1, 0.1, 0.1, 0.7])
     assert judged(lone, weights=heavy, alignment=asked)[-1].tolist() == [True, True, True, False]
+    # Nor are most members that weigh less than half.
+    asked, weights = Asked(0.1, 0.1, 0.3, 0.3, 0.3), np.array([0.3, 0.0, 0.4, 0.3, 0.0])
+    of_five = [motions(0.1, 0.1, 0.1, 0.5, 0.9)] * 3
+    assert judged(of_five, weights=weights, alignment=asked)[-1].sum() == 3
+    assert not asked.calls
+    light = np.array([0.1, 0.1, 0.2, 0.3, 0.3])
+    assert judged(of_five, weights=light, alignment=asked)[-1].tolist() == [True, True] + 3 * [
+        False
+    ]
     # Nobody is asked what all agree on.
     asked = Asked(0.1, 0.2, 0.3, 0.4)
     assert judged([motions(*[0.1] * 4)] * 3, alignment=asked, lost=True).all()
@@ -184,6 +193,19 @@ def test_who_has_no_motion_is_left_out_and_begins_anew(nothing):
     assert not agreement.judge(motions(*[nothing] * 4), 0.1, EVEN).any()
     assert np.isnan(agreement.T_previous_current).all()
     assert agreement.judge(sound, 0.1, EVEN).all()
+
+
+def test_who_has_restarted_and_is_sound_agrees_at_once():
+    stands, sound = motions(0.1, 0.1, 0.1, 0.0), motions(*[0.1] * 4)
+    agrees = {}
+    for told in (False, True):
+        agreement = Agreement(4, 3.0)
+        for _ in range(12):
+            agreement.judge(stands, 0.1, EVEN)
+        if told:
+            agreement.restarted(np.array([False, False, False, True]))
+        agrees[told] = agreement.judge(sound, 0.1, EVEN)[3]
+    assert agrees == {False: False, True: True}
 
 
 def test_who_restarts_begins_where_the_bank_is_and_has_a_second():
@@ -226,3 +248,10 @@ def test_equal_shares_where_those_that_agree_have_no_weight():
     agreeing = np.array([False, True, True])
     assert share(np.array([0.5, 0.3, 0.2]), agreeing).tolist() == [0.0, 0.3, 0.2]
     assert share(np.array([1.0, 0.0, 0.0]), agreeing).tolist() == [0.0, 1.0, 1.0]
+
+
+def test_a_lost_track_bounds_what_fast_members_may_differ_by():
+    each = [motions(*[1.0] * 4)] * 12 + [motions(1.0, 1.0, 1.0, 1.8)] + [motions(*[1.0] * 4)] * 5
+    # Over a second it departs by up to 1.2 m, of 10 m.
+    assert not judged(each, lost_track=1.0)[-1, 3]
+    assert judged(each, lost_track=1.4)[-1, 3]
