@@ -92,9 +92,9 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     prepared: Any = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
     hops = measured_hops(scans, frames)
     trials = run_trials(settings, factory, prepared, sets)
-    length, lost_track = settings.sub_trajectory, settings.lost_track
+    length = settings.sub_trajectory
     vectors = [error_vectors(frames, trial, length) for trial in trials]
-    motions = recorded_motions(frames, trials, lost_track)[..., :3, :]
+    motions = recorded_motions(frames, trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,

@@ -14,7 +14,10 @@ from adaptune.live.live_evidence import SPACING
 from adaptune.live.squares import HopErrors, LiveSquares, live_squares
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors, travelled
 from adaptune.model.bank_weights import MemberWeights
-from adaptune.odometry.bank import agreement, share
+from adaptune.odometry.agreement import Agreement, share
+
+NOTICED = 1.0
+"""Seconds until a bank notices that a member has lost track."""
 
 
 def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:
@@ -69,6 +72,7 @@ class BankSimulation:
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
+    _agreeing: dict[tuple[int, ...], NDArray[np.bool_]] = field(default_factory=dict)
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict)
 
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
@@ -99,22 +103,32 @@ class BankSimulation:
             found.append(live_squares(before.recent(float(metres[frame]), float(seconds[frame]))))
         return found
 
+    def agreeing(self, members: tuple[int, ...]) -> NDArray[np.bool_]:
+        """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
+
+        All members have the same vote, so that it is the same whatever their weights are.
+        """
+        if members not in self._agreeing:
+            T_previous_current = self.motions(members)
+            agreement, votes = Agreement(len(members), self.lost_track), np.ones(len(members))
+            agreeing = np.zeros(T_previous_current.shape[:2], bool)
+            for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
+                agreeing[i] = agreement.judge(T_previous_current[i], seconds, votes)
+                if agreeing[i].any():
+                    agreement.restarted(agreement.due)
+                else:
+                    agreement.start()
+            self._agreeing[members] = agreeing
+        return self._agreeing[members]
+
     def errors(self, weights: MemberWeights) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory."""
-        T_previous_current = self.motions(weights.members)
-        T_ref_step = steps(self.T_ref_sensor)
-        bounds = self.lost_track * np.diff(self.stamps) * 1e-9
+        T_previous_current, agreeing = self.motions(weights.members), self.agreeing(weights.members)
         of_steps = weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
-        agreeing = agreement(T_previous_current, of_steps, bounds[:, None, None])
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
         moved = mean_motion(believed, share(of_steps, agreeing | none[:, None]))
-        moved[none] = np.where(np.isnan(T_ref_step[none]), np.eye(4), T_ref_step[none])
-        # Where the reference is unknown, nothing is lost.
-        lost = np.linalg.norm((moved - T_ref_step)[:, :3, 3], axis=1) > bounds
-        T_odom_sensor = chained(moved)
-        lost = np.concatenate([[False], lost])
-        return cap(sub_trajectory_rte(self.T_ref_sensor, T_odom_sensor, self.length, lost))
+        return cap(sub_trajectory_rte(self.T_ref_sensor, chained(moved), self.length))
 
 
 def chained(T_previous_current: Poses) -> Poses:
@@ -126,11 +140,12 @@ def chained(T_previous_current: Poses) -> Poses:
     return T
 
 
-def recorded_motions(frames: Frames, trials: Sequence[Trial], lost_track: float) -> Poses:
+def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     """Motions over every scan but the first, as the trials recorded them.
 
-    Where a trial lost track, its motion was not recorded: the result is far from the true motion,
-    and from that of all others that lost track there. Where a piece of a trial began
+    Where a trial lost track, its motion was not recorded, and it started again at the reference. In
+    a bank nobody knows at once: here it stands still for `NOTICED` seconds, as all others do that
+    lose track there, and then goes on. Where a piece of a trial began
     (``offline.runs: episodes``) the motion is unknown.
 
     Parameters
@@ -139,30 +154,31 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial], lost_track: float)
         Of the sequence.
     trials
         On it.
-    lost_track
-        Metres a second.
 
     Returns
     -------
     ndarray of shape (n_frames - 1, n_trials, 4, 4)
         NaN where it is unknown.
     """
-    T_ref_step = steps(frames.T_ref_sensor)
-    bounds = lost_track * np.diff(frames.stamps) * 1e-9
-    motions = np.empty((len(bounds), len(trials), 4, 4))
+    motions = np.empty((len(frames.stamps) - 1, len(trials), 4, 4))
     for k, trial in enumerate(trials):
         T = steps(trial.T_odom_sensor)
-        restarts = _restarts(frames, trial)[1:]
-        lost = trial.restarted[1:]
+        restarts, lost = _restarts(frames, trial)[1:], trial.restarted[1:]
         T[restarts & ~lost] = np.nan
-        T[lost] = T_ref_step[lost]
-        T[lost, 0, 3] += (4.0 + 2.0 * k) * bounds[lost]
+        T[_for_a_while(lost, frames.stamps)] = np.eye(4)
         motions[:, k] = T
     return motions
 
 
+def _for_a_while(lost: NDArray[np.bool_], stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Steps that begin less than `NOTICED` seconds after the begin of one that is lost."""
+    begins = stamps[:-1]
+    last = np.maximum.accumulate(np.where(lost, begins, np.iinfo(np.int64).min // 2))
+    return np.asarray(begins - last < NOTICED * 1e9)
+
+
 def motions_from_archive(
-    archive: Archive, name: str, frames: Frames, lost_track: float
+    archive: Archive, name: str, frames: Frames
 ) -> Callable[[tuple[int, ...]], Poses]:
     """Read the motions of trials on a sequence when they are asked for; see `BankSimulation`."""
 
@@ -173,6 +189,6 @@ def motions_from_archive(
     @lru_cache(maxsize=1)
     def motions(trials: tuple[int, ...]) -> Poses:
         # One bank after the other is asked for, each many times.
-        return recorded_motions(frames, [read(trial) for trial in trials], lost_track)
+        return recorded_motions(frames, [read(trial) for trial in trials])
 
     return motions

@@ -402,7 +402,7 @@ def _labelled(
         config.sub_trajectory,
         config.lost_track,
         frames.hops,
-        motions_from_archive(archive, name, frames, config.lost_track),
+        motions_from_archive(archive, name, frames),
     )
     labelled = LabelledSequence(
         name,

@@ -1,11 +1,13 @@
 """A bank: instances with different parameters, and the weighted mean of their motions."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, mean_motion, rectify
+from adaptune.geometry import Poses, rectify
+from adaptune.odometry.agreement import Agreement
 from adaptune.odometry.base import (
     LastMotion,
     Motions,
@@ -15,33 +17,36 @@ from adaptune.odometry.base import (
     Usage,
     WarmUp,
 )
+from adaptune.odometry.short_registrations import ShortRegistrations
 from adaptune.odometry.warm_up import Make, PreparedScan, RecentScans
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 
-TRUST = 0.3
-"""By how much the vote of a bank's first member exceeds its weight where members disagree."""
+
+class BankScan(NamedTuple):
+    """What a bank prepares: the prepared scan, and its points for the short registrations."""
+
+    scan: PreparedScan
+    points: NDArray[np.float32]
 
 
 class Bank(OdometryInstance):
     """Several instances, each with its own parameters and each on every scan.
 
-    The pose moves by the weighted mean of their motions. A member whose motion departs from those
-    of the others by more than a lost track is left out of the mean. Where two or more agree, the
-    others restart on the scans of the last seconds.
+    The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
+    others restart on the scans of the last seconds, at most once a second.
 
     Parameters
     ----------
     make
         Makes instances.
     sets
-        Parameter sets by trial number. The first is the fixed one: it begins with all the weight,
-        and its vote counts more than its weight where members disagree.
+        Parameter sets by trial number. The first is the fixed one: it begins with all the weight.
     warm_up
         Which scans a member sees when it restarts.
     lost_track
-        Metres a second by which motions may differ and agree.
+        Metres a second by which motions may never differ and agree.
 
     Attributes
     ----------
@@ -57,7 +62,10 @@ class Bank(OdometryInstance):
         self._members = [make(dict(parameters)) for parameters in sets.values()]
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
         self._weights = np.eye(len(sets))[0]
-        self._lost_track = lost_track
+        self._agreement = Agreement(len(sets), lost_track)
+        self._short = ShortRegistrations()
+        self._lost = False
+        self._asked = np.zeros(len(sets), np.bool_)
         self._recent = RecentScans(warm_up, self._members[0])
         self._last_motion = LastMotion()
 
@@ -75,8 +83,8 @@ class Bank(OdometryInstance):
         members = dict(zip(self.trials, self._T_previous_current, strict=True))
         return self._last_motion.motions._replace(members=members)
 
-    def prepare(self, scan: Scan) -> PreparedScan:
-        return PreparedScan.by(self._members[0], scan)
+    def prepare(self, scan: Scan) -> BankScan:
+        return BankScan(PreparedScan.by(self._members[0], scan), scan.points)
 
     def apply(self, selection: Selection) -> None:
         # Members without a weight get 0.
@@ -88,41 +96,47 @@ class Bank(OdometryInstance):
                 f"with these trials"
             )
         self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
+        self._lost = selection.lost
+        self._asked = np.isin(self.trials, list(selection.restart))
 
     def start(
-        self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+        self, prepared: BankScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
+        scan, points = prepared
         for member in self._members:
-            member.start(prepared.prepared, T_odom_sensor, T_previous_current)
+            member.start(scan.prepared, T_odom_sensor, T_previous_current)
         self._T_previous_current = self._member_motions()
-        self._recent.start(prepared, T_odom_sensor, T_previous_current)
+        self._agreement.start()
+        self._short.start(scan.stamp, points)
+        self._recent.start(scan, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
+        self._asked[:] = False
 
-    def submit(self, prepared: PreparedScan) -> None:
+    def submit(self, prepared: BankScan) -> None:
+        self._restart(self._asked)
+        self._asked[:] = False
         self._submitted = prepared
         for member in self._members:
-            member.submit(prepared.prepared)
+            member.submit(prepared.scan.prepared)
 
     def collect(self) -> Registration:
-        prepared = self._submitted
+        scan, points = self._submitted
         registrations = [member.collect() for member in self._members]
         self._T_previous_current = T_previous_current = self._member_motions()
-        seconds = (prepared.stamp - self._recent.last.scan.stamp) * 1e-9
-        agreeing = agreement(T_previous_current, self._weights, self._lost_track * seconds)
+        seconds = (scan.stamp - self._recent.last.scan.stamp) * 1e-9
+        self._short.add(scan.stamp, points)
+        agreeing = self._agreement.judge(
+            T_previous_current, seconds, self._weights, self._short, self._lost
+        )
         if not agreeing.any():
             T_odom_sensor = np.full((4, 4), np.nan)
             self._last_motion.move(T_odom_sensor)
             return Registration(T_odom_sensor, registered=False)
-        shares = share(self._weights, agreeing)[agreeing]
-        T_moved = mean_motion(T_previous_current[agreeing], shares)
+        T_moved = self._agreement.T_previous_current
         T_odom_sensor = rectify(self._recent.last.T_odom_sensor @ T_moved)
-        self._recent.add(prepared, T_odom_sensor)
+        self._recent.add(scan, T_odom_sensor)
         self._last_motion.move(T_odom_sensor)
-        for i in np.flatnonzero(~agreeing):
-            # A single member may be the only one that is not lost.
-            if agreeing.sum() > 1 or not np.isfinite(T_previous_current[i]).all():
-                self._recent.replay_to(self._members[i]).catch_up()
-                self.restarts += 1
+        self._restart(self._agreement.due)
         registered = np.array([registration.registered for registration in registrations])
         return Registration(T_odom_sensor, bool(registered[agreeing].any()))
 
@@ -133,40 +147,9 @@ class Bank(OdometryInstance):
     def _member_motions(self) -> Poses:
         return np.array([member.motions.T_previous_current for member in self._members])
 
-
-def agreement(
-    T_previous_current: Poses, weights: NDArray[np.float64], bound: float | NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Which members agree: those near the motion that has the most votes near it.
-
-    Parameters
-    ----------
-    T_previous_current
-        Motions over a scan, of shape (..., n_members, 4, 4); NaN where there is none.
-    weights
-        Of shape (..., n_members). The first member's vote counts `TRUST` more.
-    bound
-        Metres by which two motions may differ and agree, of shape (..., 1, 1).
-
-    Returns
-    -------
-    ndarray of shape (..., n_members)
-        All False if there is no motion at all.
-    """
-    moved = T_previous_current[..., :3, 3]
-    known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
-    with np.errstate(invalid="ignore"):
-        apart = np.linalg.norm(moved[..., :, None, :] - moved[..., None, :, :], axis=-1)
-    near = np.asarray((apart <= bound) & known[..., None, :] & known[..., :, None])
-    # Among members without weight, two that agree outvote one.
-    votes = weights + 1e-9
-    votes[..., 0] += TRUST
-    heard = (near * votes[..., None, :]).sum(axis=-1)
-    most = heard.argmax(axis=-1)[..., None, None]
-    return np.asarray(np.take_along_axis(near, most, -2)[..., 0, :])
-
-
-def share(weights: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Weights of the members that agree; equal if they have none. Of shape (..., n_members)."""
-    shares = np.where(agreeing, weights, 0.0)
-    return np.where(shares.any(axis=-1, keepdims=True), shares, agreeing.astype(np.float64))
+    def _restart(self, members: NDArray[np.bool_]) -> None:
+        """Restart members at the bank's pose."""
+        for i in np.flatnonzero(members):
+            self._recent.replay_to(self._members[i]).catch_up()
+        self.restarts += int(members.sum())
+        self._agreement.restarted(members)

@@ -11,6 +11,7 @@ from adaptune.geometry import (
     from_quaternions,
     interpolate,
     invert,
+    mean_motion,
     rectify,
     rotation_angle,
     scale,
@@ -219,3 +220,22 @@ def test_count_within(seed, low, high):
     distances = np.linalg.norm(points, axis=1)
     assert count_within(points, low, high) == ((distances > low) & (distances < high)).sum()
     np.testing.assert_allclose(squared_ranges(points), distances**2)
+
+
+def test_the_mean_of_motions_is_a_motion_between_them():
+    screws = np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0], [0.1, 0.2, 0.5, 3.0, 2.0, 1.0]])
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(screws[:, :3]).as_matrix()
+    T[:, :3, 3] = screws[:, 3:]
+    for weights, expected in (([3.0, 1.0], [1.5, 2.0, 2.5]), ([0.0, 2.0], screws[1, 3:])):
+        mean = mean_motion(T, np.array(weights))
+        np.testing.assert_allclose(mean[:3, 3], expected)
+        np.testing.assert_allclose(mean[:3, :3] @ mean[:3, :3].T, np.eye(3), atol=1e-12)
+        turn = Rotation.from_matrix(mean[:3, :3]).as_rotvec()
+        between = weights @ screws[:, :3] / np.sum(weights)
+        np.testing.assert_allclose(turn, between, atol=2e-4)
+    # Far apart: half of a right turn.
+    right = np.tile(np.eye(4), (2, 1, 1))
+    right[1, :3, :3] = Rotation.from_rotvec([0.0, 0.0, np.pi / 2]).as_matrix()
+    half = Rotation.from_matrix(mean_motion(right, np.ones(2))[:3, :3]).as_rotvec()
+    np.testing.assert_allclose(half, [0.0, 0.0, np.pi / 4], atol=1e-9)

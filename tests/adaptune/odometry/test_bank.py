@@ -41,38 +41,82 @@ def test_the_mean_of_all_motions_is_taken_by_their_weights():
     assert len(made) == 3
 
 
-def test_a_lost_one_is_left_out_and_started_anew():
-    make, made = makes({1.0: {5: 4.0}})
-    odometry = Bank(
-        make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1
-    )
-    weigh(odometry, 0.4, 0.3, 0.3)
+@pytest.mark.parametrize("lost", range(3))
+def test_a_lost_one_is_left_out_and_started_anew(lost):
+    speeds, weights = np.array([1.0, 1.02, 1.06]), np.array([0.4, 0.3, 0.3])
+    make, made = makes({speeds[lost]: {5: 4.0}})
+    sets = {trial: {"speed": speed} for trial, speed in zip((7, 3, 5), speeds, strict=True)}
+    odometry = Bank(make, sets, every(2.0), 0.1)
+    weigh(odometry, *weights)
     x = x_of(odometry, range(9))
-    mean = 0.4 + 0.3 * 1.02 + 0.3 * 1.06
-    np.testing.assert_allclose(np.diff(x), [mean] * 4 + [4.0] + [mean] * 3)
-    assert odometry.restarts == 0  # The first is trusted more than its weight says, ...
-    make, made = makes({1.02: {5: 4.0}})
-    odometry = Bank(
-        make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1
-    )
-    weigh(odometry, 0.4, 0.3, 0.3)
-    x = x_of(odometry, range(9))
-    rest = (0.4 + 0.3 * 1.06) / 0.7  # ... and two are more than one.
+    mean, weights[lost] = weights @ speeds, 0.0
+    rest = weights @ speeds / weights.sum()  # Two are more than one, whatever its place.
     np.testing.assert_allclose(np.diff(x), [mean] * 4 + [rest] + [mean] * 3)
     assert odometry.restarts == 1
     # Scans 3, 4 and 5 lie within two seconds.
-    assert [second for second, _ in made[1].starts] == [0, 3]
-    assert made[1].seen[-7:] == [5, 3, 4, 5, 6, 7, 8]
+    assert [second for second, _ in made[lost].starts] == [0, 3]
+    assert made[lost].seen[-7:] == [5, 3, 4, 5, 6, 7, 8]
 
 
-def test_where_two_disagree_the_heavier_is_believed_and_the_first_more():
+def test_where_two_disagree_the_heavier_is_believed():
     make, _ = makes()
     odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
     assert x_of(odometry, range(5), {3: 3}) == [0, 1, 2, 5, 8]
-    for heavy, step, seconds in ((0.6, 1.0, range(5, 8)), (0.7, 3.0, range(8, 11))):
+    for heavy, step, seconds in ((0.4, 1.0, range(5, 8)), (0.6, 3.0, range(8, 11))):
         weigh(odometry, 1.0 - heavy, heavy)
         np.testing.assert_allclose(np.diff(x_on(odometry, seconds)), step)
     assert odometry.restarts == 0
+
+
+def test_a_member_restarts_once_a_second_at_most():
+    make, made = makes({1.02: dict.fromkeys(range(60), 4.0)})
+    sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}
+    odometry = Bank(make, sets, every(2.0), 3.0)
+    odometry.start(odometry.prepare(at(0)), np.eye(4))
+    x = [odometry.register(odometry.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, 41)]
+    # It is lost all the time.
+    np.testing.assert_allclose(np.diff(x), 1.0)
+    assert odometry.restarts == len(made[1].starts) - 1 == 4
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_two_lost_members_that_agree_do_not_outvote_the_one_that_fits_the_scans(place):
+    make, _ = makes()
+    speeds = np.roll([turns.STEP, 0.0, 0.0, 3 * turns.STEP], place)
+    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)}, every(1.0))
+    weigh(bank, *[0.25] * 4)
+    scans = list(map(turns.turn, range(13)))
+    bank.start(bank.prepare(scans[0]), np.eye(4))
+    x = [bank.register(bank.prepare(scan)).T_odom_sensor[0, 3] for scan in scans[1:]]
+    np.testing.assert_allclose(x, turns.STEP * np.arange(1, 13))
+    # The other three, at the first scan and a second later.
+    assert bank.restarts == 6
+
+
+def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
+    make, _ = makes()
+    sets = {trial: {"speed": speed} for trial, speed in enumerate((0.0, 0.001, turns.STEP))}
+    x = {}
+    for lost in (False, True):
+        bank = Bank(make, sets, every(1.0))
+        bank.apply(Selection(0, {}, dict.fromkeys(range(3), 1 / 3), lost=lost))
+        bank.start(bank.prepare(turns.turn(0)), np.eye(4))
+        x[lost] = bank.register(bank.prepare(turns.turn(1))).T_odom_sensor[0, 3]
+    assert x[True] == pytest.approx(turns.STEP)
+    assert x[False] == pytest.approx(0.0005)
+
+
+def test_members_restart_where_the_selection_says_so():
+    make, made = makes()
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
+    x_of(odometry, range(5))
+    odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, restart=frozenset({3})))
+    x_on(odometry, range(5, 8))
+    assert odometry.restarts == 1
+    assert made[0].starts == [(0, 0.0)]
+    # Scan 2 of the last two seconds, at the bank's pose, before the next scan.
+    assert made[1].starts == [(0, 0.0), (2, 2.0)]
+    assert made[1].seen[-6:] == [2, 3, 4, 5, 6, 7]
 
 
 @pytest.mark.parametrize("chosen", [1.0, 3.0])
