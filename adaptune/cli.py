@@ -401,8 +401,8 @@ def compare(
     """Compare the replays: a table, CSV, JSON, and a picture for every sequence replayed.
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
-    1, adapting is better. *estimated* is the error that a bank measured itself. Intervals come from a block bootstrap over time: they hold for these
-    recordings, not for other places.
+    1, adapting is better. *estimated* is the error that a bank measured itself. Intervals come from
+    a block bootstrap over time: they hold for these recordings, not for other places.
     """
     loaded = _load(study, override, folder)
     from adaptune.study.driven import MIN_SEQUENCES

@@ -14,9 +14,9 @@ from adaptune.files import replacing
 # lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
 # grey, too.
 LINES: dict[str, dict[str, Any]] = {
-    "baseline": {"color": "#bbbbbb", "lw": 6.0},
-    "fixed": {"color": "#0072b2", "lw": 4.0},
-    "paired": {"color": "#e69f00", "lw": 2.2},
+    "baseline": {"color": "#bbbbbb", "lw": 6.6},
+    "fixed": {"color": "#0072b2", "lw": 4.8},
+    "paired": {"color": "#e69f00", "lw": 3.0},
     "untrained": {"color": "#7b3294", "lw": 1.2},
     "paper": {"color": "#000000", "lw": 0.9, "ls": (0, (4, 4))},
 }
