@@ -420,7 +420,7 @@ def compare(
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
     if rows[0].yardstick == "baseline":
         known = any(row.rte is not None for row in rows)
-        first = "" if known else "give the training sequences a reference; then "
+        first = "" if known else "see that the training sequences have a reference; then "
         say_next_of_study("look for better sets", "offline", study, override, folder, first)
         return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")

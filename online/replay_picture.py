@@ -184,7 +184,8 @@ def _draw_estimated(axes: Any, mode: str, track: Track, length: float) -> None:
     """What a bank has estimated of its own error, the true one, and when it was lost."""
     estimated, low, high = track.estimated.T
     if np.isfinite(track.errors_behind).any():
-        axes.plot(track.seconds, track.errors_behind, **LINES[mode], label="true")
+        wide = LINES[mode] | {"lw": 3.6}  # seen where the estimate lies on it
+        axes.plot(track.seconds, track.errors_behind, **wide, label="true")
     # A logarithmic axis has no zero.
     low = np.maximum(low, 0.1 * estimated)
     seconds = track.choice_seconds
