@@ -127,7 +127,6 @@ def replay(
     schedule, tracker = Schedule(period), Tracker(odometry, health)
     steps: list[RegisteredScan] = []
     choices: list[Choice] = []
-    lost = False
     for scan in scans:
         if selector is not None:
             selector.observe(scan.stamp, scan, odometry.motions)
@@ -135,17 +134,21 @@ def replay(
                 t = time.perf_counter()
                 selection = selector.select()
                 choices.append(Choice(scan.stamp, selection, time.perf_counter() - t))
-                if selection.lost != lost:
-                    lost = selection.lost
-                    seconds = (scan.stamp - choices[0].stamp) * 1e-9
-                    found = "is lost" if lost else "goes on"
-                    _log.warning("%s: the bank %s at %.1f s", what, found, seconds)
+                _tell_of_loss(choices, what)
                 odometry.apply(selection)
         steps.append(tracker.register(scan))
         progress()
     if not steps:
         raise AdaptuneError("there is no scan to replay; check start, stop and views")
     return _recorded(steps, choices, time.perf_counter() - begin)
+
+
+def _tell_of_loss(choices: list[Choice], what: str) -> None:
+    """Log that the bank is lost since the last selection, or not any more."""
+    lost = choices[-1].selection.lost
+    if lost != (len(choices) > 1 and choices[-2].selection.lost):
+        seconds = (choices[-1].stamp - choices[0].stamp) * 1e-9
+        _log.warning("%s: the bank %s at %.1f s", what, "is lost" if lost else "goes on", seconds)
 
 
 def _recorded(steps: list[RegisteredScan], choices: list[Choice], seconds: float) -> Replay:
