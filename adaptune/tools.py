@@ -63,7 +63,7 @@ def _begin_study(found: "Inspection") -> None:
     if found.reference is None or found.missing.get("offline"):
         say(
             "Next: mend what is lacking, see docs/your-bag.md; a recording without a reference can "
-            "only be a `test` sequence"
+            "only be a `test` sequence, or be replayed with `adaptune online --untrained`"
         )
         return
     (name,), share = named, f"{100 * TRAINING:.0f}"

@@ -1,5 +1,6 @@
 """Replay a recording in lockstep, selecting parameters on the way."""
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -16,6 +17,8 @@ from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 
 class Selects(Protocol):
@@ -89,6 +92,7 @@ def replay(
     selector: Selects | None = None,
     period: float = 1.0,
     progress: Callable[[], None] = lambda: None,
+    what: str = "the replay",
 ) -> Replay:
     """Replay a recording, as fast as it goes and always the same way.
 
@@ -109,6 +113,8 @@ def replay(
         Seconds between selections.
     progress
         Called after every scan.
+    what
+        What is replayed, for the log.
 
     Raises
     ------
@@ -128,12 +134,21 @@ def replay(
                 t = time.perf_counter()
                 selection = selector.select()
                 choices.append(Choice(scan.stamp, selection, time.perf_counter() - t))
+                _tell_of_loss(choices, what)
                 odometry.apply(selection)
         steps.append(tracker.register(scan))
         progress()
     if not steps:
         raise AdaptuneError("there is no scan to replay; check start, stop and views")
     return _recorded(steps, choices, time.perf_counter() - begin)
+
+
+def _tell_of_loss(choices: list[Choice], what: str) -> None:
+    """Log that the bank is lost since the last selection, or not any more."""
+    lost = choices[-1].selection.lost
+    if lost != (len(choices) > 1 and choices[-2].selection.lost):
+        seconds = (choices[-1].stamp - choices[0].stamp) * 1e-9
+        _log.warning("%s: the bank %s at %.1f s", what, "is lost" if lost else "goes on", seconds)
 
 
 def _recorded(steps: list[RegisteredScan], choices: list[Choice], seconds: float) -> Replay:

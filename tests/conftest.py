@@ -46,6 +46,7 @@ SLOW = [
     "offline/test_trial.py",
     "adaptune/test_selector.py",
     "adaptune/model/test_knn.py",
+    "online/test_untrained.py",
     "online/test_switch_cost.py",
     "offline/test_storage.py",
     "adaptune/test_hosting.py",

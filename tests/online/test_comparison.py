@@ -48,12 +48,12 @@ def test_rows_and_files(replayed):
     rows = compare(replayed)
     assert [(row.sequence, row.mode) for row in rows] == [("three", mode) for mode in MODES]
     of = {row.mode: row for row in rows}
-    assert of["fixed"].vs_fixed == 1.0
+    assert of["fixed"].ratio == 1.0
     for row in rows:
         # Three blocks of a sub-trajectory's length say nothing of other drives.
         assert row.blocks < 10
         assert row.ratio_interval is None
-        assert row.vs_fixed == pytest.approx(row.rte / of["fixed"].rte)
+        assert row.ratio == pytest.approx(row.rte / of["fixed"].rte)
     folder = replayed.folder / "comparison"
     with (folder / "comparison.csv").open() as file:
         assert [row["mode"] for row in csv.DictReader(file)] == MODES
@@ -239,7 +239,7 @@ def test_rows_over_several_sequences(replayed, study_file, tmp_path):
     a, b, all_ = rows[3], rows[7], rows[11]
     assert all_.rte == pytest.approx((a.rte + b.rte) / 2)
     assert all_.standard.ape == pytest.approx((a.standard.ape + b.standard.ape) / 2)
-    assert all_.vs_fixed == pytest.approx((a.vs_fixed * b.vs_fixed) ** 0.5)
+    assert all_.ratio == pytest.approx((a.ratio * b.ratio) ** 0.5)
 
 
 @pytest.mark.parametrize(
@@ -357,7 +357,7 @@ def test_modes_that_adapt_are_told_where_they_differ():
     mean, verdict = remarks([*rows, *pooled])
     assert mean.startswith("Mean RTE of all sequences: baseline 1.500 %")
     assert verdict.startswith("The fixed set is better than the baseline here: on all sequences ")
-    assert remarks([replace(row, rte=None, vs_fixed=None) for row in rows]) == []
+    assert remarks([replace(row, rte=None, ratio=None) for row in rows]) == []
 
 
 def test_restarts_are_told_with_their_reason():

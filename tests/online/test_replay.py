@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Odometry, OdometryError, Registration
+from adaptune.live.untrained import UntrainedSelector, untrained_sets
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import Odometry, OdometryError, Registration, WarmUp
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.in_process import InProcess
@@ -195,6 +197,48 @@ def test_too_many_scans_that_do_not_register_restart(tmp_path):
     write_replay(tmp_path, result, ABOUT, MODEL)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["unhealthy"] == {"max_unregistered": 2}
+
+
+class Losing(Chooser):
+    """Says at which of its selections the bank is lost."""
+
+    def __init__(self, lost):
+        super().__init__([{"speed": 1.0}], lambda _: 0)
+        self.lost = lost
+
+    def select(self):
+        selection = super().select()
+        return selection._replace(lost=self.lost[len(self.asked) - 1])
+
+
+def test_the_log_says_when_a_bank_is_lost_and_when_it_goes_on(tmp_path, caplog):
+    selector = Losing([True, True, False, True])
+    result = replay(
+        scans(np.arange(36) / 10), InProcess(Scripted()), HEALTH, selector, what="a, paired"
+    )
+    assert caplog.messages == [
+        "a, paired: the bank is lost at 0.0 s",
+        "a, paired: the bank goes on at 2.0 s",
+        "a, paired: the bank is lost at 3.0 s",
+    ]
+    write_replay(tmp_path, result, ABOUT, None)
+    summary = json.loads((tmp_path / "replay.json").read_text())
+    assert summary["lost_seconds"] == 2.5  # the last selection holds until the end
+    assert summary["mean_estimated_error"] is None
+    assert summary["model_file"] is None
+
+
+def test_a_bank_without_a_model_takes_odometries_that_are_not_live():
+    class Stiff(Scripted):
+        live = False
+
+    sets = untrained_sets(Scripted.space)
+    odometry = Bank(lambda _: InProcess(Stiff()), {n: sets[n] for n in sets}, WarmUp())
+    result = replay(scans(np.arange(20) / 10), odometry, HEALTH, UntrainedSelector(sets))
+    np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], 0.1 * np.arange(20))
+    assert [choice.selection.weights for choice in result.choices] == [
+        dict.fromkeys(sets, 0.25)
+    ] * 2
 
 
 def test_no_scans():

@@ -14,10 +14,13 @@ def track(**changed):
         seconds=SECONDS,
         xy=REFERENCE,
         errors=np.where(SECONDS < 15.0, 0.7 + 0.1 * np.sin(SECONDS), np.nan),
+        errors_behind=np.where(SECONDS > 5.0, 0.7 + 0.1 * np.sin(SECONDS - 5.0), np.nan),
         restarted=np.zeros(len(SECONDS), bool),
         choice_seconds=np.array([0.0, 8.0]),
         choices={"max_distance": [0.7, 0.9], "kernel": ["none", "huber"]},
         weights={},
+        estimated=np.full((2, 3), np.nan),
+        lost=np.zeros(2, bool),
     )
     return made._replace(**changed)
 
@@ -68,6 +71,49 @@ def test_a_bank_has_its_weights_drawn_and_no_parameters(tmp_path):
     assert share_of(path, OTHERS[0]) > 1.0
     assert share_of(path, OTHERS[1]) > 1.0
     assert not {"alone", "70", "77"} & set(said)  # of the heaviest member only
+
+
+def measured(**changed):
+    """A bank that measures its errors every second, and is lost twice."""
+    seconds = np.arange(0.0, 20.0)
+    error = np.where(seconds > 2.0, 0.7 + 0.1 * np.sin(seconds - 5.0), np.nan)
+    lost = np.isin(seconds, [7.0, 8.0, 9.0, 19.0])
+    share = 0.4 + 0.3 * np.sin(seconds)
+    made = track(
+        choice_seconds=seconds,
+        choices={},
+        weights={0: share, 3: 1.0 - share},
+        estimated=np.column_stack([error, 0.6 * error, np.where(lost, 40.0, 1.7) * error]),
+        lost=lost,
+    )
+    return made._replace(**changed)
+
+
+def test_estimated_and_true_error_are_drawn_over_each_other(tmp_path):
+    bank = measured()
+    assert bank.lost_spans == [(7.0, 10.0), (19.0, SECONDS[-1])]
+    bare = track(choices={})
+    path, said = drawn(tmp_path, {"baseline": bare, "untrained": bank})
+    for label in (
+        "untrained: its error as estimated while driving",
+        "RTE over the",
+        "last 15 m [%]",
+        "estimated",
+        "95 % interval",
+        "true",
+        "lost",
+        "trial 3",
+    ):
+        assert said.count(label) == 1, label
+    assert share_of(path, OTHERS[4]) > 0.02
+    assert is_white(path)
+    # Without a reference there is an estimate alone, and it is not lost.
+    nothing = np.full(len(SECONDS), np.nan)
+    blind = measured(errors=nothing, errors_behind=nothing, lost=np.zeros(20, bool))
+    said = drawn(tmp_path, {"baseline": bare._replace(errors=nothing), "untrained": blind}, None)[1]
+    assert "estimated" in said
+    assert not {"true", "lost"} & set(said)
+    assert not any("estimated" in text for text in drawn(tmp_path, {"baseline": bare})[1])
 
 
 def test_names_and_numbers_share_an_axis(tmp_path):

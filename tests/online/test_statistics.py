@@ -36,6 +36,20 @@ def test_errors_of_a_recorded_pair_are_those_of_evo_and_kitti(recorded):
     assert files["_kitti_deg_per_m"] == found.kitti.rotation
 
 
+def test_errors_stand_at_the_ends_of_their_sub_trajectories_too():
+    # The odometry goes 10 % too far over the tenth to the twentieth metre.
+    T = straight(40)
+    T[10:20, 0, 3] += 0.1 * np.arange(1, 11)
+    T[20:, 0, 3] += 1.0
+    reference = Reference(trajectory(straight(40)), 4.5)
+    errors, behind = (f(trajectory(T)) for f in (reference.errors, reference.errors_behind))
+    assert np.isnan(errors[35:]).all()
+    assert np.isnan(behind[:5]).all()
+    np.testing.assert_array_equal(behind[5:], errors[:35])
+    assert np.nanmax(errors) > 5.0
+    assert np.isnan(Reference(None, 4.5).errors_behind(trajectory(T))).all()
+
+
 @pytest.mark.parametrize(("metres", "lengths"), [(99, None), (150, "100"), (250, "100-200")])
 def test_kittis_error_is_there_from_100_m_on(metres, lengths):
     truth = straight(metres + 2)

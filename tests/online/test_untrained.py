@@ -1,0 +1,193 @@
+"""Replays of a bank that needs no trials, no model and no reference."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from pictures import texts
+from typer.testing import CliRunner
+
+from adaptune.cli import app
+from adaptune.live.untrained import UntrainedSelector, untrained_sets
+from adaptune.study.driven import ModeError
+from offline.offline_study import load_study
+from online.comparison import compare, remarks, tables
+from online.modes import ReplaySetup, sequences_without_model
+from online.run_replays import run_replays, run_untrained
+from online.stored_replays import StoredReplay, StoredReplayError
+
+MODES = ["baseline", "untrained"]
+BLIND = "sequences.three.reference="
+WHOLE = (
+    "odometry={name: command, settings: {command: [sh, '{input}', '{output}', '{size}']}, "
+    "parameters: {size: {type: float, low: 0.1, high: 3, baseline: 1}}}"
+)
+
+
+class Measuring(UntrainedSelector):
+    """Weighs evenly, and says that it is lost at the second of its selections."""
+
+    def __init__(self, sets):
+        super().__init__(sets)
+        self.n = 0
+
+    def select(self):
+        self.n += 1
+        if self.n == 1:  # nothing is known yet
+            return super().select()
+        error = 2.0 * self.n
+        return (
+            super()
+            .select()
+            ._replace(
+                estimated_error=error,
+                estimated_low=error - 1.0,
+                estimated_high=error + 3.0,
+                lost=self.n == 2,
+            )
+        )
+
+
+@pytest.fixture
+def load(study_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("online.modes.UntrainedSelector", Measuring)
+    return lambda *overrides: load_study(study_file, overrides, tmp_path / "run")
+
+
+def test_nothing_but_a_recording_is_needed(load, caplog):
+    study = load(BLIND)
+    assert run_untrained(study) == 2
+    assert run_untrained(study) == 0
+    assert not study.model_path.exists()
+    folder = study.folder / "replays/three"
+    assert not (folder / "reference.tum").exists()
+    about = json.loads((folder / "untrained/replay.json").read_text())["about"]
+    sets = untrained_sets(study.odometry.space)
+    assert about["switching"]["members"] == list(sets.parameters)
+    assert about["model"] is None
+    for row in read(folder / "untrained/selections.csv"):
+        assert row["weights"] == "0:0.250 1:0.250 2:0.250 3:0.250"
+    rows = compare(study)
+    assert [(row.sequence, row.mode, row.rte) for row in rows] == [
+        ("three", m, None) for m in MODES
+    ]
+    # An estimate is told as one.
+    assert rows[0].estimated is None
+    assert (rows[1].estimated, rows[1].estimated_interval) == (6.0, (5.0, 9.0))
+    said = remarks(rows)
+    assert said == [
+        "three has no reference. `untrained` estimates its own mean RTE there: 6.000 % (95 % "
+        "interval 5.000-9.000 %).",
+        "On three the bank of `untrained` was lost for 1.0 s.",
+    ]
+    assert caplog.messages == [
+        "three, untrained: the bank is lost at 1.0 s",
+        "three, untrained: the bank goes on at 2.0 s",
+    ]
+
+
+def read(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_what_a_bank_measures_of_itself_is_kept_and_compared(load):
+    study = load()
+    run_untrained(study)
+    folder = study.folder / "replays/three/untrained"
+    rows = read(folder / "selections.csv")
+    assert [row["estimated_error_percent"] for row in rows] == ["nan", "4.0000", "6.0000", "8.0000"]
+    assert (rows[2]["estimated_low_percent"], rows[2]["estimated_high_percent"]) == (
+        "5.0000",
+        "9.0000",
+    )
+    assert [row["lost"] for row in rows] == ["0", "1", "0", "0"]
+    summary = json.loads((folder / "replay.json").read_text())
+    assert (summary["lost_seconds"], summary["mean_estimated_error"]) == (1.0, 6.0)
+    stored = StoredReplay.read(folder)
+    np.testing.assert_array_equal(stored.estimated[1:], [[4, 3, 7], [6, 5, 9], [8, 7, 11]])
+    assert stored.lost.tolist() == [False, True, False, False]
+    compared = compare(study)
+    assert [row.mode for row in compared] == MODES
+    assert compared[0].ratio == 1.0
+    assert compared[1].ratio == pytest.approx(compared[1].rte / compared[0].rte)
+    written = json.loads((study.folder / "comparison/comparison.json").read_text())
+    assert written[1]["vs baseline"] == compared[1].ratio
+    assert (written[1]["estimated [%]"], written[1]["estimated_high"]) == (6.0, 9.0)
+    heads = [str(column.header) for column in tables(compared, 3.0)[0].columns]
+    assert heads[4:7] == ["95 %", "estimated [%]", "lost [s]"]
+    said = remarks(compared)
+    assert said[0].startswith("Mean RTE of three: baseline ")
+    assert not any("fixed" in one or "no reference" in one for one in said)
+    drawn = texts(study.folder / "comparison/three.png")
+    assert {"untrained: its error as estimated while driving", "lost", "true"} <= set(drawn)
+    # Replays of before are read without them.
+    path = folder / "selections.csv"
+    kept = [k for k in rows[0] if not k.startswith("estimated") and k != "lost"]
+    path.write_text("\n".join([",".join(kept), *(",".join(r[k] for k in kept) for r in rows)]))
+    before = StoredReplay.read(folder)
+    assert before.estimated.shape == (4, 3)
+    assert np.isnan(before.estimated).all()
+    assert not before.lost.any()
+
+
+def test_it_is_compared_with_the_trained_modes_too(load, trained_folder):
+    study = load()
+    shutil.copytree(trained_folder, study.folder)
+    run_replays(study, study.model_path)
+    assert {row.mode for row in compare(study)} == {"baseline", "fixed", "paired", "paper"}
+    assert run_untrained(study) == 1  # the baseline is the same
+    rows = compare(study)
+    assert [row.mode for row in rows] == ["baseline", "fixed", "paired", "untrained", "paper"]
+    assert {row.yardstick for row in rows} == {"fixed"}
+    other = load("online.switching.size=3")
+    with pytest.raises(StoredReplayError, match=r"another switching; run `adaptune online --untr"):
+        compare(other)
+    assert run_untrained(other) == 1
+    # Only what is there for all sequences is compared.
+    shutil.rmtree(study.folder / "replays/three/untrained")
+    assert "untrained" not in {row.mode for row in compare(study)}
+
+
+def test_without_a_test_all_recordings_are_replayed_whole(load, study_file):
+    assert sequences_without_model(load()) == ("three",)
+    study = load("test=[]", "training=[one: 0-60%, two]")
+    assert sequences_without_model(study) == ("one", "two", "three")
+    assert run_untrained(load("test=[]", "training=[two]")) == 6
+    assert [row.sequence for row in compare(load("test=[]", "training=[two]"))][-2:] == ["all"] * 2
+    with pytest.raises(StoredReplayError, match="test: name at least one sequence to compare on"):
+        compare(load_study(study_file, ["test=[]"], study.folder / "other"))
+
+
+def test_a_bank_of_what_cannot_be_in_one_is_refused(study_file, tmp_path, load):
+    words = [str(study_file), "--untrained", "--folder", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, ["online", *words, "-o", WHOLE])
+    assert done.exit_code == 2
+    assert "a bank of command is not possible, because the program runs whole" in done.stderr
+    done = CliRunner().invoke(app, ["online", *words, "--model", "some.safetensors"])
+    assert done.exit_code == 2
+    assert "--untrained uses no model; leave out --model some.safetensors" in done.stderr
+    setup = ReplaySetup.of(load())
+    for mode in ("fixed", "paired"):
+        with pytest.raises(ModeError, match=f"{mode}: needs an error model"):
+            setup.start(mode)
+    assert setup.start("baseline").selector is None
+
+
+def test_the_command_line_names_what_follows(study_file, tmp_path):
+    words = [str(study_file), "--folder", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, ["online", *words, "--untrained"])
+    assert done.exit_code == 0, done.output
+    assert "2 of 2 replays made" in done.stdout
+    done = CliRunner().invoke(app, ["compare", *words])
+    assert done.exit_code == 0, done.output
+    assert "vs baseline" in done.stdout
+    assert "fixed.yaml" not in done.stdout
+    assert "adaptune offline" in done.stdout.splitlines()[-1]
+    blind = ["compare", *words, "-o", BLIND]
+    assert (
+        "run `adaptune online --untrained` with this study, which"
+        in CliRunner().invoke(app, blind).stderr
+    )
