@@ -190,14 +190,14 @@ def _logs(
         columns += list(_paired_errors(left_out, data, pca))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for make in choosers.values():
-        members = tuple(trial for trial in make(others, data.fixed) if trial in data.sets)
-        if members not in known:
-            of_bank = bank_data(others, data, members) if len(members) > 1 else None
-            known[members] = (
-                [fixed] * len(BANK_SETTINGS)
-                if of_bank is None
-                else list(_bank_errors(left_out, of_bank, pca))
-            )
+        found = [trial for trial in make(others, data.fixed) if trial in data.sets]
+        # Whatever the order of the others is, they are the same bank.
+        members = (*found[:1], *sorted(found[1:]))
+        if members not in known and len(members) < 2:
+            known[members] = [fixed] * len(BANK_SETTINGS)
+        elif members not in known:
+            of_bank = bank_data(others, data, members)
+            known[members] = list(_bank_errors(left_out, of_bank, pca))
         columns += known[members]
     if not columns:
         return np.empty((len(np.unique(left_out.stretch)), 0))
