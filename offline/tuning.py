@@ -116,10 +116,10 @@ def choose(
     if len(recordings) < 2 or not logs[0].shape[1]:
         unknown = BankSettings(adapt=RELIES_ON_LIVE and len(members) > 1)
         return Policy(DO_NOT_ADAPT, unknown, members, {})
-    return _best(np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0)
+    return least_loss(np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0)
 
 
-def _best(
+def least_loss(
     logs: NDArray[np.float64],
     recordings: Sequence[str],
     banks: Mapping[str, list[int]],
@@ -196,14 +196,14 @@ def _logs(
         columns += list(_paired_errors(left_out, data, pca))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for make in choosers.values():
-        members = tuple(trial for trial in make(others, data.fixed) if trial in data.sets)
-        if members not in known:
-            of_bank = bank_data(others, data, members) if len(members) > 1 else None
-            known[members] = (
-                [fixed] * len(BANK_SETTINGS)
-                if of_bank is None
-                else list(_bank_errors(left_out, of_bank, pca))
-            )
+        found = [trial for trial in make(others, data.fixed) if trial in data.sets]
+        # Whatever the order of the others is, they are the same bank.
+        members = (*found[:1], *sorted(found[1:]))
+        if members not in known and len(members) < 2:
+            known[members] = [fixed] * len(BANK_SETTINGS)
+        elif members not in known:
+            of_bank = bank_data(others, data, members)
+            known[members] = list(_bank_errors(left_out, of_bank, pca))
         columns += known[members]
     if not columns:
         return np.empty((len(np.unique(left_out.stretch)), 0))

@@ -96,7 +96,7 @@ def _words(value: Any) -> str:
 def _validation(model: ErrorModel) -> list[RenderableType]:
     """Numbers in a table, and the rest in words."""
     if not model.validation:
-        return [Text("Not validated yet: `adaptune validate` shows whether adapting pays.")]
+        return [Text("Not validated yet: `adaptune validate` shows what adapting gains.")]
     found = {
         rule: of_rule if isinstance(of_rule, Mapping) else {"found": of_rule}
         for rule, of_rule in model.validation.items()

@@ -20,6 +20,8 @@ from adaptune.selection import Selection
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import driven
 from adaptune.study.mistakes import ConfigurationError
+from offline import leave_one_out as leave_one_out_module
+from offline import tuning
 from offline import validate as validation_of_study
 from offline.curves import bank_curve, learning_curve
 from offline.fit import fit, tuned

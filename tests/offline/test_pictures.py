@@ -83,7 +83,7 @@ def test_curves_are_explained_where_they_are_drawn(tmp_path):
     found = found._replace(banks=rows("instances", (2, 3)), learning=rows("stretches", (3, 5)))
     draw_validation(path, "study", found)
     said = texts(path)
-    assert "number of sets, or members, or training sequences [-]" in said
+    assert "number of sets, or members, or training stretches [-]" in said
     assert {"bank of so many members", "paired, trained on so many"} <= set(said)
     assert not [text for text in said if "familiarity" in text]
 

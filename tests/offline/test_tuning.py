@@ -89,7 +89,7 @@ def test_the_least_loss_wins(monkeypatch):
     banks = {"first": [0, 1], "second": [0, 2]}
 
     def best():
-        return tuning._best(logs, names, banks, len(PAIRED_SETTINGS))
+        return tuning.least_loss(logs, names, banks, len(PAIRED_SETTINGS))
 
     assert (best().one_set, best().bank) == (DO_NOT_ADAPT, NO_BANK)
     logs[:, 5] = -0.2
