@@ -319,27 +319,41 @@ def online(
         typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
     ] = None,
     again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
+    untrained: Annotated[
+        bool,
+        typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
+    ] = False,
 ) -> None:
     """Replay the test sequences: baseline, fixed, and adaptive by every rule.
 
     Once a second, an adaptive replay describes the newest scan and selects a parameter set with the
     error model. Each replay writes its trajectory (TUM), every selection with its predicted error,
     and the time of each scan (CSV).
+
+    With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
+    if the study names no test.
     """
+    if untrained and model is not None:
+        raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
     loaded = _load(study, override, folder)
     from adaptune.cores import pin
-    from online.modes import ReplaySetup
-    from online.run_replays import run_replays
+    from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
+    from online.run_replays import run_replays, run_untrained
 
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
     unpin = pin(os.getpid())
     try:
         with progress() as show:
-            made = run_replays(loaded, model or loaded.model_path, again, show)
+            if untrained:
+                made = run_untrained(loaded, again, show)
+            else:
+                made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
     n = len(loaded.config.test) * len(ReplaySetup.of(loaded).modes)
+    if untrained:
+        n = len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
@@ -384,10 +398,10 @@ def compare(
     override: Override = [],  # noqa: B006
     folder: Folder = None,
 ) -> None:
-    """Compare the replays: a table, CSV, JSON, and a picture for every test sequence.
+    """Compare the replays: a table, CSV, JSON, and a picture for every sequence replayed.
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
-    1, adapting is better. Intervals come from a block bootstrap over time: they hold for these
+    1, adapting is better. *estimated* is the error that a bank measured itself. Intervals come from a block bootstrap over time: they hold for these
     recordings, not for other places.
     """
     loaded = _load(study, override, folder)
@@ -404,6 +418,11 @@ def compare(
     for said in remarks(rows):
         say(said)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    if rows[0].yardstick == "baseline":
+        known = any(row.rte is not None for row in rows)
+        first = "" if known else "give the training sequences a reference; then "
+        say_next_of_study("look for better sets", "offline", study, override, folder, first)
+        return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
     n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
     if n < MIN_SEQUENCES and more is not None:

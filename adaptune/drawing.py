@@ -10,12 +10,14 @@ import numpy as np
 
 from adaptune.files import replacing
 
-# Okabe and Ito's colours, which the colour-blind tell apart. Lines that coincide lie on each other
-# from wide to narrow and are dark and light in turn, so that each is seen, in grey, too.
+# Colours that the colour-blind tell apart, all but one of them Okabe and Ito's. Lines that coincide
+# lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
+# grey, too.
 LINES: dict[str, dict[str, Any]] = {
-    "baseline": {"color": "#bbbbbb", "lw": 5.4},
-    "fixed": {"color": "#0072b2", "lw": 3.4},
-    "paired": {"color": "#e69f00", "lw": 1.4},
+    "baseline": {"color": "#bbbbbb", "lw": 6.0},
+    "fixed": {"color": "#0072b2", "lw": 4.0},
+    "paired": {"color": "#e69f00", "lw": 2.2},
+    "untrained": {"color": "#7b3294", "lw": 1.2},
     "paper": {"color": "#000000", "lw": 0.9, "ls": (0, (4, 4))},
 }
 """Lines of the modes, the lowest first."""

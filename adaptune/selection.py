@@ -28,6 +28,15 @@ class Selection(NamedTuple):
     n_sequences : float
         Effective number of training sequences that the selection rests on: one over the sum of
         their squared weights; NaN where they have none.
+    estimated_error : float
+        Percent over the study's length: the odometry's own error now, measured without ground
+        truth; NaN where it is unknown.
+    estimated_low, estimated_high : float
+        Ends of its 95 % interval.
+    lost : bool
+        Whether the bank is lost here.
+    restart : frozenset of int
+        Trial numbers of members to restart at the bank's pose.
     """
 
     trial: int
@@ -37,3 +46,8 @@ class Selection(NamedTuple):
     predicted_fixed: float = math.nan
     familiarity: float = math.nan
     n_sequences: float = math.nan
+    estimated_error: float = math.nan
+    estimated_low: float = math.nan
+    estimated_high: float = math.nan
+    lost: bool = False
+    restart: frozenset[int] = frozenset()

@@ -9,24 +9,36 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from adaptune import report
+from adaptune.drawing import LINES
 from adaptune.geometry import invert
 from adaptune.model import ErrorModel
 from adaptune.study.inputs import check_model
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
-from online.modes import ReplaySetup
+from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.replay_picture import Track, draw_replays
 from online.run_replays import shared_identity
-from online.statistics import ALL, ComparisonRow, Reference, compare_modes, pooled
+from online.statistics import (
+    ALL,
+    ESTIMATED,
+    LOST,
+    ComparisonRow,
+    Reference,
+    compare_modes,
+    pooled,
+)
 from online.stored_reference import is_reference_of
 from online.stored_replays import ReplaySummary, StoredReplay, StoredReplayError
 
 NO_DIFFERENCE = 0.01
-"""Share of the fixed set's error by which others may differ without it being told."""
+"""Share of the yardstick's error by which others may differ without it being told."""
 
 
 def compare(study: Study) -> list[ComparisonRow]:
     """Compare the replays that were made, and write tables and pictures.
+
+    The untrained bank is compared with the other modes if it was replayed on all test sequences,
+    and with the baseline alone if only these two were replayed.
 
     Parameters
     ----------
@@ -45,16 +57,17 @@ def compare(study: Study) -> list[ComparisonRow]:
         If a replay is missing, damaged, or of another recording or configuration.
     """
     setup = ReplaySetup.of(study)
-    _check_replays(study, setup)
+    names, modes = _replayed(study, setup)
+    _check_replays(study, setup, names, modes)
     logarithmic = [
         name
         for name, parameter in setup.odometry.space.parameters.items()
         if getattr(parameter, "log", False)
     ]
     rows: list[ComparisonRow] = []
-    for name in study.config.test:
+    for name in names:
         folder = study.folder / "replays" / name
-        replays = {mode: StoredReplay.read(folder / mode) for mode in setup.modes}
+        replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
         reference = Reference.read(folder, study.config.sub_trajectory)
         rows += compare_modes(name, replays, reference)
         draw_replays(
@@ -71,6 +84,24 @@ def compare(study: Study) -> list[ComparisonRow]:
     return rows
 
 
+def _replayed(study: Study, setup: ReplaySetup) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The sequences and the modes to compare, in the order in which lines lie on each other."""
+
+    def any_of(names: Sequence[str], modes: Collection[str]) -> bool:
+        folders = (study.folder / "replays" / name / mode for name in names for mode in modes)
+        return any((folder / "replay.json").exists() for folder in folders)
+
+    names, without_model = study.config.test, sequences_without_model(study)
+    of_model = [mode for mode in setup.modes if mode not in WITHOUT_MODEL]
+    if not any_of(names, of_model) and any_of(without_model, [UNTRAINED]):
+        return without_model, WITHOUT_MODEL
+    if not names:
+        raise StoredReplayError("test: name at least one sequence to compare on")
+    if all(any_of([name], [UNTRAINED]) for name in names):
+        return names, tuple(sorted({*setup.modes, UNTRAINED}, key=list(LINES).index))
+    return names, setup.modes
+
+
 def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
     """The rows for the terminal: errors over `length` metres, and, if known, those of evo."""
     several = rows[-1].sequence == ALL
@@ -79,8 +110,16 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
     )
     if several:
         caption += " `all`: mean RTE, and geometric mean of the ratios."
-    title = f"RTE over {length:g} m on test sequences"
-    made = [report.table(title, [row.columns() for row in rows], caption)]
+    unknown = set()
+    if all(row.estimated is None for row in rows):
+        unknown.add(ESTIMATED)
+    else:
+        caption += " Estimated: by the odometry itself while driving, without the reference."
+    if not any(row.lost_seconds for row in rows):
+        unknown.add(LOST)
+    columns = [{k: v for k, v in row.columns().items() if k not in unknown} for row in rows]
+    where = " on test sequences" if rows[0].yardstick == "fixed" else ""
+    made = [report.table(f"RTE over {length:g} m{where}", columns, caption)]
     standard = [row.standard for row in rows if row.standard]
     if not standard:
         return made
@@ -106,31 +145,60 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     if all(row.rte is not None for row in last.values()):
         found = ", ".join(f"{mode} {row.rte:.3f} %" for mode, row in last.items())
         said.append(f"Mean RTE of {_where(rows[-1])}: {found}.")
-    if "baseline" in last and (verdict := _of_baseline(last["baseline"])):
+    if "fixed" in last and "baseline" in last and (verdict := _of_baseline(last["baseline"])):
         said.append(verdict)
     adaptive = [row for mode, row in last.items() if mode not in ("baseline", "fixed")]
     if differing := [row for row in adaptive if _counts(row)]:
         each = (
-            f"`{row.mode}` is {'better' if row.vs_fixed < 1.0 else 'worse'}, with {_times(row)}"
+            f"`{row.mode}` is {'better' if row.ratio < 1.0 else 'worse'}, with {_times(row)}"
             for row in differing
-            if row.vs_fixed is not None
+            if row.ratio is not None
         )
-        said.append(f"Compared with the fixed set, {', and '.join(each)} its error.")
-    return said + _restarts(rows)
+        other = _YARDSTICKS[rows[-1].yardstick]
+        said.append(f"Compared with the {other}, {', and '.join(each)} its error.")
+    return said + _estimates(rows) + _losses(rows) + _restarts(rows)
+
+
+_YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
+"""What a mode that others are compared with is called in a sentence."""
+
+
+def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
+    """For each sequence without reference a sentence about what is estimated there."""
+    said = []
+    for row in rows:
+        if row.rte is not None or row.estimated is None:
+            continue
+        ends = row.estimated_interval
+        interval = "" if ends is None else f" (95 % interval {ends[0]:.3f}-{ends[1]:.3f} %)"
+        said.append(
+            f"{row.sequence} has no reference. `{row.mode}` estimates its own mean RTE there: "
+            f"{row.estimated:.3f} %{interval}."
+        )
+    return said
+
+
+def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence about every replay in which the bank was lost."""
+    return [
+        f"On {row.sequence} the bank of `{row.mode}` was lost for {row.lost_seconds:.1f} s."
+        for row in rows
+        if row.lost_seconds and row.sequence != ALL
+    ]
 
 
 def _counts(row: ComparisonRow) -> bool:
-    """Whether a mode differs from the fixed set by what counts, as far as it is known."""
-    if row.vs_fixed is None or abs(row.vs_fixed - 1.0) < NO_DIFFERENCE:
+    """Whether a mode differs from the yardstick by what counts, as far as it is known."""
+    if row.ratio is None or abs(row.ratio - 1.0) < NO_DIFFERENCE:
         return False
-    low, high = row.ratio_interval or (row.vs_fixed, row.vs_fixed)
+    low, high = row.ratio_interval or (row.ratio, row.ratio)
     return not low <= 1.0 <= high
 
 
 def _times(row: ComparisonRow) -> str:
     ends = row.ratio_interval
     interval = "" if ends is None else f" (95 % interval {ends[0]:.2f}-{ends[1]:.2f})"
-    return f"{row.vs_fixed:.2f} times{interval}"
+    return f"{row.ratio:.2f} times{interval}"
 
 
 def _where(row: ComparisonRow) -> str:
@@ -138,7 +206,7 @@ def _where(row: ComparisonRow) -> str:
 
 
 def _of_baseline(row: ComparisonRow) -> str | None:
-    if row.vs_fixed is None:
+    if row.ratio is None:
         return None
     has = f"on {_where(row)} the baseline has {_times(row)}"
     if not _counts(row):
@@ -146,7 +214,7 @@ def _of_baseline(row: ComparisonRow) -> str | None:
             f"There is no difference that counts between the baseline and the fixed set here: "
             f"{has} the fixed set's error."
         )
-    better, other = ("baseline", "fixed set") if row.vs_fixed < 1.0 else ("fixed set", "baseline")
+    better, other = ("baseline", "fixed set") if row.ratio < 1.0 else ("fixed set", "baseline")
     return f"The {better} is better than the {other} here: {has} the fixed set's error."
 
 
@@ -177,10 +245,13 @@ def _track(replay: StoredReplay, reference: Reference) -> Track:
         (stamps - stamps[0]) * 1e-9,
         _seen_from(replay.trajectory, start),
         reference.errors(replay.trajectory),
+        reference.errors_behind(replay.trajectory),
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
         replay.choices,
         replay.weights,
+        replay.estimated,
+        replay.lost,
     )
 
 
@@ -190,43 +261,47 @@ def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
     return np.asarray((invert(T[start]) @ T)[:, :2, 3])
 
 
-def _check_replays(study: Study, setup: ReplaySetup) -> None:
+def _check_replays(
+    study: Study, setup: ReplaySetup, names: Sequence[str], modes: Sequence[str]
+) -> None:
     """Refuse replays that are missing, or of another recording, model or configuration."""
     made = {
         (name, mode): ReplaySummary.read(study.folder / "replays" / name / mode)
-        for name in study.config.test
-        for mode in setup.modes
+        for name in names
+        for mode in modes
     }
     path, model = _model_of(study, made.values())
     digest = "" if model is None else model.digest
     # Both read what they are about.
-    shared = {name: shared_identity(study, name) for name in study.config.test}
+    shared = {name: shared_identity(study, name) for name in names}
     for (name, mode), summary in made.items():
         now, about = dict(shared[name]), summary.about.model_dump()
-        if model is not None:
+        if model is not None or mode in WITHOUT_MODEL:
             whole = setup.identity(mode, model, digest)
             now |= {key: whole[key] for key in ("model", "parameters")}
             if not _is_automatic(study, whole["switching"], about["switching"]):
                 now["switching"] = whole["switching"]
         if differing := [key for key, value in now.items() if about[key] != value]:
-            own = path == study.model_path.resolve()
+            option = "" if path == study.model_path.resolve() else f" --model {path}"
+            if mode == UNTRAINED:
+                option = " --untrained"
             raise StoredReplayError(
                 f"{study.folder / 'replays' / name / mode}: was replayed with another "
-                f"{', '.join(differing)}; run `adaptune online{'' if own else f' --model {path}'}` "
-                f"with this study"
+                f"{', '.join(differing)}; run `adaptune online{option}` with this study"
             )
-    for name in study.config.test:
+    option = " --untrained" if UNTRAINED in modes and "fixed" not in modes else ""
+    for name in names:
         if not is_reference_of(study.folder / "replays" / name, study.sequences.reference(name)):
             raise StoredReplayError(
                 f"{study.folder / 'replays' / name}: was judged by another reference; run "
-                f"`adaptune online` with this study, which replays nothing for it"
+                f"`adaptune online{option}` with this study, which replays nothing for it"
             )
 
 
 def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:
     """File of the model that all replays are of, and the model if the file is still there."""
     own = study.model_path.resolve()
-    files = {s.about.model: s.model_file for s in summaries if s.about.model is not None}
+    files = {s.about.model: s.model_file for s in summaries if s.about.model and s.model_file}
     if len(files) > 1:
         raise StoredReplayError(
             f"{study.folder / 'replays'}: holds replays with different models "

@@ -1,26 +1,33 @@
-"""The modes of a replay: baseline, fixed, and adaptive by each selection rule."""
+"""The modes of a replay: baseline, fixed, adaptive by each selection rule, and untrained."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import OdometryInstance, WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.hand_over import HandOver
+from adaptune.parameter_sets import ParameterSets
 from adaptune.selector import Selector
+from adaptune.sequence.part import part_name
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import bank_members, mechanism_of
+from adaptune.study.driven import ModeError, bank_members, mechanism_of
 from adaptune.study.study import Mechanism, Study
+
+BASELINE, UNTRAINED = "baseline", "untrained"
+WITHOUT_MODEL = (BASELINE, UNTRAINED)
+"""The modes that need neither trials nor a model."""
 
 
 class Mode(NamedTuple):
     """What runs along a recording, and what chooses its parameters, if anything does."""
 
     odometry: OdometryInstance
-    selector: Selector | None
+    selector: Selector | UntrainedSelector | None
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,8 @@ class ReplaySetup:
 
     @property
     def modes(self) -> tuple[str, ...]:
-        """What is compared: baseline, fixed, and each selection rule."""
-        return ("baseline", "fixed", *self.rules)
+        """What is compared with a model: baseline, fixed, and each selection rule."""
+        return (BASELINE, "fixed", *self.rules)
 
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
@@ -62,45 +69,87 @@ class ReplaySetup:
         if self.mechanism == "bank":
             bank_members(self.switching, model)
 
-    def identity(self, mode: str, model: ErrorModel, digest: str) -> dict[str, Any]:
+    def untrained_sets(self) -> ParameterSets:
+        """The members of the bank that needs no model.
+
+        Raises
+        ------
+        ModeError
+            If the odometry cannot be in a bank, or has no parameters by which members differ.
+        """
+        what = f"{UNTRAINED}: a bank of {self.odometry.name} is not possible, because"
+        if self.odometry.description.whole:
+            raise ModeError(
+                f"{what} the program runs whole recordings; try parameter sets on recordings with "
+                f"a reference instead (`adaptune offline`)"
+            )
+        sets = untrained_sets(self.odometry.space, self.switching.size)
+        if len(sets) < 2:
+            raise ModeError(
+                f"{what} it has no parameters by which its members would differ; name some "
+                f"(odometry.parameters)"
+            )
+        return sets
+
+    def identity(
+        self, mode: str, model: ErrorModel | None = None, digest: str = ""
+    ) -> dict[str, Any]:
         """What a mode depends on, as plain data; `digest` is the model's."""
+        about = {"mode": mode, "parameters": None, "model": None, "switching": None}
+        if mode == UNTRAINED:
+            members = list(self.untrained_sets().parameters)
+            warm_up = self.warm_up._asdict()
+            return about | {
+                "switching": {"mechanism": "bank", "members": members, "warm_up": warm_up}
+            }
         if mode not in self.rules:
-            parameters = self.parameters(mode, model)
-            return {"mode": mode, "parameters": parameters, "model": None, "switching": None}
+            return about | {"parameters": self.parameters(mode, model)}
         used = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
-        mechanism = self._mechanism(mode, model)
+        mechanism = self._mechanism(mode, needed(mode, model))
         settings = self.switching.model_dump(mode="json", include=used[mechanism])
         if mechanism != "live":
             settings["warm_up"] = self.warm_up._asdict()
         if mechanism != "bank":
             settings["switch_cost"] = self.switch_cost
         settings["mechanism"] = mechanism
-        return {"mode": mode, "parameters": None, "model": digest, "switching": settings}
+        return about | {"model": digest, "switching": settings}
 
-    def parameters(self, mode: str, model: ErrorModel) -> ParameterSet | None:
+    def parameters(self, mode: str, model: ErrorModel | None = None) -> ParameterSet | None:
         """The parameters of baseline and fixed, which stay; None for adaptive modes."""
-        constant = {"baseline": self.odometry.space.baseline, "fixed": model.sets[model.fixed]}
-        return constant.get(mode)
+        if mode == BASELINE:
+            return self.odometry.space.baseline
+        if mode != "fixed":
+            return None
+        model = needed(mode, model)
+        return model.sets[model.fixed]
 
-    def start(self, mode: str, model: ErrorModel, sequence: str | None = None) -> Mode:
+    def start(
+        self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
+    ) -> Mode:
         """Make a new odometry, or a bank, and its selector.
 
         Parameters
         ----------
         mode
-            One of `modes`.
+            One of `modes`, or `untrained`.
         model
-            The error model.
+            The error model; baseline and untrained need none.
         sequence
             Name of the recording; a program that reads whole recordings needs it.
 
         Raises
         ------
         ModeError
-            If the model does not go with the study's bank.
+            If the model is lacking, or does not go with the study's bank.
         """
+        if mode == UNTRAINED:
+            members = self.untrained_sets()
+            by_number = dict(zip(members.trials, members.parameters, strict=True))
+            bank = Bank(self.odometry, by_number, self.warm_up, self.lost_track)
+            return Mode(bank, UntrainedSelector(members))
         if mode not in self.rules:
             return Mode(self.odometry(self.parameters(mode, model), sequence), None)
+        model = needed(mode, model)
         mechanism = self._mechanism(mode, model)
         if mechanism == "bank":
             sets = bank_members(self.switching, model)
@@ -115,3 +164,35 @@ class ReplaySetup:
 
     def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:
         return mechanism_of(mode, model, self.mechanism, self.odometry.description.live)
+
+
+def needed(mode: str, model: ErrorModel | None) -> ErrorModel:
+    """The model of a mode that cannot do without.
+
+    Raises
+    ------
+    ModeError
+        If there is none.
+    """
+    if model is None:
+        raise ModeError(f"{mode}: needs an error model; run `adaptune offline`, which fits one")
+    return model
+
+
+def sequences_without_model(study: Study) -> tuple[str, ...]:
+    """The sequences to replay without a model: those of the test, or if it names none, all.
+
+    A recording of which `training` names parts is replayed as a whole.
+    """
+    config = study.config
+    if config.test:
+        return config.test
+    recorded = {name: entry.part for name, entry in config.sequences.items()}
+    parts = recorded | {name: course.part for name, course in config.courses.items()}
+
+    def of_another(name: str) -> bool:
+        part = parts[name]
+        whole = name if part is None else name.removesuffix(part_name("", part))
+        return whole != name and whole in parts
+
+    return tuple(name for name in parts if not of_another(name))

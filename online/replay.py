@@ -1,5 +1,6 @@
 """Replay a recording in lockstep, selecting parameters on the way."""
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -16,6 +17,8 @@ from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 
 class Selects(Protocol):
@@ -89,6 +92,7 @@ def replay(
     selector: Selects | None = None,
     period: float = 1.0,
     progress: Callable[[], None] = lambda: None,
+    what: str = "the replay",
 ) -> Replay:
     """Replay a recording, as fast as it goes and always the same way.
 
@@ -109,6 +113,8 @@ def replay(
         Seconds between selections.
     progress
         Called after every scan.
+    what
+        What is replayed, for the log.
 
     Raises
     ------
@@ -121,6 +127,7 @@ def replay(
     schedule, tracker = Schedule(period), Tracker(odometry, health)
     steps: list[RegisteredScan] = []
     choices: list[Choice] = []
+    lost = False
     for scan in scans:
         if selector is not None:
             selector.observe(scan.stamp, scan, odometry.motions)
@@ -128,6 +135,11 @@ def replay(
                 t = time.perf_counter()
                 selection = selector.select()
                 choices.append(Choice(scan.stamp, selection, time.perf_counter() - t))
+                if selection.lost != lost:
+                    lost = selection.lost
+                    seconds = (scan.stamp - choices[0].stamp) * 1e-9
+                    found = "is lost" if lost else "goes on"
+                    _log.warning("%s: the bank %s at %.1f s", what, found, seconds)
                 odometry.apply(selection)
         steps.append(tracker.register(scan))
         progress()

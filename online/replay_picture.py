@@ -16,6 +16,7 @@ _MARKS = 60
 """Most restarts that are marked."""
 _MARGIN = 0.5
 """By how much of its extent the picture may reach beyond the reference."""
+_ESTIMATE = OTHERS[4]
 
 
 class Track(NamedTuple):
@@ -24,15 +25,29 @@ class Track(NamedTuple):
     seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
     xy: NDArray[np.float64]  # metres, seen from the reference's first pose, of shape (n, 2)
     errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
+    errors_behind: NDArray[np.float64]  # the same at the ends of the sub-trajectories
     restarted: NDArray[np.bool_]  # of shape (n,)
     choice_seconds: NDArray[np.float64]  # of shape (m,)
     choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
     weights: Mapping[int, Sequence[float]]  # in a bank by trial instead, of shape (m,)
+    # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
+    # interval; NaN where there is none.
+    estimated: NDArray[np.float64]
+    lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
 
     @property
     def span(self) -> NDArray[np.float64]:
         """When each choice was made, and the end, until which the last one holds."""
         return np.append(self.choice_seconds, self.seconds[-1])
+
+    @property
+    def lost_spans(self) -> list[tuple[float, float]]:
+        """When the bank was lost, from a selection to the first one at which it was not."""
+        spans: list[tuple[float, float]] = []
+        for begin, end in np.column_stack([self.span[:-1], self.span[1:]])[self.lost].tolist():
+            goes_on = spans and spans[-1][1] == begin
+            spans.append((spans.pop()[0] if goes_on else begin, end))
+        return spans
 
     @property
     def restarts(self) -> list[int]:
@@ -77,6 +92,8 @@ def draw_replays(
         log = name in logarithmic
         panels.append((1.0, partial(_draw_parameter, tracks=tracks, name=name, log=log)))
     for mode, track in tracks.items():
+        if np.isfinite(track.estimated[:, 0]).any() or track.lost.any():
+            panels.append((1.6, partial(_draw_estimated, mode=mode, track=track, length=length)))
         if track.weights:
             panels.append((1.2, partial(_draw_weights, mode=mode, track=track)))
     heights = [height for height, _ in panels]
@@ -161,6 +178,29 @@ def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool
     if log:
         log_scale(axes)
     axes.set_ylabel(name.replace("_", "\n"), fontsize="small")
+
+
+def _draw_estimated(axes: Any, mode: str, track: Track, length: float) -> None:
+    """What a bank has estimated of its own error, the true one, and when it was lost."""
+    estimated, low, high = track.estimated.T
+    if np.isfinite(track.errors_behind).any():
+        axes.plot(track.seconds, track.errors_behind, **LINES[mode], label="true")
+    # A logarithmic axis has no zero.
+    low = np.maximum(low, 0.1 * estimated)
+    seconds = track.choice_seconds
+    axes.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0, label="95 % interval")
+    axes.plot(seconds, estimated, color=_ESTIMATE, lw=1.4, label="estimated")
+    if (np.isfinite(estimated) & (estimated > 0.0)).any():
+        log_scale(axes)
+    label = "lost"
+    for begin, end in track.lost_spans:
+        axes.axvspan(begin, end, color="#999999", alpha=0.35, lw=0, label=label)
+        label = "_"  # not twice in the legend
+    axes.set(
+        ylabel=f"RTE over the\nlast {length:g} m [%]",
+        title=f"{mode}: its error as estimated while driving",
+    )
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_weights(axes: Any, mode: str, track: Track) -> None:

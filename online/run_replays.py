@@ -5,7 +5,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from adaptune.descriptor.base import DescriptorError
 from adaptune.errors import AdaptuneError
@@ -15,7 +15,7 @@ from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.study.config import StudyConfig
 from adaptune.study.inputs import check_model, odometry_inputs
 from adaptune.study.study import Study
-from online.modes import Mode, ReplaySetup
+from online.modes import WITHOUT_MODEL, Mode, ReplaySetup, sequences_without_model
 from online.replay import Replay, replay
 from online.stored_reference import is_reference_of, write_reference
 from online.stored_replays import ReplayIdentity, StoredReplay, other_keys, write_replay
@@ -69,49 +69,85 @@ def run_replays(
     setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
+    of = _Modes(setup, setup.modes, model, model_path)
+    return _replay_all(study, study.config.test, of, again, progress)
+
+
+def run_untrained(study: Study, again: bool = False, progress: Progress = lambda *_: None) -> int:
+    """Replay sequences with the baseline, and with a bank that needs no model.
+
+    Neither trials nor references are needed. The sequences are those of
+    `online.modes.sequences_without_model`; for the rest see `run_replays`.
+
+    Raises
+    ------
+    AdaptuneError
+        If a bank of the odometry is not possible.
+    """
+    setup = ReplaySetup.of(study)
+    setup.untrained_sets()
+    return _replay_all(
+        study, sequences_without_model(study), _Modes(setup, WITHOUT_MODEL), again, progress
+    )
+
+
+class _Modes(NamedTuple):
+    """The modes to replay, and the model of those that need one."""
+
+    setup: ReplaySetup
+    names: tuple[str, ...]
+    model: ErrorModel | None = None
+    model_path: Path | None = None
+
+
+def _replay_all(
+    study: Study, sequences: Sequence[str], modes: _Modes, again: bool, progress: Progress
+) -> int:
+    """Replay what was not replayed before; the number of replays that were made."""
     study.open()
-    digest = model.digest
+    digest = "" if modes.model is None else modes.model.digest
     made = 0
-    for name in study.config.test:
+    for name in sequences:
         shared = shared_identity(study, name)
         about = {
-            mode: ReplayIdentity(**setup.identity(mode, model, digest), **shared)
-            for mode in setup.modes
+            mode: ReplayIdentity(**modes.setup.identity(mode, modes.model, digest), **shared)
+            for mode in modes.names
         }
         folder = study.folder / "replays" / name
-        others = {mode: other_keys(folder / mode, about[mode]) for mode in setup.modes}
+        others = {mode: other_keys(folder / mode, about[mode]) for mode in modes.names}
         _report_changes(name, others)
         due = {mode: about[mode] for mode, keys in others.items() if again or keys != []}
         if due:
-            _replay_modes(study, name, due, setup, (model, model_path), progress)
+            _replay_due(study, name, due, modes, progress)
         else:
-            _renew_reference(study, name, folder / setup.modes[0])
+            _renew_reference(study, name, folder / modes.names[0])
         made += len(due)
     return made
 
 
-def _replay_modes(
+def _replay_due(
     study: Study,
     name: str,
     due: Mapping[str, ReplayIdentity],
-    setup: ReplaySetup,
-    of_file: tuple[ErrorModel, Path],
+    modes: _Modes,
     progress: Progress,
 ) -> None:
-    """Replay a sequence in some modes, with a model and its file."""
-    folder, (model, model_path) = study.folder / "replays" / name, of_file
+    """Replay a sequence in some modes."""
+    folder = study.folder / "replays" / name
     poses, sequence = study.sequences.reference(name), study.sequences.open(name)
     for i, (mode, about) in enumerate(due.items()):
-        started = setup.start(mode, model, name)
-        result = _replay(
-            study.config, sequence, name, started, partial(progress, f"{name}, {mode}")
-        )
+        started = modes.setup.start(mode, modes.model, name)
+        what = f"{name}, {mode}"
+        try:
+            result = _replay(study.config, sequence, what, started, partial(progress, what))
+        except DescriptorError as error:
+            raise ReplayError(f"sequences.{name}: {error}") from error
         if i == 0:
             write_reference(folder, sequence.reference(), result.trajectory, poses)
-        write_replay(folder / mode, result, about, model_path)
+        write_replay(folder / mode, result, about, modes.model_path)
         if started.selector is not None:
             selections = [choice.selection for choice in result.choices]
-            warn_of_scant_evidence(f"{name}, {mode}", selections, started.selector.fixed)
+            warn_of_scant_evidence(what, selections, started.selector.fixed)
 
 
 def _renew_reference(study: Study, name: str, replayed: Path) -> None:
@@ -134,7 +170,7 @@ def _report_changes(name: str, others: Mapping[str, Sequence[str] | None]) -> No
 def _replay(
     config: StudyConfig,
     sequence: Recording,
-    name: str,
+    what: str,
     mode: Mode,
     progress: Callable[[int, int], None],
 ) -> Replay:
@@ -147,9 +183,8 @@ def _replay(
             mode.selector,
             config.online.period,
             lambda: progress(next(done), n),
+            what,
         )
-    except DescriptorError as error:
-        raise ReplayError(f"sequences.{name}: {error}") from error
     finally:
         mode.odometry.close()
     progress(n, n)

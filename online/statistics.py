@@ -1,4 +1,4 @@
-"""Statistics of stored replays: errors, intervals, and ratios to the fixed set's."""
+"""Statistics of stored replays: errors, intervals, and ratios to those of another mode."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -17,12 +17,15 @@ from adaptune.metrics import (
     relative_error,
     span,
     sub_trajectory_rte,
+    window_ends,
 )
 from adaptune.trajectory import Trajectory, read_tum
 from online.stored_replays import StoredReplay
 
 ALL = "all"
 """In place of a sequence, all of them."""
+ESTIMATED, LOST = "estimated [%]", "lost [s]"
+"""Columns of what a bank has measured of itself."""
 Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
 
@@ -50,6 +53,14 @@ class Reference(NamedTuple):
             return np.full(len(odometry), np.nan)
         T_ref_sensor = self.trajectory.at(odometry.stamps)
         return sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length)
+
+    def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
+        """Sub-trajectory RTE in percent, at the frames at which the sub-trajectories end."""
+        behind = np.full(len(odometry), np.nan)
+        if self.trajectory is not None:
+            ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
+            behind[ends[ends >= 0]] = self.errors(odometry)[ends >= 0]
+        return behind
 
     def standard(self, odometry: Trajectory) -> "StandardErrors | None":
         """The errors that other tools give, where there are reference poses to compare with."""
@@ -85,7 +96,7 @@ class ComparisonRow:
     sequence: str
     mode: str
     rte: float | None  # mean sub-trajectory RTE in percent; None where the reference is unknown
-    vs_fixed: float | None  # its ratio to that of the fixed set
+    ratio: float | None  # to that of the yardstick
     restarts: int  # by the health check
     switches: int  # changes of the parameters
     poor_scans: int  # too poor to register
@@ -97,17 +108,25 @@ class ComparisonRow:
     x_real_time: float | None = None  # speed of the odometry
     first_restart: float | None = None  # seconds from the start
     unhealthy: tuple[str, ...] = ()  # what the health check found
+    yardstick: str = "fixed"  # the mode that others are compared with
+    # Percent: the mean of the odometry's own error, measured while driving and without reference.
+    estimated: float | None = None
+    estimated_interval: Interval = None
+    lost_seconds: float = 0.0  # how long the bank was lost
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
         rte_low, rte_high = self.rte_interval or (None, None)
         low, high = self.ratio_interval or (None, None)
+        estimated_low, estimated_high = self.estimated_interval or (None, None)
         return {
             "sequence": self.sequence,
             "mode": self.mode,
             "RTE [%]": self.rte,
-            "vs fixed": self.vs_fixed,
+            f"vs {self.yardstick}": self.ratio,
             "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
+            ESTIMATED: self.estimated,
+            LOST: self.lost_seconds,
             "restarts": self.restarts,
             "switches": self.switches,
             "_poor_scans": self.poor_scans,
@@ -118,6 +137,8 @@ class ComparisonRow:
             "_ratio_high": high,
             "_blocks": self.blocks,
             "_median": self.median,
+            "_estimated_low": estimated_low,
+            "_estimated_high": estimated_high,
         } | {f"_{key}": value for key, value in self._standard().items()}
 
     def _standard(self) -> dict[str, Any]:
@@ -147,7 +168,7 @@ class ComparisonRow:
 def compare_modes(
     name: str, replays: Mapping[str, StoredReplay], reference: Reference
 ) -> list[ComparisonRow]:
-    """Compare the modes on a sequence, one of which is `fixed`.
+    """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`.
 
     Parameters
     ----------
@@ -159,21 +180,23 @@ def compare_modes(
         Of the sequence.
     """
     errors = {mode: reference.errors(replay.trajectory) for mode, replay in replays.items()}
+    yardstick = "fixed" if "fixed" in replays else "baseline"
     block = reference.block
     rows = []
     for mode, replay in replays.items():
-        known = np.isfinite(errors[mode]) & np.isfinite(errors["fixed"])
-        mine, fixed = errors[mode][known], errors["fixed"][known]
+        known = np.isfinite(errors[mode]) & np.isfinite(errors[yardstick])
+        mine, others = errors[mode][known], errors[yardstick][known]
         summary = replay.summary
-        intervals = bootstrap(mine, fixed, block) if len(mine) else None
+        intervals = bootstrap(mine, others, block) if len(mine) else None
         rte_interval, ratio_interval = intervals or (None, None)
         rte = float(mine.mean()) if len(mine) else None
+        estimated, estimated_interval = _estimated(replay)
         rows.append(
             ComparisonRow(
                 name,
                 mode,
                 rte,
-                None if rte is None else rte / max(float(fixed.mean()), 1e-12),
+                None if rte is None else rte / max(float(others.mean()), 1e-12),
                 summary.restarts,
                 _switches(replay),
                 summary.poor_scans,
@@ -185,9 +208,25 @@ def compare_modes(
                 round(summary.duration_s / replay.seconds, 2) if replay.seconds else None,
                 _first_restart(replay),
                 tuple(summary.unhealthy),
+                yardstick,
+                estimated,
+                estimated_interval,
+                summary.lost_seconds,
             )
         )
     return rows
+
+
+def _estimated(replay: StoredReplay) -> tuple[float | None, Interval]:
+    """Mean of the estimated errors, and of the ends of their intervals.
+
+    The interval is right if all estimates err together, and else too wide.
+    """
+    known = replay.estimated[np.isfinite(replay.estimated[:, 0])]
+    if not len(known):
+        return None, None
+    mean, low, high = known.mean(axis=0).tolist()
+    return mean, (low, high) if np.isfinite([low, high]).all() else None
 
 
 def _first_restart(replay: StoredReplay) -> float | None:
@@ -208,7 +247,8 @@ def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
     made = []
     for mode in dict.fromkeys(row.mode for row in rows):
         mine = [row for row in rows if row.mode == mode and row.rte is not None]
-        ratios = [row.vs_fixed for row in mine if row.vs_fixed is not None]
+        ratios = [row.ratio for row in mine if row.ratio is not None]
+        estimated = [row.estimated for row in mine if row.estimated is not None]
         made.append(
             ComparisonRow(
                 ALL,
@@ -219,6 +259,9 @@ def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
                 sum(row.switches for row in mine),
                 sum(row.poor_scans for row in mine),
                 standard=StandardErrors.pooled([row.standard for row in mine if row.standard]),
+                yardstick=mine[0].yardstick,
+                estimated=float(np.mean(estimated)) if estimated else None,
+                lost_seconds=sum(row.lost_seconds for row in mine),
             )
         )
     return made

@@ -1,10 +1,12 @@
 """Replays on disk: trajectory, selections, frames, and what they were made from."""
 
 import csv
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +56,10 @@ class ReplaySummary(BaseModel):
     unhealthy: dict[str, int]  # how often the health check found what
     poor_scans: int  # scans that were too poor to register
     selections: int
-    model_file: str  # of the model that it was made with
+    lost_seconds: float = 0.0  # how long the bank was lost
+    # Percent: mean of the odometry's own error as it was measured without ground truth.
+    mean_estimated_error: float | None = None
+    model_file: str | None  # of the model that it was made with; None if it needed none
     about: ReplayIdentity
 
     @classmethod
@@ -101,6 +106,10 @@ class StoredReplay:
     # For every parameter its values, of shape (m,); in a bank those of the heaviest member.
     choices: dict[str, Sequence[Any]]
     weights: dict[int, Sequence[float]]  # in a bank, by trial, of shape (m,); empty without one
+    # (m, 3): the odometry's own error as it was measured while driving, and the ends of its
+    # interval, in percent; NaN where it is unknown.
+    estimated: NDArray[np.float64]
+    lost: NDArray[np.bool_]  # (m,): whether the bank was lost
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -125,15 +134,21 @@ class StoredReplay:
             seconds = 1e-3 * sum(float(ms) for key in _TIMES for ms in frames[key])
         except (KeyError, ValueError) as error:
             raise _damaged(folder / "frames.csv", error) from error
-        stamps, choices, weights = _choices(folder / "selections.csv")
-        if not len(stamps):
-            stamps = trajectory.stamps[:1]
+        chosen = _choices(folder / "selections.csv")
+        if not len(chosen.stamps):
             kept = summary.about.parameters or {}
-            choices = {name: _numbers([str(value)]) for name, value in kept.items()}
-        return cls(summary, trajectory, restarted, seconds, stamps, choices, weights)
+            chosen = chosen._replace(
+                stamps=trajectory.stamps[:1],
+                parameters={name: _numbers([str(value)]) for name, value in kept.items()},
+                estimated=np.full((1, 3), np.nan),
+                lost=np.zeros(1, bool),
+            )
+        return cls(summary, trajectory, restarted, seconds, *chosen)
 
 
-def write_replay(folder: Path, replay: Replay, about: ReplayIdentity, model_file: Path) -> None:
+def write_replay(
+    folder: Path, replay: Replay, about: ReplayIdentity, model_file: Path | None
+) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
     Parameters
@@ -145,7 +160,7 @@ def write_replay(folder: Path, replay: Replay, about: ReplayIdentity, model_file
     about
         What it was made from.
     model_file
-        The model that it was made with.
+        The model that it was made with, if any.
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     _write_selections(folder / "selections.csv", replay)
@@ -167,15 +182,32 @@ def write_replay(folder: Path, replay: Replay, about: ReplayIdentity, model_file
         unhealthy=replay.unhealthy,
         poor_scans=int((~replay.registered).sum()),
         selections=len(replay.choices),
-        model_file=str(model_file.resolve()),
+        lost_seconds=round(_lost_seconds(replay), 3),
+        mean_estimated_error=_mean_estimated(replay),
+        model_file=None if model_file is None else str(model_file.resolve()),
         about=about,
     )
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
 
 
+def _lost_seconds(replay: Replay) -> float:
+    """Seconds from selections at which the bank was lost to the next ones."""
+    stamps = [*(choice.stamp for choice in replay.choices), int(replay.trajectory.stamps[-1])]
+    spans = zip(replay.choices, itertools.pairwise(stamps), strict=True)
+    return 1e-9 * sum(end - start for choice, (start, end) in spans if choice.selection.lost)
+
+
+def _mean_estimated(replay: Replay) -> float | None:
+    """Mean of the estimated errors, where there are any."""
+    errors = [choice.selection.estimated_error for choice in replay.choices]
+    known = [error for error in errors if math.isfinite(error)]
+    return round(float(np.mean(known)), 4) if known else None
+
+
+_ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
 _SELECTION = (
     *("stamp_ns", "trial", "predicted_error_percent", "predicted_fixed_percent"),
-    *("familiarity", "sequences", "weights", "ms"),
+    *("familiarity", "sequences", *_ESTIMATED, "lost", "weights", "ms"),
 )
 """Columns of ``selections.csv`` before the parameters."""
 
@@ -189,10 +221,13 @@ def _write_selections(path: Path, replay: Replay) -> None:
             selection.predicted_fixed,
             selection.familiarity,
             selection.n_sequences,
+            selection.estimated_error,
+            selection.estimated_low,
+            selection.estimated_high,
         )
         weights = (selection.weights or {}).items()
         rows.append(
-            [stamp, selection.trial, *(f"{x:.4f}" for x in numbers)]
+            [stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)]
             + [" ".join(f"{trial}:{weight:.3f}" for trial, weight in weights)]
             + [f"{1e3 * seconds:.3f}"]
             + [selection.parameters[name] for name in names]
@@ -207,17 +242,33 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
         writer.writerows(rows)
 
 
-def _choices(
-    path: Path,
-) -> tuple[NDArray[np.int64], dict[str, Sequence[Any]], dict[int, Sequence[float]]]:
+class _Choices(NamedTuple):
+    """The columns of ``selections.csv``, see `StoredReplay`."""
+
+    stamps: NDArray[np.int64]
+    parameters: dict[str, Sequence[Any]]
+    weights: dict[int, Sequence[float]]
+    estimated: NDArray[np.float64]
+    lost: NDArray[np.bool_]
+
+
+def _choices(path: Path) -> _Choices:
     columns = _columns(path)
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
         weights = _weights(columns.get("weights", []))
+        # Replays of an older adaptune have no estimates.
+        estimated = np.full((len(stamps), 3), np.nan)
+        for i, name in enumerate(_ESTIMATED):
+            if name in columns:
+                estimated[:, i] = np.array(columns[name], np.float64)
+        lost = np.array([text == "1" for text in columns.get("lost", ["0"] * len(stamps))], bool)
     except (TypeError, ValueError) as error:
         raise _damaged(path, error) from error
-    parameters = {name: v for name, v in columns.items() if name not in _SELECTION}
-    return stamps, {name: _numbers(values) for name, values in parameters.items()}, weights
+    parameters: dict[str, Sequence[Any]] = {
+        name: _numbers(values) for name, values in columns.items() if name not in _SELECTION
+    }
+    return _Choices(stamps, parameters, weights, estimated, lost)
 
 
 def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:

@@ -1,7 +1,7 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,7 +150,7 @@ class BankRule(Rule):
 
 
 def weighted_selection(
-    sets: ParameterSets, weights: Mapping[int, float], **predicted: float
+    sets: ParameterSets, weights: Mapping[int, float], **predicted: Any
 ) -> Selection:
     """A selection of a bank's weights; its set is that of the heaviest member."""
     heaviest = max(weights, key=weights.__getitem__)
