@@ -1,6 +1,7 @@
 """A check of an odometry's poses that needs no reference."""
 
-from collections import Counter
+from collections import Counter, deque
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ _STILL = 1e-6
 """Metres and radians by which a pose that stays where it is may move."""
 _WALK = 0.5
 """Metres a second."""
+_INTERVALS = 11
+"""Newest intervals between scans whose median is the usual one."""
+_MOST_JITTER = 0.5
+"""The largest share of an interval that counts as jitter of its stamps."""
 
 
 class HealthCheck(StrictModel):
@@ -27,7 +32,7 @@ class HealthCheck(StrictModel):
         Metres a second.
     max_acceleration : float
         Metres a second squared, of the step's mean velocity against the last healthy one's;
-        generous enough for the noise of two differentiations.
+        generous enough for the noise of two differentiations. Irregular stamps widen it.
     max_turn_rate : float
         Degrees a second.
     max_freeze : float
@@ -45,7 +50,12 @@ class HealthCheck(StrictModel):
     max_unregistered: int = Field(10, ge=1, le=10**9)
 
     def exceeded(
-        self, velocity: Poses, last_velocity: Poses | None, elapsed: float, turn_rate: float = 0.0
+        self,
+        velocity: Poses,
+        last_velocity: Poses | None,
+        elapsed: float,
+        turn_rate: float = 0.0,
+        stamp_noise: float = 0.0,
     ) -> str | None:
         """The bound that this motion exceeds, if any.
 
@@ -59,6 +69,8 @@ class HealthCheck(StrictModel):
             Seconds since `last_velocity`.
         turn_rate
             Radians a second.
+        stamp_noise
+            Metres a second by which the change of velocity may come from the stamps.
         """
         if not turn_rate <= np.radians(self.max_turn_rate):
             return "max_turn_rate"
@@ -68,7 +80,8 @@ class HealthCheck(StrictModel):
         if last_velocity is None:
             return None
         change = float(np.linalg.norm(velocity - last_velocity))
-        return "max_acceleration" if change > self.max_acceleration * elapsed else None
+        most = self.max_acceleration * elapsed + stamp_noise
+        return "max_acceleration" if change > most else None
 
     def still(self, T_previous_current: Poses) -> bool:
         """Whether a pose of shape (4, 4) stays where it is, to the micrometre."""
@@ -87,6 +100,8 @@ class Guard:
         self._health = check
         # The last healthy motion, and the last one that was not still, each with its seconds.
         self._healthy: tuple[Poses, float] | None = None
+        self._healthy_noise = 0.0
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
         self._moving: tuple[Poses, float] | None = None
         self._since = self._still = 0.0
         self._unregistered = 0
@@ -106,22 +121,38 @@ class Guard:
             Whether the odometry registered the scan.
         """
         self._since += elapsed
+        self._intervals.append(elapsed)
         self._unregistered = 0 if registered else self._unregistered + 1
         if not np.isfinite(T_previous_current).all():
             return "no_pose"
         motion = T_previous_current, elapsed
         last = None if self._healthy is None else _velocity(*self._healthy)
         turn_rate = float(rotation_angle(T_previous_current)) / elapsed
-        what = self._health.exceeded(_velocity(*motion), last, self._since, turn_rate)
+        velocity = _velocity(*motion)
+        noise = self._jitter(elapsed) * float(np.linalg.norm(velocity))
+        what = self._health.exceeded(
+            velocity, last, self._since, turn_rate, noise + self._healthy_noise
+        )
         if what is not None:
             return what
         if self._frozen(*motion):
             return "max_freeze"
-        self._healthy, self._since = motion, 0.0
+        self._healthy, self._healthy_noise, self._since = motion, noise, 0.0
         if self._unregistered >= self._health.max_unregistered:
             self._unregistered = 0
             return "max_unregistered"
         return None
+
+    def _jitter(self, elapsed: float) -> float:
+        """The share of an interval by which its stamps are irregular.
+
+        A recording that stamps scans on arrival says 0.08 s and 0.13 s where a laser turned at a
+        regular 10 Hz. The usual interval, or a multiple of it where scans are missing, is
+        then as likely as what the stamps say.
+        """
+        usual = median(self._intervals)
+        turns = max(1, round(elapsed / usual))
+        return min(abs(elapsed - turns * usual) / elapsed, _MOST_JITTER)
 
     def _frozen(self, T_previous_current: Poses, elapsed: float) -> bool:
         if not self._health.still(T_previous_current):

@@ -7,19 +7,29 @@ import subprocess
 import sys
 import time
 
+import commands
 import drives
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from adaptune import tools
+from adaptune import terminal, tools
 from adaptune.archive import Archive
 from adaptune.cli import app
 from adaptune.trajectory import Trajectory
 from offline.offline_study import load_study
 
 
-def adaptune(*arguments, cwd):
+@pytest.fixture
+def adaptune(tmp_path, monkeypatch):
+    """Call the command line in this process, with a terminal of 80 columns."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(terminal.console, "width", 80)
+    return commands.call
+
+
+def process(*arguments, cwd):
+    """Call the command line in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "adaptune.cli", *map(str, arguments)],
         cwd=cwd,
@@ -39,17 +49,17 @@ def next_words(done):
     return shlex.split(match[1])
 
 
-def test_one_bag_is_enough_and_every_command_names_the_next(study_file, tmp_path):
+def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file, tmp_path):
     (tmp_path / "one.bag").symlink_to(study_file.parent / "one.bag")
-    done = adaptune("inspect", "one.bag", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = adaptune("inspect", "one.bag")
+    assert done.exit_code == 0, done.stderr
     begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
     (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
     words = [*next_words(done), "-o", "offline.trials=4", "--folder", "my study[v2]"]
     for command in ("offline", "online", "compare"):
         assert words[0] == command
-        done = adaptune(*words, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = adaptune(*words)
+        assert done.exit_code == 0, done.stderr
         words = next_words(done)
         fewer = [] if command == "compare" else ["-o", "offline.trials=4"]
         assert words[1:] == ["one.yaml", "--folder", "my study[v2]", *fewer]
@@ -101,7 +111,9 @@ def test_inspect_says_what_to_do_without_a_reference(tmp_path):
         (["cache"], "cache"),
     ],
 )
-def test_other_commands_name_the_next_too(study_file, trained_folder, tmp_path, command, following):
+def test_other_commands_name_the_next_too(
+    adaptune, study_file, trained_folder, tmp_path, command, following
+):
     folder = tmp_path / "run"
     shutil.copytree(trained_folder, folder)
     if "MODEL" in command:
@@ -110,53 +122,53 @@ def test_other_commands_name_the_next_too(study_file, trained_folder, tmp_path, 
         words = command
     else:
         words = [*command, study_file, "--folder", folder]
-    done = adaptune(*words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = adaptune(*words)
+    assert done.exit_code == 0, done.stderr
     assert next_words(done)[0] == following
-    csv = adaptune("trials", study_file, "--folder", folder, "--csv", cwd=tmp_path)
+    csv = adaptune("trials", study_file, "--folder", folder, "--csv")
     assert "Next" not in csv.stdout
 
 
-def test_a_model_in_a_study_folder_names_a_command_that_works(study_file, tmp_path):
+def test_a_model_in_a_study_folder_names_a_command_that_works(adaptune, study_file, tmp_path):
     folder = tmp_path / "my run"
     roles = ("-o", "training=[one]", "-o", "test=[two]", "-o", "offline.trials=4")
-    assert adaptune("offline", study_file, *roles, "--folder", folder, cwd=tmp_path).returncode == 0
-    done = adaptune("model", "show", folder, cwd=tmp_path)
+    assert adaptune("offline", study_file, *roles, "--folder", folder).exit_code == 0
+    done = adaptune("model", "show", folder)
     assert "Not validated yet: `adaptune validate` shows what adapting gains" in done.stdout
-    done = adaptune(*next_words(done), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = adaptune(*next_words(done))
+    assert done.exit_code == 0, done.stderr
     assert "4 of 4 replays made" in done.stdout
-    done = adaptune("online", folder / "study.yaml", "--folder", folder, cwd=tmp_path)
+    done = adaptune("online", folder / "study.yaml", "--folder", folder)
     assert "All 4 replays were there already" in done.stdout
     shutil.copy(folder / "model.safetensors", tmp_path)
-    assert "Next:" not in adaptune("model", "show", "model.safetensors", cwd=tmp_path).stdout
+    assert "Next:" not in adaptune("model", "show", "model.safetensors").stdout
 
 
-def test_parts_of_a_course_are_recorded_once(study_file, tmp_path):
+def test_parts_of_a_course_are_recorded_once(adaptune, study_file, tmp_path):
     course = "courses={cave: {scenes: [cave], length: 10, seed: 1, columns: 64}}"
     roles = ["training=[cave: 0-50%]", "test=[cave: 50-100%]"]
     overrides = [word for text in (course, *roles) for word in ("-o", text)]
     words = ("simulate", study_file, "--folder", "run", *overrides)
-    done = adaptune(*words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = adaptune(*words)
+    assert done.exit_code == 0, done.stderr
     assert "Recorded 1 of 1 courses" in done.stdout
     assert [path.name for path in (tmp_path / "run/recordings").glob("*.bag")] == ["cave.bag"]
-    assert "Recorded 0 of 1" in adaptune(*words, cwd=tmp_path).stdout
+    assert "Recorded 0 of 1" in adaptune(*words).stdout
 
 
 def test_the_whole_way(study_file, tmp_path):
-    done = adaptune("offline", study_file, cwd=tmp_path)
+    done = process("offline", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert re.search(
         r"^Fixed: \d.* % against the baseline's \d.* \(2 sequences\)", done.stdout, re.MULTILINE
     )
     assert "Parameters of the fixed set: max_correspondence_distance" in done.stdout
     assert next_words(done)[:2] == ["validate", str(study_file)]
-    done = adaptune("online", study_file, cwd=tmp_path)
+    done = process("online", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "4 of 4 replays made" in done.stdout
     assert next_words(done)[:2] == ["compare", str(study_file)]
-    done = adaptune("compare", study_file, cwd=tmp_path)
+    done = process("compare", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for mode in ("baseline", "fixed", "paired", "paper"):
         assert mode in done.stdout
@@ -186,28 +198,28 @@ def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words,
 
 
 def test_a_process_ends_with_a_sentence_too(tmp_path):
-    done = adaptune("offline", "none.yaml", cwd=tmp_path)
+    done = process("offline", "none.yaml", cwd=tmp_path)
     assert done.returncode == 2
     assert "none.yaml: there is no such file" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_inspect_and_cache(study_file, tmp_path):
-    done = adaptune("inspect", study_file.parent / "one.bag", "--png", "one.png", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_inspect_and_cache(adaptune, study_file, tmp_path):
+    done = adaptune("inspect", study_file.parent / "one.bag", "--png", "one.png")
+    assert done.exit_code == 0, done.stderr
     assert "/points" in done.stdout
     assert "sequences:" in done.stdout
     assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
-    done = adaptune("inspect", study_file, cwd=tmp_path)
-    assert done.returncode == 2
+    done = adaptune("inspect", study_file)
+    assert done.exit_code == 2
     assert "Traceback" not in done.stderr
-    assert adaptune("cache", cwd=tmp_path).returncode == 0
-    assert adaptune("cache", "clear", cwd=tmp_path).stdout.startswith("Freed")
+    assert adaptune("cache").exit_code == 0
+    assert adaptune("cache", "clear").stdout.startswith("Freed")
 
 
-def test_help_and_version(tmp_path):
-    done = adaptune("--help", cwd=tmp_path)
-    assert done.returncode == 0
+def test_help_and_version(adaptune):
+    done = adaptune("--help")
+    assert done.exit_code == 0
     for command in (
         "inspect",
         "simulate",
@@ -219,13 +231,13 @@ def test_help_and_version(tmp_path):
         "cache",
     ):
         assert command in done.stdout
-    assert adaptune("--version", cwd=tmp_path).stdout.startswith("adaptune 0.")
+    assert adaptune("--version").stdout.startswith("adaptune 0.")
 
 
-def test_ctrl_c_leaves_a_study_that_resumes(study_file, tmp_path):
+def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
     command = [sys.executable, "-m", "adaptune.cli", "offline", str(study_file)]
     many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
-    process = subprocess.Popen(
+    campaign = subprocess.Popen(
         command + many,
         cwd=tmp_path,
         stderr=subprocess.PIPE,
@@ -238,11 +250,11 @@ def test_ctrl_c_leaves_a_study_that_resumes(study_file, tmp_path):
     deadline = time.monotonic() + 60
     while not archive.trial_path("one", 3).exists() and time.monotonic() < deadline:
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=30)
-    assert process.returncode == 130
+    os.killpg(campaign.pid, signal.SIGINT)
+    _, said = campaign.communicate(timeout=30)
+    assert campaign.returncode == 130
     assert "run the same command again" in said
     assert "Traceback" not in said
     finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
-    assert adaptune("offline", study_file, cwd=tmp_path).returncode == 0
+    assert adaptune("offline", study_file).exit_code == 0
     assert {p: p.stat().st_mtime_ns for p in finished} == finished

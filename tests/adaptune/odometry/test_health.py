@@ -126,3 +126,36 @@ def test_scans_that_do_not_register(in_a_row, said):
         "max_unregistered" if not said else None
     )
     np.testing.assert_allclose(guard.go_on(0.2), moved(0.2), atol=1e-12)
+
+
+def drive(elapsed, steps):
+    """What a guard of a vehicle says of steps in metres that are stamped so many seconds apart."""
+    guard = Guard(HealthCheck())
+    return [guard.check(moved(x), t) for x, t in zip(steps, elapsed, strict=True)]
+
+
+def test_jitter_of_stamps_is_not_acceleration():
+    """A car at 10 m/s, a laser at a regular 10 Hz, and stamps of the moment of arrival."""
+    rng = np.random.default_rng(0)
+    for most in (0.01, 0.02, 0.03):
+        arrived = 0.1 * np.arange(201) + rng.uniform(0.0, most, 201)
+        assert set(drive(np.diff(arrived), np.ones(200))) == {None}
+    # Late and then early, as a recording in a town has it; so is a scan that is missing.
+    elapsed = [*[0.1] * 10, 0.13, 0.07, 0.1, 0.1, 0.21, 0.09, 0.1]
+    assert set(drive(elapsed, [*[1.0] * 14, 2.0, 1.0, 1.0])) == {None}
+
+
+@pytest.mark.parametrize("elapsed", [0.1, 0.02, 0.07, 0.13, 0.2])
+def test_a_step_is_not_excused_by_jitter(elapsed):
+    """A step of three times what the robot drives, however its stamps are."""
+    before, said = [0.1] * 12, [None] * 12
+    assert drive([*before, elapsed], [*[1.0] * 12, 30.0 * elapsed]) == [*said, "max_acceleration"]
+
+
+def test_regular_stamps_excuse_nothing():
+    """3 m/s within 0.1 s is the bound, before and after stamps that jitter."""
+    regular = [0.1] * 12
+    assert drive([*regular, 0.1], [*[1.0] * 12, 1.31])[-1] == "max_acceleration"
+    assert drive([*regular, 0.1], [*[1.0] * 12, 1.29])[-1] is None
+    jittered = [*regular, 0.13, 0.07, *regular]
+    assert drive([*jittered, 0.1], [*[1.0] * 26, 1.31]) == [*[None] * 26, "max_acceleration"]
