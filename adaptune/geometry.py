@@ -65,12 +65,14 @@ def scale(T_previous_current: Poses, share: float) -> Poses:
 def mean_motion(T_previous_current: Poses, weights: NDArray[np.float64]) -> Poses:
     """Weighted mean of motions: of translations, and the rotation nearest to that of rotations.
 
-    Motions of shape (n, 4, 4) turn by nearly the same. Weights of shape (n,) are not all zero.
+    Motions of shape (..., n, 4, 4) turn by nearly the same. Weights of shape (..., n) are not all
+    zero. The mean is of shape (..., 4, 4).
     """
-    T = np.tensordot(weights / weights.sum(), T_previous_current, axes=1)
+    shares = weights / weights.sum(axis=-1, keepdims=True)
+    T: Poses = np.einsum("...n,...nij->...ij", shares, T_previous_current)
     # Newton's steps double the digits: turns that differ by a radian take five.
     for _ in range(5):
-        if abs(np.linalg.det(T[:3, :3]) - 1.0) < 1e-13:
+        if np.abs(np.linalg.det(T[..., :3, :3]) - 1.0).max(initial=0.0) < 1e-13:
             break
         T = rectify(T)
     return T

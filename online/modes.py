@@ -39,6 +39,7 @@ class ReplaySetup:
     switching: SwitchingConfig
     mechanism: Mechanism  # how the odometry changes its parameters
     warm_up: WarmUp
+    sub_trajectory: float  # metres
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     switch_cost: float  # what a switch must promise, as a share of the fixed set's error
     descriptors: tuple[str, ...]  # those that the study names
@@ -53,6 +54,7 @@ class ReplaySetup:
             config.online.switching,
             study.mechanism,
             study.warm_up,
+            config.sub_trajectory,
             config.lost_track,
             study.switch_cost(),
             config.descriptor.names,
@@ -146,7 +148,7 @@ class ReplaySetup:
             members = self.untrained_sets()
             by_number = dict(zip(members.trials, members.parameters, strict=True))
             bank = Bank(self.odometry, by_number, self.warm_up, self.lost_track)
-            return Mode(bank, UntrainedSelector(members))
+            return Mode(bank, UntrainedSelector(members, self.sub_trajectory))
         if mode not in self.rules:
             return Mode(self.odometry(self.parameters(mode, model), sequence), None)
         model = needed(mode, model)

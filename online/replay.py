@@ -30,6 +30,9 @@ class Selects(Protocol):
     def select(self) -> Selection:
         """Choose what to apply."""
 
+    def measure(self) -> None:
+        """Measure how wrong the odometry was, for the next selections."""
+
 
 class Choice(NamedTuple):
     """A selection that was made."""
@@ -136,6 +139,7 @@ def replay(
                 choices.append(Choice(scan.stamp, selection, time.perf_counter() - t))
                 _tell_of_loss(choices, what)
                 odometry.apply(selection)
+                selector.measure()
         steps.append(tracker.register(scan))
         progress()
     if not steps:

@@ -63,6 +63,9 @@ class Alternating:
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """Ignore the scan."""
 
+    def measure(self) -> None:
+        """Do nothing."""
+
     def select(self) -> Selection:
         """Take the next set."""
         return Selection(*next(self._turns))
