@@ -116,7 +116,9 @@ def choose(
     if len(recordings) < 2 or not logs[0].shape[1]:
         unknown = BankSettings(adapt=RELIES_ON_LIVE and len(members) > 1)
         return Policy(DO_NOT_ADAPT, unknown, members, {})
-    return least_loss(np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0)
+    return least_loss(
+        np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0
+    )
 
 
 def least_loss(

@@ -1,7 +1,7 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
