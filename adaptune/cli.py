@@ -197,7 +197,7 @@ def offline(
         say(f"The sets that no other set beats in every objective: {front}.*")
     say(driven(loaded, model).words)
     say(f"Error model: {loaded.model_path}")
-    say_next_of_trained(loaded.training, loaded.config.test, study, override, folder)
+    say_next_of_trained(bool(model.expected), loaded.config.test, study, override, folder)
 
 
 @app.command()
@@ -249,7 +249,8 @@ def trials(
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
         if all_done(loaded.config.offline, loaded.folder, (row["trial"] for row in finished)):
-            say_next_of_trained(loaded.training, loaded.config.test, study, override, folder)
+            several = len(loaded.training) > 1
+            say_next_of_trained(several, loaded.config.test, study, override, folder)
         else:
             why = "run the trials that are left, fit"
             say_next_of_study(why, "offline", study, override, folder)
@@ -265,18 +266,18 @@ def validate(
     override: Override = [],  # noqa: B006
     folder: Folder = None,
     curve: Annotated[
-        bool, typer.Option("--learning-curve", help="Add the gain with fewer sequences.")
+        bool, typer.Option("--learning-curve", help="Add the gain with fewer stretches.")
     ] = False,
     sizes: Annotated[
         bool, typer.Option("--bank-sizes", help="Add the gain of banks of 2 to 6 members.")
     ] = False,
 ) -> None:
-    """Estimate whether adapting pays in places without training data.
+    """Estimate what adapting gains in places without training data.
 
-    Leaves out one training sequence after the other, fits on the rest, and looks up the errors of
-    the sets that the rule selects in each period. No odometry runs. A bank averages the recorded
-    motions of its members. Numbers are ratios to the error of the fixed set, which is chosen
-    without the left-out sequence, too.
+    Leaves out one training recording after the other (with fewer than six, one stretch after the
+    other), chooses on the rest what to drive, and looks up the errors of the sets that are selected
+    in each period. No odometry runs. A bank averages the recorded motions of its members. Numbers
+    are ratios to the error of the fixed set, which is chosen without what is left out, too.
     """
     loaded = _load(study, override, folder)
     from adaptune import report
@@ -287,25 +288,25 @@ def validate(
     validation, rows, learning, banks, verdicts = validated
     console.print(
         report.table(
-            "Error as a ratio to the fixed set's, each sequence left out in turn",
+            "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
             rows,
             "Oracles know the errors: the best set of the sequence, and of every period. "
-            "Intervals: for a sequence, a block bootstrap over time, if it is long enough; for the "
-            "geometric mean, Student's interval over the sequences.",
+            "Intervals: for a recording, a block bootstrap over time, if it is long enough; for "
+            "the geometric mean over the stretches, what is expected elsewhere.",
         )
     )
     known = ", ".join(f"{ratio:.2f}" for ratio in validation.portfolio())
     say(f"If the best of 1, 2, ... complementary sets were always known: {known}.")
     for title, found in (
-        (f"With fewer training sequences, by `{validation.default}`", learning),
+        (f"With fewer training stretches, by `{validation.default}`", learning),
         ("Banks by number of members", banks),
     ):
         if found:
-            caption = "Ratio to the fixed set's error on left-out sequences; 95 % interval."
+            caption = "Ratio to the fixed set's error on what is left out; 95 % interval."
             console.print(report.table(title, found, caption))
     for verdict in verdicts:
         say(verdict)
-    say(f"Tables and picture: {loaded.folder / 'validation'}.*")
+    say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
     say_next_online(loaded.config.test, study, override, folder)
 
 
@@ -405,7 +406,7 @@ def compare(
     recordings, not for other places.
     """
     loaded = _load(study, override, folder)
-    from adaptune.study.driven import MIN_SEQUENCES
+    from adaptune.study.driven import MIN_RECORDINGS
     from offline.budget import TRIALS, more_trials
     from online.comparison import compare as compare_replays
     from online.comparison import remarks, tables
@@ -425,12 +426,13 @@ def compare(
         return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
     n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
-    if n < MIN_SEQUENCES and more is not None:
-        why = f"try {TRIALS} sets; {MIN_SEQUENCES} training sequences show whether to adapt"
+    if n < MIN_RECORDINGS and more is not None:
+        why = f"try {TRIALS} sets; {MIN_RECORDINGS} training recordings tell of other recordings"
         say_next_of_study(why, "offline", study, more, folder)
-    elif n < MIN_SEQUENCES:
-        first = f"name {MIN_SEQUENCES} training sequences or more, the study has {n}; then "
-        say_next_of_study("find out whether to adapt", "offline", study, override, folder, first)
+    elif n < MIN_RECORDINGS:
+        first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
+        why = "find out what adapting gains elsewhere"
+        say_next_of_study(why, "offline", study, override, folder, first)
     else:
         why = "what it has learned; docs/adapting-live.md brings it to the robot"
         say_next(why, "model", "show", loaded.model_path)

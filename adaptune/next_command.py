@@ -38,15 +38,15 @@ def say_next_online(
 
 
 def say_next_of_trained(
-    training: Sequence[str],
+    enough: bool,
     test: Sequence[str],
     study: Path,
     override: Sequence[str],
     folder: Path | None,
 ) -> None:
-    """Name what follows training: nothing can be left out of one sequence."""
-    if len(training) > 1:
-        say_next_of_study("would adapting pay elsewhere?", "validate", study, override, folder)
+    """Name what follows training: nothing can be left out of a single stretch."""
+    if enough:
+        say_next_of_study("what does adapting gain elsewhere?", "validate", study, override, folder)
     else:
         say_next_online(test, study, override, folder)
 

@@ -26,15 +26,7 @@ from adaptune.model.paired import Near
 from adaptune.selection import Selection
 from offline.labelled import LabelledData, LabelledSequence
 from offline.leave_one_out import Maker, Validation, leave_one_out
-from offline.tuning import (
-    bank_data,
-    bank_errors,
-    bank_evidence,
-    choose_bank,
-    tune,
-    tune_bank,
-    weights_along,
-)
+from offline.tuning import bank_data, bank_errors, bank_evidence, choose
 
 Take = Callable[[TrainingData], TrainingData]
 
@@ -88,7 +80,7 @@ def less(data: LabelledData) -> None:
 
     def maker(name: str, take: Take, every: int = 1) -> Maker:
         def make(others: LabelledData) -> Rule:
-            settings = tune(others) if name == "paired" else PairedSettings()
+            settings = choose(others, 0).one_set if name == "paired" else PairedSettings()
             of_less = {"n_frames": max(1, settings.n_frames // every)}
             return OfLess(make_rule(name, settings.model_copy(update=of_less)), take)
 
@@ -148,7 +140,7 @@ def makers() -> dict[str, Maker]:
         def with_its_settings(others: LabelledData) -> Rule:
             names = " ".join(other.name for other in others.sequences)
             if names not in tuned:
-                tuned[names] = tune(others)
+                tuned[names] = choose(others, 0).one_set
             settings = tuned[names]
             # A rule that does not adapt keeps the fixed set, unless its sharpness is given.
             if settings.adapt or "sharpness" in changed:
@@ -192,8 +184,8 @@ def ablate(data: LabelledData, size: int) -> None:
 def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors:
     """Errors of a bank on the sequence left out, and without one ingredient after the other."""
     data, pca = others.training_data()
-    members = choose_bank(others, data.fixed, size)
-    settings = tune_bank(others, members, data.fixed)
+    chosen = choose(others, size, one_set=False)
+    members, settings = chosen.members, chosen.bank
     of_members = bank_data(others, data, members)
 
     def simulated(
@@ -202,7 +194,7 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         smoothing: int = bank_weights.SMOOTHING,
         **changed: Any,
     ) -> NDArray[np.float64]:
-        # A bank that was not shown to pay is not used.
+        # A bank without less expected loss is not used.
         if not settings.adapt:
             return cap(sequence.errors[:, data.sets.column(data.fixed)])
         its = settings.model_copy(update=changed)
@@ -210,8 +202,7 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         if all_familiar:
             near = near._replace(evidence=familiar(near.evidence))
         with patch.multiple(bank_weights, RIDGE=ridge, SMOOTHING=smoothing):
-            weights = weights_along(near, its)
-        return bank_errors(sequence, weights)
+            return bank_errors(sequence, near, its)
 
     found = {
         "bank": simulated(),

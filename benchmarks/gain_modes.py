@@ -13,7 +13,7 @@ from adaptune.model.bank_weights import MemberWeights, clip_errors, minimum_vari
 from offline.curves import learning_curve
 from offline.labelled import LabelledData, LabelledSequence, periods
 from offline.leave_one_out import Validation, leave_one_out
-from offline.tuning import NO_WORSE, bank_errors, choose_bank
+from offline.tuning import cancelling_members, on_labelled, simulated_with
 
 Errors = dict[str, NDArray[np.float64]]
 """Capped errors on a sequence in several modes, at each frame that has a sub-trajectory."""
@@ -23,7 +23,7 @@ def validate(data: LabelledData, size: int) -> None:
     """Leave each sequence out in turn, and print the ratios."""
     left_out = leave_one_out(data, bank=size).left_out
     for of, (sequence, others) in zip(left_out, data.folds(), strict=True):
-        members = choose_bank(others, others.fixed(), size)
+        members = cancelling_members(others, others.fixed(), size)
         of.errors.update(constantly(sequence, members))
     validation = Validation(left_out)
     print_summary(validation, validation.ratios)
@@ -46,7 +46,12 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     }
     n_periods = len(periods(sequence.simulation.period)[0])
     return {
-        mode: bank_errors(sequence, MemberWeights(tuple(members), np.tile(weights, (n_periods, 1))))
+        mode: on_labelled(
+            sequence,
+            simulated_with(
+                sequence, MemberWeights(tuple(members), np.tile(weights, (n_periods, 1)))
+            ),
+        )
         for mode, weights in modes.items()
     }
 
@@ -87,12 +92,12 @@ def curve(data: LabelledData) -> None:
 
 def print_summary(validation: Validation, modes: Iterable[str]) -> None:
     """Print the ratios to the fixed set's error."""
-    print("geometric, arithmetic, worst ratio to the fixed set's error, sequences above 1.05")
+    print("geometric, arithmetic, worst tenth, worst ratio to the fixed set's error")
     for mode in modes:
         s = validation.summary(mode)
         print(
-            f"{mode:30}{s['geometric']:8.3f}{s['arithmetic']:8.3f}{s['worst']:8.2f}"
-            f"{(validation.ratios[mode] > NO_WORSE).sum():4d}"
+            f"{mode:30}{s['geometric']:8.3f}{s['arithmetic']:8.3f}{s['worst_tenth']:8.2f}"
+            f"{s['worst']:8.2f}"
             f"   (95 % {s['low']:.2f}-{s['high']:.2f})",
             flush=True,
         )

@@ -34,7 +34,7 @@ from adaptune.simulation import Course
 from adaptune.simulation.simulate import SimulatedScan, simulate
 from offline.fit import fit
 from offline.labelled import LabelledData
-from offline.tuning import choose_bank, tune, tune_bank
+from offline.tuning import choose
 from online.replay import Replay, Selects, replay
 
 ORDERS = (
@@ -79,7 +79,7 @@ def model_of(odometry: str, data: LabelledData) -> ErrorModel:
     sequences = [replace(s, blocks={"ndt": N_FEATURES}) for s in data.sequences]
     identity = factory_of(odometry).identity
     model = fit(data._replace(sequences=sequences), data.fixed(), identity, 25.0, WINDOW, {})
-    return replace(model, paired=tune(data))
+    return replace(model, paired=choose(data, 0).one_set)
 
 
 def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
@@ -95,8 +95,8 @@ def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
         return lambda: factory(sets[model.fixed]), Selector(model, rule, ())
 
     def bank(size: int, even: bool = False) -> Way:
-        members = choose_bank(data, model.fixed, size)
-        settings = tune_bank(data, members, model.fixed)
+        chosen = choose(data, size, one_set=False)
+        members, settings = chosen.members, chosen.bank
         print(f"bank of {size}: trials {members}, {settings}", flush=True)
         of_bank = replace(
             model, bank=members, vectors=data.vectors(members), bank_settings=settings

@@ -1,24 +1,27 @@
-"""What fewer training sequences, or banks of other sizes, would gain."""
+"""What fewer training stretches, or banks of other sizes, would gain."""
 
 from typing import Any
 
 import numpy as np
 
-from adaptune.sequence.names import origin
+from adaptune.study.driven import MIN_RECORDINGS
 from offline.labelled import LabelledData
 from offline.leave_one_out import (
     BANK_SIZE,
     PAIRED,
-    Maker,
+    LeftOut,
     Progress,
     Validation,
+    check_folds,
+    joined,
     leave_one_out,
     leave_out,
-    tuned_rules,
 )
 
 SIZES = (2, 3, 4, 5, 6)
 """Members of a bank that a study may ask for."""
+LEARNING = (3, 5, 8, 11, 16, 24, 32)
+"""Training stretches of a learning curve, and as many as there are."""
 
 
 def learning_curve(
@@ -27,48 +30,45 @@ def learning_curve(
     progress: Progress = lambda *_: None,
     bank: int | tuple[int, ...] | list[int] = BANK_SIZE,
 ) -> list[dict[str, Any]]:
-    """What a bank, or where there is none the paired rule, gains with fewer training sequences.
+    """What is gained with fewer training stretches, by a bank or, where there is none, by one set.
 
-    Each sequence is left out in turn. The rule and its settings are fitted on some of the others,
-    drawn at random.
+    Each recording or stretch is left out in turn. What is driven is chosen on some stretches of the
+    rest, drawn at random.
 
     Returns
     -------
     list of dict
-        For each number of training sequences the ratio to the error of the set that is fixed on
-        the same ones: geometric mean with its 95 % interval (Student's, over sequences), and the
-        worst.
+        For each number of training stretches the figures, see `Validation.summary`.
     """
-    folds = data.folds()
-    most = len(folds) - 1
+    by_recording = len(data.recordings) >= MIN_RECORDINGS
+    folds = data.folds(by_recording)
+    check_folds(data, folds)
     # Only one of them is reported.
     alone = not bank or data.sequences[0].simulation is None
-    rules: dict[str, Maker] = {PAIRED: tuned_rules()[PAIRED]} if alone else {}
-    sizes = sorted({n for n in (3, 5, 8, 11, 16, 24, 32) if n < most} | {most})
+    most = min(len(np.unique(others.stretches())) for _, others in folds)
+    sizes = sorted({n for n in LEARNING if n < most} | {most})
     rows = []
     for i, size in enumerate(sizes):
         rng = np.random.default_rng((seed, size))
-        left_out = []
-        for j, (sequence, others) in enumerate(folds):
+        parts: dict[str, list[LeftOut]] = {}
+        for j, (left_out, others) in enumerate(folds):
             progress(i * len(folds) + j, len(sizes) * len(folds))
-            names = sorted({origin(other.name) for other in others.sequences})
-            drawn = set(rng.choice(names, size, replace=False))
-            some = [other for other in others.sequences if origin(other.name) in drawn]
-            left_out.append(leave_out(sequence, others._replace(sequences=some), rules, bank))
-        validation = Validation(left_out)
-        rows.append({"sequences": size} | validation.summary(validation.default))
+            some = others.drawn(size, rng)
+            found = leave_out(left_out, some, None if alone else {}, bank, by_recording)
+            parts.setdefault(found.name, []).append(found)
+        validation = Validation([joined(of) for of in parts.values()])
+        rows.append({"stretches": size} | validation.summary(validation.default))
     progress(len(sizes) * len(folds), len(sizes) * len(folds))
     return rows
 
 
 def bank_curve(data: LabelledData, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
-    """What banks gain by their number of members, each sequence left out in turn.
+    """What banks gain by their number of members, each recording or stretch left out in turn.
 
     Returns
     -------
     list of dict
-        For each of `SIZES` for which there are enough sets, the ratio to the fixed set's error:
-        geometric mean with its 95 % interval (Student's, over sequences), arithmetic, worst.
+        For each of `SIZES` for which there are enough sets the figures, see `Validation.summary`.
     """
     few = [size for size in SIZES if size <= len(data.sets)]
     rows = []

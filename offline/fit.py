@@ -9,7 +9,7 @@ import numpy as np
 from adaptune.model import ErrorModel
 from adaptune.study.config import SwitchingConfig
 from offline.labelled import LabelledData
-from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose_bank, tune, tune_bank
+from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose
 
 _log = logging.getLogger(__name__)
 
@@ -55,13 +55,14 @@ def fit(
         errors=np.concatenate([s.errors for s in sequences]),
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
+        stretch=np.concatenate([s.stretch for s in sequences]),
         paired=DO_NOT_ADAPT,
         bank_settings=NO_BANK,
     )
 
 
 def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
-    """Choose the bank, and the settings of the rule and of the bank's weights.
+    """Choose what is driven: the rule's settings, the bank and those of its weights.
 
     Parameters
     ----------
@@ -73,15 +74,16 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
         Size of the bank, or its members.
     """
     complete = data.complete()
-    members = named_members(model, switching, complete)
-    if not members:
-        members = choose_bank(complete, model.fixed, switching.size)
+    bank = named_members(model, switching, complete) or switching.size
+    chosen = choose(complete, bank, fixed=model.fixed)
+    members = chosen.members or [model.fixed]
     return replace(
         model,
-        paired=tune(complete),
+        paired=chosen.one_set,
         bank=members,
         vectors=complete.vectors(members),
-        bank_settings=tune_bank(complete, members, model.fixed),
+        bank_settings=chosen.bank,
+        expected={way: figures._asdict() for way, figures in chosen.expected.items()},
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -9,17 +10,19 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Frames, Summary
 from adaptune.descriptor import averaged
-from adaptune.metrics import span
+from adaptune.metrics import cap, span
 from adaptune.model import ModelError, TrainingData
 from adaptune.model.bank_weights import POOL
 from adaptune.model.base import mean_errors
 from adaptune.parameter_sets import ParameterSets
-from adaptune.sequence.names import origin, places
+from adaptune.sequence.names import origin, places, stretch_numbers
+from adaptune.study.driven import MIN_RECORDINGS
 from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
 from offline.config import Metric, OfflineStudyConfig
 from offline.objective import choose_fixed, few, margin, mean_value, repeated, weighted
 from offline.search import owner
-from offline.whole_runs import mean_values, read_whole_runs, whole_values
+from offline.stretches import Extent, cut, part_of, stretches_of_view
+from offline.whole_runs import mean_values, read_whole_runs, whole_errors, whole_values
 
 if TYPE_CHECKING:
     from adaptune.descriptor.pca import ScaledPCA
@@ -52,8 +55,56 @@ class LabelledSequence:
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     # By trial number, the objective in whole runs of the candidates for the fixed set.
     whole: Mapping[int, float] = field(default_factory=dict)
+    # By trial number (n,): errors in these whole runs.
+    whole_errors: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    # Whether the objective is that of the errors alone, and so is known on some frames, too.
+    by_frames: bool = False
     # With all frames; without it there is no bank.
     simulation: BankSimulation | None = None
+    # Number of each frame's stretch, of shape (n,), the same in a view; one stretch when left out.
+    cuts: NDArray[np.intp] | None = None
+    extent: Extent | None = None  # where the frames are; without it there is one stretch
+
+    @cached_property
+    def stretch(self) -> NDArray[np.intp]:
+        """Number of each frame's stretch, of shape (n,)."""
+        return np.zeros(len(self.errors), np.intp) if self.cuts is None else self.cuts
+
+    def frames(self, kept: NDArray[np.bool_]) -> "LabelledSequence":
+        """The same with some of the frames."""
+        if kept.all():
+            return self
+        few = {n: errors[kept] for n, errors in self.whole_errors.items() if kept.any()}
+        whole = {n: float(cap(errors).mean()) for n, errors in few.items()}
+        return replace(
+            self,
+            period=self.period[kept],
+            descriptors=self.descriptors[kept],
+            errors=self.errors[kept],
+            baseline=None if self.baseline is None else self.baseline[kept],
+            # Where errors alone are the objective, it is that of the frames that are left.
+            values=None if self.by_frames else self.values,
+            repeats=None if self.by_frames else self.repeats,
+            vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
+            whole=whole if self.by_frames else self.whole,
+            whole_errors=few,
+            cuts=self.stretch[kept],
+            extent=None if self.extent is None else self.extent.some(kept),
+        )
+
+    def left_out(self, number: int) -> "LabelledSequence":
+        """A stretch, with the part of the simulation that it takes."""
+        one = self.frames(self.stretch == number)
+        if one.simulation is None or one.extent is None:
+            return one
+        simulation, extent = part_of(one.simulation, one.extent)
+        return replace(one, simulation=simulation, extent=extent)
+
+    def without(self, left_out: Extent | None, is_view: bool) -> "LabelledSequence":
+        """The same without what must not be known where a stretch is left out."""
+        if self.extent is None or left_out is None:
+            return self.frames(np.zeros(len(self.errors), bool))
+        return self.frames(~self.extent.near(left_out, is_view))
 
     def subset(self, columns: NDArray[np.intp]) -> "LabelledSequence":
         """The same with some of the sets."""
@@ -83,19 +134,64 @@ class LabelledData(NamedTuple):
         everywhere = np.flatnonzero(~missing.any(axis=0))
         return self.subset([self.sets.trials[column] for column in everywhere])
 
-    def folds(self) -> list[tuple[LabelledSequence, "LabelledData"]]:
-        """Leave each sequence out, with all views of it.
+    @property
+    def recordings(self) -> list[str]:
+        """Names of the recordings; views are none."""
+        return [s.name for s in self.sequences if origin(s.name) == s.name]
 
-        Views themselves are not left out: they add nothing about the place that they show.
+    def folds(
+        self, by_recording: bool | None = None
+    ) -> list[tuple[LabelledSequence, "LabelledData"]]:
+        """Leave each recording out, or, where there are few, each stretch, with all its views.
+
+        Views themselves are not left out: they add nothing about the place that they show. A
+        stretch is not left out if nothing far enough from it remains.
+
+        Parameters
+        ----------
+        by_recording
+            Whether recordings are left out; by default if there are `MIN_RECORDINGS`.
         """
-        return [
-            (
-                one,
-                LabelledData([s for s in self.sequences if origin(s.name) != one.name], self.sets),
-            )
-            for one in self.sequences
-            if origin(one.name) == one.name
+        if by_recording is None:
+            by_recording = len(self.recordings) >= MIN_RECORDINGS
+        folds = []
+        for one in self.sequences:
+            if origin(one.name) != one.name:
+                continue
+            if by_recording:
+                others = [s for s in self.sequences if origin(s.name) != one.name]
+                folds.append((one, LabelledData(others, self.sets)))
+            else:
+                folds += [self._without(one, int(n)) for n in np.unique(one.stretch)]
+        return [(one, others) for one, others in folds if others.sequences]
+
+    def _without(
+        self, one: LabelledSequence, number: int
+    ) -> tuple[LabelledSequence, "LabelledData"]:
+        """A stretch of a recording, and all that may be known where it is left out."""
+        left = one.frames(one.stretch == number)
+        others = [
+            s if origin(s.name) != one.name else s.without(left.extent, s.name != one.name)
+            for s in self.sequences
         ]
+        known = [s for s in others if len(s.errors)]
+        return one.left_out(number), LabelledData(known, self.sets)
+
+    def stretches(self) -> NDArray[np.intp]:
+        """Number of every frame's stretch, of shape (n_frames,); views share their numbers."""
+        place = places([s.name for s in self.sequences])
+        lengths = [len(s.errors) for s in self.sequences]
+        cuts = np.concatenate([s.stretch for s in self.sequences])
+        return stretch_numbers(np.repeat(place, lengths), cuts)
+
+    def drawn(self, size: int, rng: np.random.Generator) -> "LabelledData":
+        """Some of the stretches, drawn at random, with all their views."""
+        number = self.stretches()
+        known = np.unique(number)
+        kept = np.isin(number, rng.choice(known, min(size, len(known)), replace=False))
+        ends = np.cumsum([len(s.errors) for s in self.sequences])[:-1]
+        parts = zip(self.sequences, np.split(kept, ends), strict=True)
+        return LabelledData([s.frames(of) for s, of in parts if of.any()], self.sets)
 
     def bounds(self) -> dict[int, float]:
         """The objective of every set in trials on these sequences, see `Verdict.bound`."""
@@ -132,12 +228,11 @@ class LabelledData(NamedTuple):
         from adaptune.descriptor.pca import ScaledPCA  # takes long to import
 
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
-        number = places([s.name for s in self.sequences])
         blocks = self.sequences[0].blocks
         pca = ScaledPCA(blocks=None if blocks is None else tuple(blocks.values()))
         data = TrainingData(
             pca.fit(descriptors).transform(descriptors),
-            np.repeat(number, [len(s.errors) for s in self.sequences]),
+            self.stretches(),
             np.concatenate([s.errors for s in self.sequences]),
             self.sets,
             self.fixed(),
@@ -233,10 +328,50 @@ def labelled_data(
         }
         own = [one is not None and origin(one) == origin(name) for one in owners]
         labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
+    return LabelledData(_with_cuts(_with_whole_runs(archive, labelled, sets, config)), sets)
+
+
+def _with_whole_runs(
+    archive: Archive,
+    labelled: Sequence[LabelledSequence],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+) -> list[LabelledSequence]:
+    """Add what is known of the whole runs of the candidates for the fixed set."""
     rivals = few(LabelledData(labelled, sets).bounds())
-    runs = read_whole_runs(archive, list(run), rivals, config.health)
+    runs = read_whole_runs(archive, [s.name for s in labelled], rivals, config.health)
     whole = whole_values(config.offline, runs)
-    return LabelledData([replace(s, whole=whole[s.name]) for s in labelled], sets)
+    # Whether the objective on some frames follows from the errors there.
+    by_frames = set(config.offline.objective[0]) == {"rte"}
+    found = []
+    for s in labelled:
+        of = whole[s.name]
+        if by_frames and s.extent is not None:
+            errors = whole_errors(archive, s.name, of, s.extent.frames)
+            found.append(replace(s, whole=of, whole_errors=errors, by_frames=True))
+        else:
+            found.append(replace(s, whole=of))
+    return found
+
+
+def _with_cuts(sequences: Sequence[LabelledSequence]) -> list[LabelledSequence]:
+    """Cut recordings into stretches, and views as their recordings are."""
+    cuts: dict[str, NDArray[np.intp]] = {}
+    extents: dict[str, Extent] = {}
+    for s in sequences:
+        if s.extent is not None and s.simulation is not None:
+            cuts[s.name] = cut(s.simulation.T_ref_sensor, s.extent)
+            extents[s.name] = s.extent
+    found = []
+    for s in sequences:
+        of = origin(s.name)
+        if of == s.name or of not in cuts:
+            # A view without its recording is cut by itself.
+            found.append(replace(s, cuts=cuts.get(s.name)))
+        else:
+            numbers = stretches_of_view(extents[s.name], extents[of], cuts[of])
+            found.append(replace(s, cuts=numbers))
+    return found
 
 
 def _labelled(
@@ -280,6 +415,7 @@ def _labelled(
         block=span(frames.T_ref_sensor, config.sub_trajectory),
         elevation=float(np.nanmedian(frames.elevations)),
         simulation=simulation,
+        extent=Extent.of(frames.T_ref_sensor, known, config.sub_trajectory),
     )
     return labelled, frames, known
 

@@ -1,6 +1,6 @@
-"""Leave each training sequence out in turn, to find whether adapting pays in other places.
+"""Leave recordings or stretches out in turn, to find what adapting gains in other places.
 
-A fixed set and the selection rules are fitted on the other sequences. On the one left out, the
+A fixed set, and what is driven instead of it, are chosen on the rest. On what is left out, the
 errors that were recorded for the sets they choose are looked up, period by period; no odometry
 runs.
 """
@@ -17,28 +17,24 @@ from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
 from adaptune.model.base import complementary
-from adaptune.study.driven import MIN_SEQUENCES
+from adaptune.model.paired import ERROR_FLOOR
+from adaptune.study.driven import MIN_RECORDINGS, ONE_SET, PER_STRETCH, expected_in_words
+from offline.expected_loss import Figures, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 from offline.tuning import (
-    MIN_OTHERS,
-    NO_WORSE,
-    TINY,
+    MOST_FOLDS,
+    Policy,
     bank_data,
     bank_errors,
     bank_evidence,
-    choose_bank,
-    interval_margin,
-    tune,
-    tune_bank,
+    choose,
     weights_along,
 )
 
 MOST_SETS = 6
 """Complementary sets whose worth is reported."""
 PAIRED = RULES[0]
-"""The mode that `adaptune online` drives: a bank, if one is simulated, or one set at a time."""
-ONE_SET = "one set"
-"""Beside a bank, the mode with one set at a time."""
+"""The mode that `adaptune online` drives: what has the least expected loss."""
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
 
@@ -47,7 +43,7 @@ Interval = tuple[float, float] | None
 Progress = Callable[[int, int], None]
 """Called with how much is done, and how much there is."""
 Maker = Callable[[LabelledData], Rule]
-"""Makes a rule, with settings chosen on the sequences that it will be fitted on."""
+"""Makes a rule for the data that it will be fitted on."""
 
 
 class ValidationError(AdaptuneError):
@@ -55,7 +51,7 @@ class ValidationError(AdaptuneError):
 
 
 class LeftOut(NamedTuple):
-    """What happened on one sequence that was left out."""
+    """What happened on one recording, or stretch of it, that was left out."""
 
     name: str
     # For every mode the capped error in percent at each frame, of shape (n,).
@@ -68,6 +64,14 @@ class LeftOut(NamedTuple):
     # known.
     portfolio: NDArray[np.float64]
     block: int = 1  # frames of a sub-trajectory
+    stretch: NDArray[np.intp] | None = None  # (n,): of each frame; one stretch when left out
+
+    @property
+    def stretches(self) -> NDArray[np.intp]:
+        """Number of each frame's stretch, of shape (n,)."""
+        if self.stretch is None:
+            return np.zeros(len(self.errors["fixed"]), np.intp)
+        return self.stretch
 
     def interval(self, mode: str) -> Interval:
         """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
@@ -78,21 +82,52 @@ class LeftOut(NamedTuple):
         return intervals and intervals[1]
 
 
+def joined(parts: Sequence[LeftOut]) -> LeftOut:
+    """Stretches of a recording that were left out, as one."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    n_frames = [len(part.familiarity) for part in parts]
+    return LeftOut(
+        first.name,
+        {mode: np.concatenate([part.errors[mode] for part in parts]) for mode in first.errors},
+        {
+            mode: float(np.average([part.adapted[mode] for part in parts], weights=n_frames))
+            for mode in first.adapted
+        },
+        np.concatenate([part.familiarity for part in parts]),
+        np.average([part.portfolio for part in parts], axis=0, weights=n_frames),
+        first.block,
+        np.concatenate([part.stretches for part in parts]),
+    )
+
+
 @dataclass
 class Validation:
-    """All sequences left out, and the conclusion."""
+    """All that was left out, and the conclusion."""
 
-    left_out: list[LeftOut]
+    left_out: list[LeftOut]  # one of each recording
     bank: bool = False  # whether a bank was simulated
-    # For every mode its mean error over the fixed set's, a number for each sequence.
+    # For every mode its mean error over the fixed set's, a number for each recording.
     ratios: dict[str, NDArray[np.float64]] = field(init=False)
+    # For every mode the logarithm of its ratio to the fixed set's error on each stretch.
+    logs: dict[str, NDArray[np.float64]] = field(init=False)
+    recordings: list[str] = field(init=False)  # of each stretch
 
     def __post_init__(self) -> None:
         modes = list(self.left_out[0].errors)
         means = {
-            mode: np.array([s.errors[mode].mean() for s in self.left_out]) + TINY for mode in modes
+            mode: np.array([s.errors[mode].mean() for s in self.left_out]) + ERROR_FLOOR
+            for mode in modes
         }
         self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
+        self.logs = {
+            mode: np.concatenate(
+                [log_ratios(s.errors[mode], s.errors["fixed"], s.stretches) for s in self.left_out]
+            )
+            for mode in modes
+        }
+        self.recordings = [s.name for s in self.left_out for _ in np.unique(s.stretches)]
 
     @property
     def modes(self) -> list[str]:
@@ -104,24 +139,18 @@ class Validation:
         """The first of them."""
         return (*self.modes, RULES[0])[0]
 
-    def summary(self, mode: str) -> dict[str, float]:
-        """Geometric mean, 95 % interval, worst and arithmetic ratio to the fixed set.
+    def figures(self, mode: str) -> Figures:
+        """What is expected of a mode elsewhere."""
+        return figures(self.logs[mode], self.recordings)
 
-        The interval is Student's, of the logarithms: it is about other sequences like these.
-        """
-        logs = np.log(self.ratios[mode])
-        margin = interval_margin(logs)
-        low, high = logs.mean() - margin, logs.mean() + margin
+    def summary(self, mode: str) -> dict[str, float]:
+        """Its figures, and the ratio of the mean errors."""
         mean, fixed = (
             np.mean([s.errors[m].mean() for s in self.left_out]) for m in (mode, "fixed")
         )
-        return {
-            "geometric": float(np.exp(logs.mean())),
-            "low": float(np.exp(low)),
-            "high": float(np.exp(high)),
-            "worst": float(self.ratios[mode].max()),
-            "arithmetic": float(mean / fixed),
-        }
+        of_mode = self.figures(mode)._asdict()
+        numbers = {key: float(value) for key, value in of_mode.items() if not key.startswith("n_")}
+        return numbers | {"arithmetic": float((mean + ERROR_FLOOR) / (fixed + ERROR_FLOOR))}
 
     def portfolio(self) -> NDArray[np.float64]:
         """Geometric mean of the ratio to the fixed set's error if the best of K sets were known.
@@ -131,35 +160,24 @@ class Validation:
         ndarray of shape (MOST_SETS,)
             For K = 1 (the fixed set), 2, ...
         """
-        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out]) + TINY
-        portfolios = np.array([s.portfolio for s in self.left_out]) + TINY
+        fixed = np.array([s.errors["fixed"].mean() for s in self.left_out]) + ERROR_FLOOR
+        portfolios = np.array([s.portfolio for s in self.left_out]) + ERROR_FLOOR
         return np.asarray(np.exp(np.log(portfolios / fixed[:, None]).mean(axis=0)))
 
     def verdict(self, rule: str) -> str:
-        """What to do, in a sentence or two."""
-        s = self.summary(rule)
-        weighs = self.bank and rule == PAIRED
-        what = f"`{rule}` with the bank" if weighs else f"`{rule}`"
-        worst = self.left_out[int(np.argmax(self.ratios[rule]))].name
+        """What to expect of a rule, in a sentence."""
+        what = f"`{rule}`, with the bank where that is best" if self.bank else f"`{rule}`"
+        what = what if rule == PAIRED else f"`{rule}`"
+        expected = expected_in_words(self.figures(rule)._asdict())
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
-        weight = f"{share:.0f} % of the weight on other members than the fixed set"
-        ratio = (
-            f"over {len(self.left_out)} sequences left out it has {s['geometric']:.2f} times the "
-            f"fixed set's error in geometric mean (95 % interval {s['low']:.2f}-{s['high']:.2f}), "
-            + (f"with {weight}" if weighs else f"adapting {share:.0f} % of the time")
-        )
-        if not any(left_out.adapted.get(rule, 1.0) for left_out in self.left_out):
+        if not share:
             return (
-                f"{what} kept the fixed set wherever a sequence was left out: the others did not "
-                f"show that it pays; so there is no estimate of it."
+                f"{what} kept the fixed set wherever something was left out: the rest did not show "
+                f"less expected loss; so there is no estimate of it."
             )
-        if s["worst"] > NO_WORSE:
-            return f"Do not adapt by {what}: {s['worst']:.2f} times on {worst}; {ratio}."
-        if len(self.left_out) < MIN_SEQUENCES:
-            return f"Too few sequences to advise for {what}: {ratio}."
-        if s["high"] >= 1.0:
-            return f"Nothing shows that {what} pays, nor that it harms: {ratio}."
-        return f"Adapt by {what}: {ratio}, and on none more than {s['worst']:.2f} times."
+        if rule == PAIRED and self.bank:
+            return f"{what}: {expected}, with {share:.0f} % of the weight on other sets than fixed."
+        return f"{what}: {expected}, adapting {share:.0f} % of the time."
 
 
 def leave_one_out(
@@ -168,17 +186,20 @@ def leave_one_out(
     progress: Progress = lambda *_: None,
     bank: int | Sequence[int] = BANK_SIZE,
 ) -> Validation:
-    """Leave each sequence out in turn, with all views of it.
+    """Leave each recording or stretch out in turn, with all views of it.
+
+    What is driven is chosen anew on the rest, by the loss with which a study chooses it. So the
+    figures are those of the choice, and not of what was best in hindsight.
 
     Parameters
     ----------
     data
         The training sequences.
     rules
-        By name, how to make each; when left out, those of `adaptune.model.RULES` with settings that
-        `tune` chooses again on the other sequences.
+        By name, how to make each. When left out, those of `adaptune.model.RULES`, of which
+        `PAIRED` is what has the least expected loss.
     progress
-        Called about every sequence.
+        Called about every fold.
     bank
         Number of a bank's members, or their trial numbers, the first of which counts as the fixed
         one. No bank is simulated with 0, nor without recorded motions.
@@ -186,42 +207,58 @@ def leave_one_out(
     Raises
     ------
     ValidationError
-        If there are fewer than two sequences.
+        If there are fewer than two folds.
     """
-    folds = data.folds()
-    if len(folds) < 2:
-        raise ValidationError(
-            "training: one sequence cannot be validated, for nothing remains to train on when it "
-            "is left out; add sequences"
-        )
-    left_out = []
-    for i, (sequence, others) in enumerate(folds):
+    by_recording = len(data.recordings) >= MIN_RECORDINGS
+    folds = data.folds(by_recording)
+    check_folds(data, folds)
+    parts: dict[str, list[LeftOut]] = {}
+    for i, (left_out, others) in enumerate(folds):
         progress(i, len(folds))
-        left_out.append(
-            leave_out(sequence, others, tuned_rules() if rules is None else rules, bank)
-        )
+        found = leave_out(left_out, others, rules, bank, by_recording)
+        parts.setdefault(found.name, []).append(found)
     progress(len(folds), len(folds))
-    return Validation(left_out, bool(bank) and data.sequences[0].simulation is not None)
+    has_bank = bool(bank) and data.sequences[0].simulation is not None
+    return Validation([joined(of) for of in parts.values()], has_bank)
 
 
-def tuned_rules() -> dict[str, Maker]:
-    """How to make each of `adaptune.model.RULES`, with settings chosen on what it is fitted on."""
+def check_folds(data: LabelledData, folds: Sequence[object]) -> None:
+    """Refuse to leave out what nothing remains of.
 
-    def paper(_: LabelledData) -> Rule:
-        return make_rule("paper", PairedSettings())
-
-    return {PAIRED: lambda data: make_rule(PAIRED, tune(data, MIN_OTHERS)), "paper": paper}
+    Raises
+    ------
+    ValidationError
+    """
+    if len(folds) > 1:
+        return
+    extent = data.sequences[0].extent
+    if extent is None:
+        raise ValidationError(
+            "training: one stretch cannot be validated, for nothing remains to train on when it is "
+            "left out; add recordings"
+        )
+    least = 2 * PER_STRETCH * extent.length
+    raise ValidationError(
+        f"training: there is one stretch only, or every stretch passes within "
+        f"{extent.length:g} m of all others, so nothing remains to train on when it is left out. "
+        f"Record {least:g} m or more that do not stay in one place, add recordings, or lower "
+        f"sub_trajectory (two stretches are {2 * PER_STRETCH} sub-trajectories)"
+    )
 
 
 def leave_out(
     sequence: LabelledSequence,
     others: LabelledData,
-    rules: Mapping[str, Maker],
+    rules: Mapping[str, Maker] | None,
     bank: int | Sequence[int],
+    by_recording: bool,
 ) -> LeftOut:
-    """Fit on the other sequences, and look up what happens on the one left out."""
+    """Fit on the others, and look up what happens on what is left out."""
     n_sets = len(others.sets)
     sequence, others = comparable(sequence, others)
+    if not isinstance(bank, int) and len(others.sets) < n_sets:
+        bank = len(bank)
+    bank = bank if sequence.simulation is not None else 0
     data, pca = others.training_data()
     features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)
@@ -231,30 +268,59 @@ def leave_out(
     baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
     errors, adapted = {"baseline": baseline, "fixed": fixed}, {}
     familiarity = np.full(len(first), np.nan)
+    chosen = None
+    if rules is None or bank:
+        chosen = choose(others, bank, by_recording, MOST_FOLDS, rules is None or PAIRED in rules)
+    if rules is None:
+        rules = _rules(chosen.one_set if chosen else PairedSettings())
     for name, make in rules.items():
         rule = make(others).fit(data)
         selections = [rule.select(features[i]) for i in first]
-        chosen = data.sets.columns([selection.trial for selection in selections])
-        errors[name] = capped[frames, chosen[period]]
+        selected = data.sets.columns([selection.trial for selection in selections])
+        errors[name] = capped[frames, selected[period]]
         adapted[name] = float(np.mean([selection.trial != data.fixed for selection in selections]))
         if not np.isnan(selections[0].familiarity):
             familiarity = np.array([selection.familiarity for selection in selections])
-    if bank and sequence.simulation is not None:
-        if not isinstance(bank, int) and len(data.sets) < n_sets:
-            bank = len(bank)
-        # Where the bank is not shown to pay, one set at a time is driven.
+    if bank and chosen is not None:
+        # Where a bank does not have the least loss, one set at a time is driven, or the fixed one.
         instead = errors.pop(PAIRED, fixed), adapted.pop(PAIRED, 0.0)
         if PAIRED in rules:
             errors[ONE_SET], adapted[ONE_SET] = instead
-        simulated = _simulate(sequence, others, data, pca, bank)
-        errors[PAIRED], adapted[PAIRED] = simulated or instead
-    errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
+        driven = _simulate(sequence, others, data, pca, chosen) if chosen.bank.adapt else instead
+        errors[PAIRED], adapted[PAIRED] = driven
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
-    errors["oracle, period"] = capped[frames, of_periods.argmin(axis=1)[period]]
+    errors |= _oracles(capped, of_periods[period])
     few = data.sets.columns(complementary(data, MOST_SETS))
     least = np.minimum.accumulate(of_periods[:, few], axis=1)[period].mean(axis=0)
     portfolio = least[np.minimum(np.arange(MOST_SETS), len(few) - 1)]
-    return LeftOut(sequence.name, errors, adapted, familiarity[period], portfolio, sequence.block)
+    return LeftOut(
+        sequence.name,
+        errors,
+        adapted,
+        familiarity[period],
+        portfolio,
+        sequence.block,
+        sequence.stretch,
+    )
+
+
+def _rules(one_set: PairedSettings) -> dict[str, Maker]:
+    """How to make each of `adaptune.model.RULES`."""
+    return {
+        PAIRED: lambda _: make_rule(PAIRED, one_set),
+        "paper": lambda _: make_rule("paper", PairedSettings()),
+    }
+
+
+def _oracles(
+    capped: NDArray[np.float64], of_periods: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Errors of the best set in hindsight, of a whole sequence and of each frame's period."""
+    frames = np.arange(len(capped))
+    return {
+        "oracle, sequence": capped[:, int(np.argmin(capped.mean(axis=0)))],
+        "oracle, period": capped[frames, of_periods.argmin(axis=1)],
+    }
 
 
 def _simulate(
@@ -262,16 +328,10 @@ def _simulate(
     others: LabelledData,
     data: TrainingData,
     pca: ScaledPCA,
-    bank: int | Sequence[int],
-) -> tuple[NDArray[np.float64], float] | None:
-    """A bank's errors on the sequence left out, and the weight that the fixed set did not have.
-
-    None if it was not shown to pay.
-    """
-    members = choose_bank(others, data.fixed, bank) if isinstance(bank, int) else bank
-    settings = tune_bank(others, members, data.fixed, MIN_OTHERS)
-    if not settings.adapt:
-        return None
-    near = bank_evidence(sequence, bank_data(others, data, members), pca, settings)
-    weights = weights_along(near, settings)
-    return bank_errors(sequence, weights), float(1.0 - weights.weights[:, 0].mean())
+    chosen: Policy,
+) -> tuple[NDArray[np.float64], float]:
+    """A bank's errors on what is left out, and the weight that the first member did not have."""
+    of_bank = bank_data(others, data, chosen.members)
+    near = bank_evidence(sequence, of_bank, pca, chosen.bank)
+    weights = weights_along(near, chosen.bank)
+    return bank_errors(sequence, near, chosen.bank), float(1.0 - weights.weights[:, 0].mean())

@@ -58,12 +58,12 @@ def draw_front(
 
 
 class LeftOutResults(NamedTuple):
-    """Results on the sequences that were left out of training."""
+    """Results on what was left out of training."""
 
-    # By mode, the ratio to the fixed set's error on each sequence.
+    # By mode, the ratio to the fixed set's error on each recording.
     ratios: Mapping[str, NDArray[np.float64]]
     sequences: Sequence[str]  # their names
-    # Of every frame; the gain is the ratio to the fixed set's error, of shape (n,).
+    # Of every stretch; the gain is the ratio to the fixed set's error, of shape (n,).
     familiarity: NDArray[np.float64]
     gain: NDArray[np.float64]
     portfolio: NDArray[np.float64]  # ratio if the best of 1, 2, ... sets were known
@@ -79,7 +79,7 @@ def draw_validation(path: Path, title: str, found: LeftOutResults) -> None:
     panels.append(_draw_sizes)
     width = max(6.0, 0.35 * len(found.sequences))
     with picture(as_png_and_svg(path), width + 4.5 * (len(panels) - 1), 5.5) as figure:
-        figure.suptitle(f"{title}: each sequence left out in turn", x=0.01, ha="left")
+        figure.suptitle(f"{title}: each part left out in turn", x=0.01, ha="left")
         parts = figure.subfigures(1, len(panels), width_ratios=[width, *[4.5] * (len(panels) - 1)])
         for part, draw in zip(np.atleast_1d(parts), panels, strict=True):
             axes = part.subplots()
@@ -105,18 +105,14 @@ def _draw_sequences(axes: Any, found: LeftOutResults) -> None:
 
 def _draw_familiarity(axes: Any, found: LeftOutResults) -> None:
     """Gain of `paired` over familiarity."""
-    known = ~np.isnan(found.familiarity)
-    familiarity, gain = found.familiarity[known], found.gain[known]
-    parts = [p for p in np.array_split(np.argsort(familiarity, kind="stable"), 10) if len(p)]
-    means = [np.exp(np.log(gain[p]).mean()) for p in parts]
-    mean = [familiarity[p].mean() for p in parts]
-    axes.plot(mean, means, label="paired, mean of a tenth of the frames", **POINTS["paired"])
+    label = "paired, each stretch"
+    axes.plot(found.familiarity, found.gain, label=label, **POINTS["paired"] | {"ls": ""})
     axes.set_xlabel("familiarity [-] (0: unlike all training)")
     axes.set_title("where scans are known and new")
 
 
 def _draw_sizes(axes: Any, found: LeftOutResults) -> None:
-    """Ratio over the number of sets, of members and of training sequences."""
+    """Ratio over the number of sets, of members and of training stretches."""
     from matplotlib.ticker import MaxNLocator
 
     sizes = np.arange(1, len(found.portfolio) + 1)
@@ -126,7 +122,7 @@ def _draw_sizes(axes: Any, found: LeftOutResults) -> None:
     fewer, number = "paired, trained on so many", ["sets"]
     for rows, column, counted, look, label in (
         (found.banks, "instances", "members", POINTS["paired"], "bank of so many members"),
-        (found.learning, "sequences", "training sequences", _FEWER, fewer),
+        (found.learning, "stretches", "training stretches", _FEWER, fewer),
     ):
         if rows:
             number.append(counted)
@@ -135,7 +131,7 @@ def _draw_sizes(axes: Any, found: LeftOutResults) -> None:
             most = max(most, float(middle.max()))
             x = [row[column] for row in rows]
             axes.errorbar(x, middle, error, capsize=3, label=label, **look)
-    # The interval of two sequences may reach to the sky.
+    # The interval of two stretches may reach to the sky.
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, 0.0), min(high, 2.0 * most))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

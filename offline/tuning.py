@@ -1,160 +1,279 @@
-"""Choice of a bank's members, and of the rules' settings, on the training sequences."""
+"""Choice of what is driven: the fixed set, one set at a time, or a bank, and with what settings.
 
-from collections.abc import Sequence
+All are compared by their expected loss on evidence that is left out, see `offline.expected_loss`.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from adaptune.metrics import cap
+from adaptune.metrics import cap, window_ends
 from adaptune.model import BankRule, BankSettings, PairedExpectedRatio, PairedSettings, TrainingData
 from adaptune.model.bank_weights import (
+    POOL,
     MemberWeights,
     NearProducts,
     bank_weights,
     choose_members,
     smooth_weights,
 )
-from adaptune.study.driven import MIN_SEQUENCES
+from adaptune.model.base import complementary, mean_errors
+from adaptune.sequence.names import origin
+from adaptune.study.driven import BANK, ONE_SET, RELIES_ON_LIVE
+from offline.expected_loss import Figures, expected_loss, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 if TYPE_CHECKING:
     from adaptune.descriptor.pca import ScaledPCA
 
-MIN_OTHERS = MIN_SEQUENCES - 1
-"""As many remain where one of them is left out: what holds for the study holds there, too."""
-NO_WORSE = 1.05
-"""Largest ratio to the fixed set's error that is allowed on a sequence left out."""
-TINY = 1e-6
-"""Percent, added to mean errors so that errors of zero can be compared."""
-SHARPNESS = (6.0, 12.0, 24.0, 48.0)
-"""`tune` chooses one of these; of equally good ones the first."""
-BANK_FRAMES = 1000
-"""Nearest frames of each sequence in a bank: products of errors need more frames than means do."""
-BANK_SETTINGS = [
-    [
-        BankSettings(sharpness=sharpness, min_fixed_share=share, clip=clip, n_frames=BANK_FRAMES)
-        for sharpness in (12.0, 48.0)
-        for share in (0.0, 0.25, 0.5)
-    ]
-    for clip in (6.0, 18.0)
+PAIRED_SETTINGS = [
+    PairedSettings(n_sets=n_sets, sharpness=sharpness)
+    for n_sets in (2, 3, 5)
+    for sharpness in (6.0, 12.0, 24.0, 48.0)
 ]
-"""`tune_bank` chooses one of these; the lists share their clip."""
+"""One set at a time is driven with one of these; of equally good ones the first."""
+BANK_FRAMES = 1000
+"""Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
+BANK_SETTINGS = [
+    BankSettings(sharpness=sharpness, min_fixed_share=share, clip=clip, n_frames=BANK_FRAMES)
+    for clip in (6.0, 18.0)
+    for sharpness in (12.0, 48.0)
+    for share in (0.0, 0.25, 0.5)
+]
+"""A bank is driven with one of these; of equally good ones the first."""
+MOST_FOLDS = 12
+"""So many folds at most compare ways to adapt where evidence is left out already."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
 NO_BANK = BankSettings(adapt=False)
 
-
-def interval_margin(logs: NDArray[np.float64]) -> float:
-    """Half of the 95 % interval of the mean, Student's."""
-    from scipy import stats
-
-    return float(stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs))
+Chooser = Callable[[LabelledData, int, int], list[int]]
+"""Chooses a bank's members on sequences, for a fixed set, so many."""
 
 
-def tune(data: LabelledData, fewest: int = MIN_SEQUENCES) -> PairedSettings:
-    """Choose the settings of the paired rule, leaving each of these sequences out in turn.
+class Policy(NamedTuple):
+    """What is driven."""
 
-    Among the settings with which the rule was nowhere worse than `NO_WORSE` times the fixed set,
-    the least geometric mean wins, if its 95 % interval lies below 1. If it does not, or no settings
-    are left, or there are fewer than `fewest` sequences, the rule does not adapt.
+    one_set: PairedSettings  # adapts if that has less expected loss than the fixed set
+    bank: BankSettings  # adapts if that has the least expected loss of all
+    members: list[int]  # of the bank; trial numbers, the fixed set's first
+    # By `BANK` and `ONE_SET`, what is expected with the best settings; empty where there is too
+    # little to compare.
+    expected: dict[str, Figures]
+
+
+def choose(
+    data: LabelledData,
+    bank: int | Sequence[int],
+    by_recording: bool | None = None,
+    most: int | None = None,
+    one_set: bool = True,
+    fixed: int | None = None,
+) -> Policy:
+    """Choose what is driven, leaving one recording or stretch after the other out.
 
     Parameters
     ----------
     data
-        The sequences that the rule will be fitted on, and no others.
-    fewest
-        `MIN_OTHERS` where one sequence of a study is left out.
+        What the rules will be fitted on, and nothing else.
+    bank
+        Number of a bank's members, or their trial numbers; no bank is considered with 0, nor
+        without recorded motions.
+    by_recording
+        See `LabelledData.folds`.
+    most
+        Number of folds at most, evenly chosen.
+    one_set
+        Whether one set at a time is considered.
+    fixed
+        Trial number of the fixed set, `LabelledData.fixed` by default.
     """
-    folds = data.folds()
-    if len(folds) < fewest:
-        return DO_NOT_ADAPT
+    folds = data.folds(by_recording)
+    if most is not None and len(folds) > most:
+        folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
+    fixed = data.fixed() if fixed is None else fixed
+    choosers = _choosers(bank) if _has_motions(data) else {}
+    banks = {way: make(data, fixed) for way, make in choosers.items()}
+    banks = {way: members for way, members in banks.items() if len(members) > 1}
+    members = next(iter(banks.values()), [])
+    recordings: list[str] = []
+    logs: list[NDArray[np.float64]] = []
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
-        best = _paying(np.array([_paired_logs(sequence, others) for sequence, others in folds]))
-    return DO_NOT_ADAPT if best is None else PairedSettings(sharpness=SHARPNESS[best])
+        for left_out, others in folds:
+            of_fold = _logs(left_out, others, {way: choosers[way] for way in banks}, one_set)
+            logs.append(of_fold)
+            recordings += [origin(left_out.name)] * len(of_fold)
+    if len(recordings) < 2 or not logs[0].shape[1]:
+        unknown = BankSettings(adapt=RELIES_ON_LIVE and len(members) > 1)
+        return Policy(DO_NOT_ADAPT, unknown, members, {})
+    return least_loss(np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0)
 
 
-def _paying(logs: NDArray[np.float64]) -> int | None:
-    """Of settings that are nowhere worse than `NO_WORSE` those with the least mean, if that pays.
+def least_loss(
+    logs: NDArray[np.float64],
+    recordings: Sequence[str],
+    banks: Mapping[str, list[int]],
+    n_single: int,
+) -> Policy:
+    """The settings with the least loss, of one set at a time and of a bank.
 
     Parameters
     ----------
     logs
-        Logarithms of ratios to the fixed set's error, of shape (n_sequences, n_settings).
+        Of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS)).
+    recordings
+        Of each stretch.
+    banks
+        By way to choose them, the members of each bank.
+    n_single
+        How many of the columns are about one set at a time.
     """
-    means = np.where(logs.max(axis=0) <= np.log(NO_WORSE), logs.mean(axis=0), np.inf)
-    best = int(np.argmin(means))
-    return best if means[best] + interval_margin(logs[:, best]) < 0.0 else None
+    losses = np.array([expected_loss(column, recordings) for column in logs.T])
+    expected: dict[str, Figures] = {}
+    one_set, bank, members = DO_NOT_ADAPT, NO_BANK, next(iter(banks.values()), [])
+    if n_single:
+        best = int(np.argmin(losses[:n_single]))
+        expected[ONE_SET] = figures(logs[:, best], recordings)
+        if losses[best] < 0.0:
+            one_set = PAIRED_SETTINGS[best]
+    if banks:
+        best = n_single + int(np.argmin(losses[n_single:]))
+        expected[BANK] = figures(logs[:, best], recordings)
+        way, which = divmod(best - n_single, len(BANK_SETTINGS))
+        members = list(banks.values())[way]
+        if losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
+            bank = BANK_SETTINGS[which]
+    return Policy(one_set, bank, members, expected)
 
 
-def _paired_logs(sequence: LabelledSequence, others: LabelledData) -> list[float]:
-    """With each of `SHARPNESS`, logarithm of the ratio to the fixed set's error."""
-    sequence, others = comparable(sequence, others)
+def _has_motions(data: LabelledData) -> bool:
+    return all(s.simulation is not None for s in data.sequences)
+
+
+def _choosers(bank: int | Sequence[int]) -> dict[str, Callable[[LabelledData, int], list[int]]]:
+    """By name, the ways to choose a bank's members."""
+    if not isinstance(bank, int):
+        named = list(bank)
+        return {"named": lambda *_: named}
+    if bank < 2:
+        return {}
+
+    def of_size(way: Chooser) -> Callable[[LabelledData, int], list[int]]:
+        return lambda data, fixed: way(data, fixed, bank)
+
+    return {name: of_size(way) for name, way in WAYS.items()}
+
+
+def _logs(
+    left_out: LabelledSequence,
+    others: LabelledData,
+    choosers: Mapping[str, Callable[[LabelledData, int], list[int]]],
+    one_set: bool,
+) -> NDArray[np.float64]:
+    """Logarithms of ratios to the fixed set's error, on a fold.
+
+    Returns
+    -------
+    ndarray of shape (n_stretches, n_ways)
+        First those of one set at a time with each of `PAIRED_SETTINGS`, then those of each bank
+        with each of `BANK_SETTINGS`.
+    """
+    left_out, others = comparable(left_out, others)
     data, pca = others.training_data()
-    rule = PairedExpectedRatio().fit(data)
-    first, period = periods(sequence.period)
-    near = rule.near(pca.transform(sequence.descriptors[first]))
-    capped = cap(sequence.errors)
-    fixed = capped[:, data.sets.column(data.fixed)].mean() + TINY
-    logs = []
-    for sharpness in SHARPNESS:
-        chosen = data.sets.columns(rule.choices(near, PairedSettings(sharpness=sharpness)))
-        errors = capped[np.arange(len(capped)), chosen[period]]
-        logs.append(float(np.log((errors.mean() + TINY) / fixed)))
-    return logs
+    fixed = cap(left_out.errors[:, data.sets.column(data.fixed)])
+    columns = []
+    if one_set:
+        columns += list(_paired_errors(left_out, data, pca))
+    known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
+    for make in choosers.values():
+        found = [trial for trial in make(others, data.fixed) if trial in data.sets]
+        # Whatever the order of the others is, they are the same bank.
+        members = (*found[:1], *sorted(found[1:]))
+        if members not in known and len(members) < 2:
+            known[members] = [fixed] * len(BANK_SETTINGS)
+        elif members not in known:
+            of_bank = bank_data(others, data, members)
+            known[members] = list(_bank_errors(left_out, of_bank, pca))
+        columns += known[members]
+    if not columns:
+        return np.empty((len(np.unique(left_out.stretch)), 0))
+    return np.stack([log_ratios(e, fixed, left_out.stretch) for e in columns], axis=1)
 
 
-def choose_bank(data: LabelledData, fixed: int, size: int) -> list[int]:
-    """Choose a bank's members, the fixed set first, see `choose_members`."""
-    vectors, errors = zip(*((s.vectors, s.errors) for s in data.sequences), strict=True)
+def _bank_errors(
+    left_out: LabelledSequence, of_bank: TrainingData, pca: "ScaledPCA"
+) -> Iterator[NDArray[np.float64]]:
+    """Capped errors of a bank with each of `BANK_SETTINGS`."""
+    near: dict[tuple[float, int], NearProducts] = {}
+    for settings in BANK_SETTINGS:
+        key = _evidence(settings)
+        if key not in near:
+            # Settings that share what is near follow each other: one at a time is kept.
+            near = {key: bank_evidence(left_out, of_bank, pca, settings)}
+        yield bank_errors(left_out, near[key], settings)
+
+
+def _evidence(settings: BankSettings) -> tuple[float, int]:
+    """The settings on which `bank_evidence` depends."""
+    return settings.clip, settings.n_frames
+
+
+def _paired_errors(
+    left_out: LabelledSequence, data: TrainingData, pca: "ScaledPCA"
+) -> Iterator[NDArray[np.float64]]:
+    """Capped errors of one set at a time with each of `PAIRED_SETTINGS`."""
+    most = max(settings.n_sets or 1 for settings in PAIRED_SETTINGS)
+    rule = PairedExpectedRatio(PairedSettings(n_sets=most)).fit(data)
+    first, period = periods(left_out.period)
+    near = rule.near(pca.transform(left_out.descriptors[first]))
+    capped = cap(left_out.errors)
+    for settings in PAIRED_SETTINGS:
+        # The complementary sets are chosen one after the other: the first of them are those of
+        # fewer sets.
+        few = near._replace(errors=near.errors[..., : settings.n_sets])
+        chosen = data.sets.columns(rule.choices(few, settings))
+        yield capped[np.arange(len(capped)), chosen[period]]
+
+
+def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
+    """Choose a bank's members, the fixed set first, whose errors cancel: see `choose_members`."""
+    vectors, errors = [], []
+    for s in data.sequences:
+        for number in np.unique(s.stretch):
+            frames = s.stretch == number
+            vectors.append({trial: of_trial[frames] for trial, of_trial in s.vectors.items()})
+            errors.append(s.errors[frames])
     return choose_members(vectors, errors, data.sets, fixed, size)
 
 
-def tune_bank(
-    data: LabelledData, members: Sequence[int], fixed: int, fewest: int = MIN_SEQUENCES
-) -> BankSettings:
-    """Choose how a bank's weights are found, leaving each of these sequences out in turn.
+def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int]:
+    """Choose a bank's members, the fixed set first, one of which does well at every frame.
 
-    The criterion is that of `tune`.
-
-    Parameters
-    ----------
-    data
-        See `tune`.
-    members
-        Trial numbers of the bank's members, chosen on these sequences; the first counts as the
-        fixed one.
-    fixed
-        Trial number of the fixed set, which the bank is compared with.
-    fewest
-        See `tune`.
+    They are sought among the best sets, see `complementary`. Where another one would lower nothing,
+    the best of the others fill the bank.
     """
-    folds = data.folds()
-    if len(folds) < fewest or len(members) < 2:
-        return NO_BANK
-    with threadpool_limits(1, "blas"):
-        logs = np.array([_bank_logs(one, others, members, fixed) for one, others in folds])
-    best = _paying(logs)
-    tried = [settings for of_clip in BANK_SETTINGS for settings in of_clip]
-    return NO_BANK if best is None else tried[best]
+    errors, number = np.concatenate([s.errors for s in data.sequences]), data.stretches()
+    means = mean_errors(errors, number)
+    best = [
+        data.sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf
+    ]
+    pool = [t for t in best if t != fixed and all(t in s.vectors for s in data.sequences)]
+    few = data.sets.subset([fixed, *pool])
+    columns = data.sets.columns(few.trials)
+    features = np.empty((len(errors), 0))
+    chosen = complementary(TrainingData(features, number, errors[:, columns], few, fixed), size)
+    return [*chosen, *(trial for trial in pool if trial not in chosen)][:size]
 
 
-def _bank_logs(
-    sequence: LabelledSequence, others: LabelledData, members: Sequence[int], fixed: int
-) -> list[float]:
-    """With each of `BANK_SETTINGS`, logarithm of the ratio to the fixed set's error."""
-    data, pca = others.training_data()
-    of_fixed = cap(sequence.errors[:, others.sets.column(fixed)]).mean() + TINY
-    data = bank_data(others, data, members)
-    logs = []
-    for of_clip in BANK_SETTINGS:
-        near = bank_evidence(sequence, data, pca, of_clip[0])
-        for settings in of_clip:
-            errors = bank_errors(sequence, weights_along(near, settings))
-            logs.append(float(np.log((errors.mean() + TINY) / of_fixed)))
-    return logs
+WAYS: dict[str, Chooser] = {
+    "cancelling": cancelling_members,
+    "complementary": complementary_members,
+}
+"""Ways to choose a bank's members."""
 
 
 def bank_data(others: LabelledData, data: TrainingData, members: Sequence[int]) -> TrainingData:
@@ -179,8 +298,43 @@ def weights_along(near: NearProducts, settings: BankSettings) -> MemberWeights:
     return MemberWeights(near.members, smooth_weights(weights, near.evidence.familiarity))
 
 
-def bank_errors(sequence: LabelledSequence, weights: MemberWeights) -> NDArray[np.float64]:
-    """Capped errors of a simulated bank on the frames that have a sub-trajectory."""
+def simulated(
+    sequence: LabelledSequence, near: NearProducts, settings: BankSettings
+) -> NDArray[np.float64]:
+    """Capped errors of a simulated bank at the frames of a simulation that have a sub-trajectory.
+
+    Parameters
+    ----------
+    sequence
+        The sequence, whose simulation is run from end to end.
+    near
+        See `bank_evidence`.
+    settings
+        Of the bank's weights.
+    """
+    return simulated_with(sequence, weights_along(near, settings))
+
+
+def simulated_with(sequence: LabelledSequence, weights: MemberWeights) -> NDArray[np.float64]:
+    """The same with weights that are given."""
     assert sequence.simulation is not None
     errors = sequence.simulation.errors(weights)
     return errors[~np.isnan(errors)]
+
+
+def bank_errors(
+    sequence: LabelledSequence, near: NearProducts, settings: BankSettings
+) -> NDArray[np.float64]:
+    """Capped errors of a simulated bank on the labelled frames."""
+    return on_labelled(sequence, simulated(sequence, near, settings))
+
+
+def on_labelled(sequence: LabelledSequence, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of the errors of a simulated bank, those on the labelled frames, of shape (n,)."""
+    simulation, extent = sequence.simulation, sequence.extent
+    if simulation is None or extent is None:
+        return errors
+    known = np.flatnonzero(window_ends(simulation.T_ref_sensor, simulation.length) >= 0)
+    of_frames = np.full(len(simulation.stamps), np.nan)
+    of_frames[known] = errors
+    return of_frames[extent.frames]

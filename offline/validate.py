@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from adaptune import report
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.paired import ERROR_FLOOR
 from adaptune.study.driven import Driven, driven
 from adaptune.study.inputs import check_model
 from offline.curves import bank_curve, learning_curve
@@ -54,31 +53,33 @@ def validate(
     ----------
     study
         A study that the offline stage has finished. Its folder receives ``validation`` (CSV, JSON
-        and pictures), and its model the summary.
+        and pictures) and ``stretches`` (CSV, JSON), and its model the summary.
     curve
-        Compute, too, what fewer training sequences would gain (``learning``).
+        Compute, too, what fewer training stretches would gain (``learning``).
     sizes
         Compute, too, what banks of other sizes would gain (``banks``).
     progress
-        Called about every sequence.
+        Called about every fold.
 
     Raises
     ------
     ModelError
         If there is no model yet, or it is not this study's.
     ValidationError
-        If there is only one training sequence.
+        If there is only one stretch.
     """
     model = _checked_model(study)
     data = _labelled(study, model)
     online = driven(study, model)
-    bank = _bank(study, model) if online.mechanism == "bank" else 0
+    considered = study.mechanism == "bank" and PAIRED in study.rules
+    bank = _bank(study, model) if considered else 0
     try:
-        validation = leave_one_out(data, None, partial(progress, "sequences left out"), bank)
+        validation = leave_one_out(data, None, partial(progress, "parts left out"), bank)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online.words}") from error
     rows = _rows(validation)
     report.write_rows(study.folder, "validation", rows)
+    report.write_rows(study.folder, "stretches", _stretch_rows(validation))
     learning = banks = []
     if curve:
         learning = learning_curve(data, progress=partial(progress, "learning curve"), bank=bank)
@@ -86,6 +87,19 @@ def validate(
     if sizes:
         banks = bank_curve(data, partial(progress, "sizes of banks"))
         report.write_rows(study.folder, "banks", banks)
+    _draw(study, validation, learning, banks)
+    summaries = {mode: validation.summary(mode) for mode in validation.modes}
+    replace(model, validation=summaries).save(study.model_path)
+    said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
+    return Validated(validation, rows, learning, banks, said)
+
+
+def _draw(
+    study: OfflineStudy,
+    validation: Validation,
+    learning: list[dict[str, Any]],
+    banks: list[dict[str, Any]],
+) -> None:
     draw_validation(
         study.folder / "validation.png",
         study.name,
@@ -98,10 +112,6 @@ def validate(
             banks,
         ),
     )
-    summaries = {mode: validation.summary(mode) for mode in validation.modes}
-    replace(model, validation=summaries).save(study.model_path)
-    said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
-    return Validated(validation, rows, learning, banks, said)
 
 
 def _bank(study: OfflineStudy, model: ErrorModel) -> int | list[int]:
@@ -120,7 +130,7 @@ def _rivalry(study: OfflineStudy, data: LabelledData) -> list[str]:
 def _verdicts(study: OfflineStudy, online: Driven, validation: Validation) -> list[str]:
     """What `adaptune online` will drive, then the estimate for it, then for what else it drives."""
     said = [online.words]
-    if online.mechanism is not None:
+    if "paired" in study.rules:
         said.append(validation.verdict(PAIRED))
     said.append(baseline_in_words(validation))
     if "paper" not in study.rules:
@@ -137,7 +147,7 @@ def baseline_in_words(validation: Validation) -> str:
     better = ": there the baseline is better" if s["high"] < 1.0 else ""
     return (
         f"The baseline has {s['geometric']:.2f} times the error of the sets that are chosen "
-        f"without each sequence, over {len(validation.left_out)} sequences left out (95 % interval "
+        f"without what is left out, over {len(validation.recordings)} stretches (95 % interval "
         f"{s['low']:.2f}-{s['high']:.2f}){better}."
     )
 
@@ -189,21 +199,32 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         of = {mode: float(validation.ratios[mode][i]) for mode in modes}
         add(sequence.name, sequence.errors["fixed"].mean(), of, sequence.interval(default))
     summaries = {mode: validation.summary(mode) for mode in modes}
-    for key in ("geometric", "arithmetic", "worst"):
+    for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         ends = summaries[default]["low"], summaries[default]["high"]
         of = {mode: summaries[mode][key] for mode in modes}
-        add(key, None, of, ends if key == "geometric" else None)
+        add(key.replace("_", " "), None, of, ends if key == "geometric" else None)
+    return rows
+
+
+def _stretch_rows(validation: Validation) -> list[dict[str, Any]]:
+    """Mean error of the fixed set, and ratios to it, on each stretch."""
+    logs = {mode: of for mode, of in validation.logs.items() if mode != "fixed"}
+    rows: list[dict[str, Any]] = []
+    for one in validation.left_out:
+        for number in np.unique(one.stretches):
+            fixed = one.errors["fixed"][one.stretches == number]
+            rows.append(
+                {"recording": one.name, "stretch": int(number), "fixed [%]": float(fixed.mean())}
+                | {mode: float(np.exp(of[len(rows)])) for mode, of in logs.items()}
+            )
     return rows
 
 
 def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Familiarity of every frame left out, and its error by the default rule over the fixed's."""
-    rule = validation.default
-    familiarity = np.concatenate([s.familiarity for s in validation.left_out])
-    ratio = np.concatenate(
-        [
-            (s.errors[rule] + ERROR_FLOOR) / (s.errors["fixed"] + ERROR_FLOOR)
-            for s in validation.left_out
-        ]
-    )
-    return familiarity, ratio
+    """Mean familiarity of every stretch left out, and its ratio to the fixed set's error."""
+    familiarity = [
+        s.familiarity[s.stretches == number].mean()
+        for s in validation.left_out
+        for number in np.unique(s.stretches)
+    ]
+    return np.array(familiarity), np.exp(validation.logs[validation.default])

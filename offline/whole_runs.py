@@ -1,9 +1,10 @@
 """Whole runs: the sets that may become the fixed one, driven as `adaptune online` drives them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.odometry.health import HealthCheck
@@ -69,6 +70,13 @@ def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, 
         name: {n: weighted(config.objective[0], of_sequence[n].metrics) for n in feasible}
         for name, of_sequence in runs.items()
     }
+
+
+def whole_errors(
+    archive: Archive, name: str, numbers: Iterable[int], frames: NDArray[np.intp]
+) -> dict[int, NDArray[np.float64]]:
+    """Errors in whole runs on some frames, by trial number, each of shape (n,)."""
+    return {n: archive.read(name, n, whole=True).errors[frames] for n in numbers}
 
 
 def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:

@@ -24,7 +24,7 @@ from adaptune.model.model_file import (
 from adaptune.model.paired import PairedSettings
 from adaptune.parameter_sets import ParameterSets
 from adaptune.plain_words import in_one_line
-from adaptune.sequence.names import places
+from adaptune.sequence.names import places, stretch_numbers
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ SAME_SENSOR = 3.0
 _TYPES = {
     "descriptors": ("<u2", "<f4"),
     "sequence": ("<u4",),
+    "stretch": ("<u4",),
     "errors": ("<f4",),
     "vectors": ("<f4",),
 }
@@ -61,6 +62,7 @@ class _Header(BaseModel):
     bank: list[int]
     bank_settings: BankSettings
     provenance: dict[str, Any]
+    expected: dict[str, dict[str, float]]
     validation: dict[str, Any]
 
 
@@ -92,6 +94,9 @@ class ErrorModel:
         float32 percent, infinite where the track was lost, NaN where the set was not run.
     provenance : dict
         Where the model comes from, for people.
+    stretch : ndarray of shape (n_frames,), optional
+        Number of each frame's stretch in its recording, the same in a view of it; by default each
+        recording is one stretch.
     bank : list of int, optional
         Trial numbers of the sets whose errors cancel each other best, the fixed one first, see
         `adaptune.model.bank_weights.choose_members`; empty if there is no bank.
@@ -104,6 +109,9 @@ class ErrorModel:
         Of the paired rule, chosen on the training sequences.
     bank_settings : BankSettings
         Of the bank's weights, chosen on the training sequences.
+    expected : dict
+        By name of a way to adapt (`BANK`, `ONE_SET`) what was expected of it when it was chosen,
+        see `offline.expected_loss.Figures`; empty where too little is known to compare.
     validation : dict
         By selection rule what `adaptune validate` found, for people; empty before.
     """
@@ -119,12 +127,18 @@ class ErrorModel:
     sequence: NDArray[np.intp]
     errors: NDArray[np.float32]
     provenance: dict[str, Any]
+    stretch: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     bank: list[int] = field(default_factory=list)
     vectors: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
     elevations: list[float] = field(default_factory=list)
     paired: PairedSettings = field(default_factory=PairedSettings)
     bank_settings: BankSettings = field(default_factory=BankSettings)
+    expected: dict[str, dict[str, float]] = field(default_factory=dict)
     validation: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not len(self.stretch):
+            object.__setattr__(self, "stretch", np.zeros(len(self.sequence), np.intp))
 
     @property
     def bank_adapts(self) -> bool:
@@ -136,6 +150,10 @@ class ErrorModel:
         from adaptune.descriptor.pca import ScaledPCA  # not needed to load a model
 
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
+
+    def stretches(self) -> NDArray[np.intp]:
+        """Number of every frame's stretch among all of the model, of shape (n_frames,)."""
+        return stretch_numbers(places(self.sequences)[self.sequence], self.stretch)
 
     def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
         """What selection rules are fitted to.
@@ -155,7 +173,7 @@ class ErrorModel:
         """
         data = TrainingData(
             pca.transform(self.descriptors),
-            places(self.sequences)[self.sequence],
+            self.stretches(),
             self.errors,
             self.sets,
             self.fixed,
@@ -173,21 +191,22 @@ class ErrorModel:
     def thinned(self, max_frames: int | None) -> Self:
         """Keep fewer frames, so that a selection costs less.
 
-        Each sequence keeps its share, at least one frame, evenly in time: so mean errors stay what
+        Each stretch keeps its share, at least one frame, evenly in time: so mean errors stay what
         they are. (Frames that cover what all of them look like would be rare ones.) The paired rule
         and the bank then use as much fewer near frames.
 
         Parameters
         ----------
         max_frames
-            Number of frames over all sequences, but one of each at least; all if None.
+            Number of frames over all sequences, but one of each stretch at least; all if None.
         """
         n_frames = len(self.sequence)
         if max_frames is None or n_frames <= max_frames:
             return self
         kept = []
-        for s in np.unique(self.sequence):
-            members = np.flatnonzero(self.sequence == s)
+        number = stretch_numbers(self.sequence, self.stretch)
+        for s in np.unique(number):
+            members = np.flatnonzero(number == s)
             share = max(1, max_frames * len(members) // n_frames)
             kept.append(members[(2 * np.arange(share) + 1) * len(members) // (2 * share)])
         frames = np.sort(np.concatenate(kept))
@@ -202,6 +221,7 @@ class ErrorModel:
             bank_settings=self.bank_settings.model_copy(update=fewer(self.bank_settings.n_frames)),
             descriptors=self.descriptors[frames],
             sequence=self.sequence[frames],
+            stretch=self.stretch[frames],
             errors=self.errors[frames],
             vectors=self.vectors[frames] if self.bank else self.vectors,
         )
@@ -290,6 +310,7 @@ class ErrorModel:
         return {
             "descriptors": np.ascontiguousarray(compact(self.descriptors)),
             "sequence": self.sequence.astype(np.uint32),
+            "stretch": self.stretch.astype(np.uint32),
             "errors": np.ascontiguousarray(self.errors, np.float32),
             "vectors": np.ascontiguousarray(self.vectors, np.float32),
         }
@@ -318,7 +339,11 @@ class ErrorModel:
 
     def save(self, path: Path | str) -> None:
         """Write the model to one file, in the safetensors format. Numbers keep all their bits."""
-        about = {"provenance": self.provenance, "validation": self.validation}
+        about = {
+            "provenance": self.provenance,
+            "expected": self.expected,
+            "validation": self.validation,
+        }
         write_model_file(Path(path), self._header() | about, self._arrays())
 
     @classmethod
@@ -337,7 +362,8 @@ class ErrorModel:
             space = ParameterSpace.load(header.pop("space"))
             sets = ParameterSets(space, tuple(header.pop("trials")), tuple(header.pop("sets")))
             arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
-            arrays["sequence"] = arrays["sequence"].astype(np.intp)
+            for numbers in ("sequence", "stretch"):
+                arrays[numbers] = arrays[numbers].astype(np.intp)
             model = cls(sets=sets, **header, **arrays)
             model.check()
         except FileNotFoundError as error:
@@ -360,8 +386,10 @@ class ErrorModel:
         n_frames, n_sets = self.errors.shape
         if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
             raise ValueError("the errors are not of as many frames as the descriptors")
-        if self.sequence.shape != (n_frames,):
-            raise ValueError("the errors are not of as many frames as the sequence numbers")
+        if not self.sequence.shape == self.stretch.shape == (n_frames,):
+            raise ValueError(
+                "the errors are not of as many frames as the sequence and stretch numbers"
+            )
         if not n_frames or len(self.sets) != n_sets or self.fixed not in self.sets:
             raise ValueError("errors and parameter sets do not go together")
         if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):

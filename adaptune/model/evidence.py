@@ -57,7 +57,10 @@ class Evidence(NamedTuple):
         """
         means = np.empty((*self.squared.shape, *values.shape[1:]))
         for s, frames in enumerate(self.frames):
-            means[:, s] = values[frames].mean(axis=1, dtype=np.float64)
+            # All frames are near to every scan: the mean is the same.
+            same = frames.strides[0] == 0
+            of = values[frames[:1]] if same else values[frames]
+            means[:, s] = of.mean(axis=1, dtype=np.float64)
         return means
 
 
@@ -141,6 +144,7 @@ def _nearest(
 
     squared = cdist(queries, features, "sqeuclidean")
     if n >= len(features):
-        return squared.mean(axis=1), np.tile(np.arange(len(features)), (len(queries), 1))
+        everything = np.broadcast_to(np.arange(len(features)), squared.shape)
+        return squared.mean(axis=1), everything
     nearest = np.argpartition(squared, n - 1, axis=1)[:, :n]
     return np.take_along_axis(squared, nearest, axis=1).mean(axis=1), nearest

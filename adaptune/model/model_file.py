@@ -16,7 +16,7 @@ from adaptune import __version__
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 
-FORMAT = 5
+FORMAT = 6
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 DAMAGED = (SafetensorError, ValueError, TypeError, KeyError, OverflowError)

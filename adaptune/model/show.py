@@ -53,14 +53,14 @@ def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
     """What is selected along the way."""
     paired, bank = model.paired, model.bank_settings
     if not paired.adapt:
-        yield Text("One set at a time: it was not shown to pay; `paired` keeps the fixed set.")
+        yield Text("One set at a time: no less expected loss; `paired` does not use it.")
     else:
         n = "all" if paired.n_sets is None else str(paired.n_sets)
         yield Text(f"One set at a time: `paired` chooses among {n} sets.")
     if not model.bank:
         return
     if not bank.adapt:
-        yield Text("Bank: it was not shown to pay, and `paired` does not use it.")
+        yield Text("Bank: it has not the least expected loss, and `paired` does not use it.")
         return
     share = 100 * bank.min_fixed_share
     yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
@@ -95,10 +95,8 @@ def _words(value: Any) -> str:
 
 def _validation(model: ErrorModel) -> list[RenderableType]:
     """Numbers in a table, and the rest in words."""
-    if len(model.sequences) < 2:
-        return [Text("One training sequence cannot show whether adapting pays elsewhere.")]
     if not model.validation:
-        return [Text("Not validated yet: `adaptune validate` shows whether adapting pays.")]
+        return [Text("Not validated yet: `adaptune validate` shows what adapting gains.")]
     found = {
         rule: of_rule if isinstance(of_rule, Mapping) else {"found": of_rule}
         for rule, of_rule in model.validation.items()
@@ -108,7 +106,7 @@ def _validation(model: ErrorModel) -> list[RenderableType]:
     rows = [
         {"rule": rule} | {k: of_rule.get(k) for k in numbers} for rule, of_rule in found.items()
     ]
-    caption = "Ratios to the fixed set's error, each sequence left out; low, high: 95 % interval."
+    caption = "Ratios to the fixed set's error on what is left out; low, high: 95 % interval."
     made: list[RenderableType] = [report.table("Validation", rows, caption)] if numbers else []
     for rule, of_rule in found.items():
         rest = {key: value for key, value in of_rule.items() if key not in numbers}

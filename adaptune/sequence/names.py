@@ -18,3 +18,17 @@ def places(names: Sequence[str]) -> NDArray[np.intp]:
     """Number the places of sequences, of shape (n,): a view has the place of its origin."""
     number = {place: i for i, place in enumerate(dict.fromkeys(map(origin, names)))}
     return np.array([number[origin(name)] for name in names], np.intp)
+
+
+def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Number stretches of all places from 0 on, of shape (n_frames,).
+
+    Parameters
+    ----------
+    place
+        Number of each frame's place, of shape (n_frames,).
+    stretch
+        Number of its stretch there, of shape (n_frames,).
+    """
+    _, number = np.unique(np.stack([place, stretch], axis=1), axis=0, return_inverse=True)
+    return np.asarray(number.ravel())

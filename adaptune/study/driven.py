@@ -1,18 +1,25 @@
 """What `adaptune online` drives with a model, in the mode `paired`."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.sequence.names import origin
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import Mechanism, Study
 
-MIN_SEQUENCES = 6
-"""With fewer training sequences, a rule does not adapt: they say too little about other places."""
+PER_STRETCH = 4
+"""Sub-trajectories of a stretch, the unit of evidence."""
+MIN_RECORDINGS = 6
+"""With as many, whole recordings are left out; with fewer, stretches of them."""
+BANK, ONE_SET = "bank", "one set"
+"""Names of the ways to adapt."""
+RELIES_ON_LIVE = False
+"""Whether a bank adapts where too little is known to compare it: only if it measures the errors of
+its members while it drives."""
 
 
 class ModeError(AdaptuneError):
@@ -58,17 +65,59 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     if mechanism == "bank":
         members = ", ".join(map(str, bank_members(study.config.online.switching, model)))
         words = f"`online` will drive the bank of trials {members} as `paired`."
+        if not model.expected:
+            words += f" {_too_little(model)}: the bank relies on what it measures while it drives."
         return Driven("bank", words, paper)
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
         words = f"`online` will drive one set at a time as `paired`, {how}."
         return Driven(mechanism, words, paper)
-    if (n := len({origin(name) for name in model.sequences})) < MIN_SEQUENCES:
-        are = "is one" if n == 1 else f"are {n}"
-        why = f"adapting takes {MIN_SEQUENCES} training sequences, and there {are}"
+    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
+    known = [way for way in ways if way in model.expected]
+    if known:
+        way = min(known, key=lambda way: model.expected[way]["loss"])
+        best = "a bank" if way == BANK else "one set at a time"
+        why = (
+            f"it has the least expected loss; the best alternative is {best}: "
+            f"{expected_in_words(model.expected[way])}"
+        )
     else:
-        why = "leaving out one training sequence after the other did not show that adapting pays"
+        why = _too_little(model)
     return Driven(None, f"{fixed} as `paired`, because {why}.", paper)
+
+
+def _too_little(model: ErrorModel) -> str:
+    return (
+        f"there is too little to compare ways to adapt, which takes {metres_to_compare(model):g} m "
+        f"of recordings, or a smaller sub_trajectory"
+    )
+
+
+def metres_to_compare(model: ErrorModel) -> float:
+    """Metres of recordings that hold two stretches: one is left out, the other trained on."""
+    return 2 * PER_STRETCH * model.length
+
+
+def expected_in_words(expected: Mapping[str, float]) -> str:
+    """What a way to adapt is expected to gain, what it rests on, and how far that reaches.
+
+    Parameters
+    ----------
+    expected
+        See `offline.expected_loss.Figures`.
+    """
+    gain, low, high = (100.0 * (1.0 - expected[key]) for key in ("geometric", "high", "low"))
+    stretches, recordings = int(expected["n_stretches"]), int(expected["n_recordings"])
+    if recordings >= MIN_RECORDINGS:
+        reach = "in other recordings"
+    else:
+        reach = f"elsewhere along {'this recording' if recordings == 1 else 'these recordings'}"
+    of = "one recording" if recordings == 1 else f"{recordings} recordings"
+    return (
+        f"expected gain {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %), in the worst tenth "
+        f"{expected['worst_tenth']:.2f} times the fixed set's error, {reach} "
+        f"({stretches} stretches of {of})"
+    )
 
 
 def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool) -> Mechanism:

@@ -80,10 +80,10 @@ def test_modes_with_equal_errors_are_all_seen(tmp_path):
 def test_curves_are_explained_where_they_are_drawn(tmp_path):
     path = tmp_path / "validation.png"
     found = results(["fixed", "paired"], familiarity=np.full(50, np.nan))
-    found = found._replace(banks=rows("instances", (2, 3)), learning=rows("sequences", (3, 5)))
+    found = found._replace(banks=rows("instances", (2, 3)), learning=rows("stretches", (3, 5)))
     draw_validation(path, "study", found)
     said = texts(path)
-    assert "number of sets, or members, or training sequences [-]" in said
+    assert "number of sets, or members, or training stretches [-]" in said
     assert {"bank of so many members", "paired, trained on so many"} <= set(said)
     assert not [text for text in said if "familiarity" in text]
 
@@ -96,7 +96,7 @@ def test_familiarity_is_not_drawn_where_nothing_adapts(tmp_path):
 
 
 def test_wide_intervals_do_not_shrink_the_rest(tmp_path):
-    wide = [row | {"low": 1e-6, "high": 1e6} for row in rows("sequences", (1, 2))]
+    wide = [row | {"low": 1e-6, "high": 1e6} for row in rows("stretches", (1, 2))]
     draw_validation(tmp_path / "v.png", "study", results(["fixed", "paired"], learning=wide))
     assert max(float(t) for t in texts(tmp_path / "v.png") if t.replace(".", "").isdigit()) < 100
 

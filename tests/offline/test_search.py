@@ -233,7 +233,8 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
         assert sequence.own.tolist() == [
             owner_of(archive, n) == sequence.name for n in complete.sets
         ]
-    validation = leave_one_out(complete)
+    # These trials have errors without motions.
+    validation = leave_one_out(complete, bank=0)
     for left_out in validation.left_out:
         known = [
             archive.finished(left_out.name)[n].mean_error

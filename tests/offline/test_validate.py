@@ -16,5 +16,5 @@ def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better)
         for i, e in enumerate(errors)
     ]
     said = baseline_in_words(Validation(left_out))
-    assert " times the error of the sets that are chosen without each sequence, over 2 " in said
+    assert " times the error of the sets that are chosen without what is left out, over 2 " in said
     assert said.endswith("): there the baseline is better.") == better

@@ -157,7 +157,10 @@ def test_a_bank_is_shown(model, tmp_path):
     assert "Bank" not in shown(model, tmp_path)
     vectors = np.zeros((4, 2, 3), np.float32)
     for settings, said in (
-        (BankSettings(adapt=False), "it was not shown to pay, and `paired` does not use it."),
+        (
+            BankSettings(adapt=False),
+            "it has not the least expected loss, and `paired` does not use it.",
+        ),
         (BankSettings(min_fixed_share=0.25), "has 25 % of the weight at least"),
     ):
         of_two = dataclasses.replace(model, bank=[0, 2], vectors=vectors, bank_settings=settings)

@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptune.model.paired import ERROR_FLOOR
+from offline.expected_loss import (
+    expected_loss,
+    figures,
+    interval_of,
+    log_ratios,
+    standard_error,
+    worst_tenth,
+)
+
+logs = st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=30).map(np.array)
+
+
+def alone(values):
+    """Each stretch is a recording."""
+    return [str(i) for i in range(len(values))]
+
+
+def test_the_fixed_set_has_no_loss():
+    for n in (1, 2, 30):
+        assert expected_loss(np.zeros(n), alone(range(n))) == 0.0
+
+
+def test_one_stretch_shows_nothing():
+    assert expected_loss(np.array([-1.0]), ["one"]) == np.inf
+
+
+@given(logs, st.floats(0.01, 2.0))
+def test_what_is_worse_everywhere_has_more_loss(values, by):
+    assert expected_loss(values + by, alone(values)) > expected_loss(values, alone(values)) - 1e-9
+
+
+@given(logs)
+def test_loss_is_the_mean_and_what_may_go_wrong(values):
+    loss = expected_loss(values, alone(values))
+    if values.any():
+        assert loss >= values.mean()
+        risk = 0.5 * max(0.0, worst_tenth(values))
+        assert loss == pytest.approx(values.mean() + risk + standard_error(values, alone(values)))
+
+
+def test_one_disaster_outweighs_small_gains():
+    values = np.full(24, -0.05)
+    assert expected_loss(values, alone(values)) < 0.0
+    values[7] = np.log(10.0)
+    assert values.mean() < 0.06
+    assert expected_loss(values, alone(values)) > 0.5
+    # A small harm does not outweigh what is gained elsewhere.
+    values = np.full(24, -0.5)
+    values[7] = np.log(1.2)
+    assert expected_loss(values, alone(values)) < 0.0
+
+
+def test_the_worst_tenth_counts_parts_of_stretches():
+    values = np.arange(24.0)[::-1]
+    assert worst_tenth(values) == pytest.approx((23.0 + 22.0 + 0.4 * 21.0) / 2.4)
+    assert worst_tenth(values[:5]) == 23.0
+
+
+def test_stretches_of_a_recording_are_not_taken_for_independent():
+    # Six recordings, each of whose stretches are alike.
+    of_recordings = np.array([-0.5, -0.2, -0.4, 0.1, -0.3, -0.1])
+    names = [str(i) for i in range(6)]
+    one = standard_error(of_recordings, names)
+    assert one == pytest.approx(of_recordings.std(ddof=1) / np.sqrt(6))
+    repeated = np.repeat(of_recordings, 4), np.repeat(names, 4).tolist()
+    assert standard_error(*repeated) == pytest.approx(one)
+    assert interval_of(*repeated) == pytest.approx(interval_of(of_recordings, names))
+
+
+def test_few_recordings_are_resampled_in_blocks():
+    rng = np.random.default_rng(0)
+    drawn = [rng.normal(0.0, 1.0, 8) for _ in range(200)]
+    errors = [standard_error(values, ["a"] * 4 + ["b"] * 4) for values in drawn]
+    # On average it is that of the mean of eight independent values.
+    assert np.mean(errors) == pytest.approx(1.0 / np.sqrt(8), rel=0.15)
+    # Neighbours that agree count as less.
+    alike = np.repeat([1.0, -1.0, 1.0, -1.0], 2)
+    apart = np.tile([1.0, -1.0], 4)
+    assert standard_error(alike, ["a"] * 8) > 2.0 * standard_error(apart, ["a"] * 8)
+    assert standard_error(alike, ["a"] * 8) == standard_error(alike, ["a"] * 8)
+
+
+def test_ratios_are_of_mean_errors_on_each_stretch():
+    errors, fixed = np.array([1.0, 3.0, 5.0]), np.array([4.0, 4.0, 1.0])
+    found = np.exp(log_ratios(errors, fixed, np.array([3, 3, 7])))
+    expected = [
+        (2.0 + ERROR_FLOOR) / (4.0 + ERROR_FLOOR),
+        (5.0 + ERROR_FLOOR) / (1.0 + ERROR_FLOOR),
+    ]
+    np.testing.assert_allclose(found, expected)
+
+
+def test_figures_hold_together():
+    values = np.log([0.5, 0.6, 0.7, 1.5, 0.8, 0.5, 0.9])
+    found = figures(values, alone(values))
+    assert found.low < found.geometric < found.high < found.worst
+    assert found.worst == found.worst_tenth == pytest.approx(1.5)
+    assert (found.n_stretches, found.n_recordings) == (7, 7)
+    assert found.loss == expected_loss(values, alone(values))

@@ -1,0 +1,194 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from labelled_places import in_stretches, labelled, with_motions
+
+from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
+from offline.labelled import LabelledSequence
+from offline.stretches import PER_STRETCH, Extent, cut, stretches_of_view
+from offline.tuning import on_labelled
+
+LENGTH = 10.0
+
+
+def poses(steps, turns):
+    """Poses along a plane path."""
+    heading = np.cumsum(turns)
+    T = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
+    T[1:, 0, 3] = np.cumsum(steps * np.cos(heading))
+    T[1:, 1, 3] = np.cumsum(steps * np.sin(heading))
+    return T
+
+
+def extent_of(T):
+    return Extent.of(T, window_ends(T, LENGTH) >= 0, LENGTH)
+
+
+def any_path(seed):
+    """A path that winds, and on which the robot stands for a while."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(30, 900))
+    steps = rng.uniform(0.0, 1.0, n)
+    at = int(rng.integers(0, n))
+    steps[at : at + int(rng.integers(0, 50))] = 0.0
+    return poses(steps, rng.normal(0.0, 0.1, n))
+
+
+paths = st.integers(0, 2**32 - 1).map(any_path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(paths)
+def test_stretches_share_out_the_frames(T):
+    extent = extent_of(T)
+    numbers = cut(T, extent)
+    assert numbers.shape == extent.frames.shape
+    if not len(numbers):
+        return
+    assert numbers[0] == 0
+    assert set(np.diff(numbers)) <= {0, 1}
+    distance = travelled(T)[extent.frames]
+    size = PER_STRETCH * LENGTH
+    of_stretches = [np.ptp(distance[numbers == n]) for n in np.unique(numbers)]
+    # All but the last are as long as they should be, within a step; that is half as long at least,
+    # unless it is the only one.
+    assert all(size - 2.0 <= length <= size for length in of_stretches[:-1])
+    if len(of_stretches) > 1:
+        assert 0.5 * size - 2.0 <= of_stretches[-1] <= 1.5 * size
+    else:
+        assert of_stretches[0] <= 1.5 * size
+
+
+@settings(max_examples=60, deadline=None)
+@given(paths, st.integers(0, 9))
+def test_nothing_that_is_known_comes_near_to_what_is_left_out(T, which):
+    extent = extent_of(T)
+    if not len(extent.frames):
+        return
+    numbers = cut(T, extent)
+    left = extent.some(numbers == which % (numbers.max() + 1))
+    kept = extent.some(~extent.near(left, is_view=False))
+    # Sub-trajectories that begin where the other ends have a frame in common.
+    first, last = left.frames.min(), left.ends.max()
+    assert not ((kept.frames <= last) & (kept.ends >= first)).any()
+    apart = np.linalg.norm(kept.positions[:, None] - left.positions[None], axis=-1)
+    assert (apart > LENGTH).all()
+    # Nothing else is dropped.
+    dropped = extent.some(extent.near(left, is_view=False))
+    apart = np.linalg.norm(dropped.positions[:, None] - left.positions[None], axis=-1).min(axis=1)
+    overlaps = (dropped.frames <= last) & (dropped.ends >= first)
+    assert (overlaps | (apart <= LENGTH)).all()
+
+
+def test_a_second_visit_is_not_known():
+    there = np.full(200, 0.5)
+    turns = np.zeros(400)
+    turns[200] = np.pi
+    T = poses(np.concatenate([there, there]), turns)  # 100 m there, and back
+    extent = extent_of(T)
+    numbers = cut(T, extent)
+    assert numbers.max() + 1 == 5
+    kept = extent.some(~extent.near(extent.some(numbers == 0), is_view=False))
+    assert kept.positions[:, 0].min() > 40.0 + LENGTH - 1.0
+    assert len(kept.frames)
+
+
+def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
+    T = poses(np.full(400, 0.5), np.zeros(400))
+    recording, view = extent_of(T), extent_of(T[::-1])
+    numbers = cut(T, recording)
+    of_view = stretches_of_view(view, recording, numbers)
+    at = np.linspace(11.0, 189.0, 30)
+    for x in at:
+        frame = np.abs(recording.positions[:, 0] - x).argmin()
+        same = np.abs(view.positions[:, 0] - x).argmin()
+        assert of_view[same] == numbers[frame]
+    left = recording.some(numbers == 2)
+    kept = view.some(~view.near(left, is_view=True))
+    first, last = left.positions[:, 0].min(), left.end_positions[:, 0].max()
+    # It goes from its start back to its end.
+    assert ((kept.positions[:, 0] < first) | (kept.end_positions[:, 0] > last - LENGTH)).all()
+    assert len(kept.frames)
+
+
+def test_a_part_of_a_simulation_is_that_of_its_stretch():
+    rng = np.random.default_rng(3)
+    one = in_stretches(with_motions("one", rng, 700))
+    for number in np.unique(one.cuts):
+        left = one.left_out(int(number))
+        assert len(left.simulation.stamps) < 400
+        known = window_ends(left.simulation.T_ref_sensor, left.simulation.length) >= 0
+        # The errors of a bank of one are those of the set.
+        T = np.tile(np.eye(4), (len(left.simulation.stamps), 1, 1))
+        for i, step in enumerate(left.simulation.motions((3,))[:, 0]):
+            T[i + 1] = T[i] @ step
+        of_frames = np.linalg.norm(left.vectors[3], axis=1)
+        errors = sub_trajectory_rte(left.simulation.T_ref_sensor, T, 10.0)[known]
+        np.testing.assert_allclose(on_labelled(left, errors), of_frames, rtol=1e-4)
+
+
+def test_with_six_recordings_whole_ones_are_left_out():
+    rng = np.random.default_rng(3)
+    sequences = [in_stretches(with_motions(f"s{i}", rng, 500)) for i in range(6)]
+    assert len(labelled(sequences).folds()) == 6
+    for left, others in labelled(sequences).folds():
+        assert [s.name for s in others.sequences] == [
+            f"s{i}" for i in range(6) if f"s{i}" != left.name
+        ]
+        assert len(np.unique(others.stretches())) == 5 * 3
+    folds = labelled(sequences[:5]).folds()
+    assert len(folds) == 5 * 3
+    for left, others in folds:
+        assert [s.name for s in others.sequences] == [f"s{i}" for i in range(5)]
+        (same,) = [s for s in others.sequences if s.name == left.name]
+        assert not set(np.unique(left.stretch)) & set(np.unique(same.stretch))
+
+
+def test_a_stretch_takes_its_part_of_everything():
+    one = in_stretches(with_motions("one", np.random.default_rng(3), 500))
+    n = len(one.errors)
+    whole_errors = {0: np.linspace(0.0, 1.0, n), 3: np.full(n, 50.0)}
+    one = replace(
+        one,
+        baseline=np.arange(n, dtype=float),
+        values=np.ones(5),
+        repeats=np.ones((5, 3)),
+        whole={0: 0.5, 3: 30.0},
+        whole_errors=whole_errors,
+        by_frames=True,
+    )
+    kept = one.stretch == 1
+    some = one.frames(kept)
+    assert some.whole == {0: pytest.approx(whole_errors[0][kept].mean()), 3: 30.0}
+    # The objective follows from the errors.
+    assert some.values is None
+    assert some.repeats is None
+    assert len(some.baseline) == len(some.period) == len(some.errors) == kept.sum()
+    assert {len(of) for of in some.vectors.values()} == {kept.sum()}
+    other = replace(one, by_frames=False).frames(kept)
+    assert (other.whole, len(other.values)) == (one.whole, 5)
+    assert one.frames(np.ones(n, bool)) is one
+    cut_again = some.frames(np.arange(kept.sum()) < 5)
+    np.testing.assert_array_equal(cut_again.extent.frames, np.flatnonzero(kept)[:5])
+
+
+def test_without_an_extent_a_sequence_is_one_stretch():
+    plain = LabelledSequence("a", np.zeros(4, int), np.zeros((4, 9)), np.ones((4, 5), np.float32))
+    assert plain.stretch.tolist() == [0] * 4
+    assert labelled([plain]).folds() == []
+    folds = labelled([plain, replace(plain, name="b"), replace(plain, name="a+noise")]).folds()
+    names = [[s.name for s in others.sequences] for _, others in folds]
+    assert names == [["b"], ["a", "a+noise"]]
+
+
+def test_stretches_are_drawn_with_their_views():
+    rng = np.random.default_rng(3)
+    one = in_stretches(with_motions("one", rng, 700))
+    data = labelled([one, replace(one, name="one+noise")])
+    some = data.drawn(2, np.random.default_rng(0))
+    known = [np.unique(s.stretch).tolist() for s in some.sequences]
+    assert known[0] == known[1]
+    assert len(known[0]) == 2

@@ -1,0 +1,146 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from labelled_places import TRIALS, in_stretches, labelled, sequence, two_kinds, with_motions
+
+from adaptune.model import BankSettings, PairedSettings
+from offline import tuning
+from offline.bank_simulation import BankSimulation
+from offline.expected_loss import expected_loss
+from offline.tuning import (
+    BANK_SETTINGS,
+    DO_NOT_ADAPT,
+    NO_BANK,
+    PAIRED_SETTINGS,
+    cancelling_members,
+    choose,
+    complementary_members,
+)
+
+
+def tune(sequences):
+    return choose(labelled(sequences), 0)
+
+
+def test_settings_are_chosen_on_the_sequences_at_hand():
+    sequences = two_kinds(np.random.default_rng(0))
+    # Set 2 everywhere, 0 in one kind of place and 4 in the other.
+    found = tune(sequences)
+    assert found.one_set == PairedSettings(n_sets=3, sharpness=6.0)
+    assert found.expected["one set"].geometric == pytest.approx(np.sqrt(0.5 * 0.4), rel=0.05)
+    # Where nothing is to be gained anywhere, nothing is tried.
+    same = [replace(s, errors=np.ones_like(s.errors)) for s in sequences]
+    assert tune(same).one_set == DO_NOT_ADAPT
+    assert tune(same).expected["one set"].loss == 0.0
+    # The last set is good in half of the sequences, and nothing tells which.
+    rng = np.random.default_rng(5)
+    random = [
+        sequence(str(i), [9.0, 9.0, 1.0, 9.0, 0.5 if i % 2 else 2.5], 0, rng) for i in range(8)
+    ]
+    assert tune(random).one_set == DO_NOT_ADAPT
+    # A single stretch shows nothing at all.
+    alone = tune(sequences[:1])
+    assert (alone.one_set, alone.expected) == (DO_NOT_ADAPT, {})
+
+
+@pytest.mark.parametrize(("odd", "gains"), [(1.2, True), (30.0, False)])
+def test_a_small_harm_is_outweighed_and_a_disaster_is_not(odd, gains):
+    rng = np.random.default_rng(0)
+    one, other = [2.0, 2.0, 1.0, 2.0, 4.0], [2.0, 2.0, 1.0, 2.0, 0.4]
+    sequences = [sequence(f"one{i}", one, 0, rng) for i in range(4)]
+    sequences += [sequence(f"other{i}", other, 1, rng) for i in range(8)]
+    # It looks like those where the last set does well.
+    sequences.append(sequence("odd", [2.0, 2.0, 1.0, 2.0, odd], 1, rng))
+    data = labelled(sequences)
+    (of_odd,) = [rest for left, rest in data.folds() if left.name == "odd"]
+    assert of_odd.fixed() == TRIALS[2]
+    assert choose(data, 0).one_set.adapt is gains
+
+
+def test_a_bank_that_gains_nothing_does_not_adapt():
+    rng = np.random.default_rng(7)
+    sequences = [with_motions(f"s{i}", rng, 100) for i in range(7)]
+    # All members err alike: nothing cancels.
+    alike = [
+        replace(
+            s,
+            errors=np.repeat(s.errors[:, :1], 5, axis=1),
+            vectors=dict.fromkeys(TRIALS, s.vectors[0]),
+            simulation=replace(
+                s.simulation,
+                motions=lambda m, of=s.simulation.motions: of((0,) * len(m)),
+            ),
+        )
+        for s in sequences
+    ]
+    found = choose(labelled(alike), [0, 3, 4], one_set=False)
+    assert found.bank == NO_BANK
+    assert found.members == [0, 3, 4]
+    found = choose(labelled(sequences), [0, 8], one_set=False)
+    assert found.bank in BANK_SETTINGS
+    # Two recordings are enough where the gain is large.
+    assert choose(labelled(sequences[:3]), [0, 8], one_set=False).bank.adapt
+
+
+def test_the_least_loss_wins(monkeypatch):
+    logs = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS)))
+    names = [str(i) for i in range(8)]
+    banks = {"first": [0, 1], "second": [0, 2]}
+
+    def best():
+        return tuning.least_loss(logs, names, banks, len(PAIRED_SETTINGS))
+
+    assert (best().one_set, best().bank) == (DO_NOT_ADAPT, NO_BANK)
+    logs[:, 5] = -0.2
+    assert (best().one_set, best().bank) == (PAIRED_SETTINGS[5], NO_BANK)
+    second = len(PAIRED_SETTINGS) + len(BANK_SETTINGS)
+    logs[:, second + 3] = -0.1
+    assert best().bank == NO_BANK
+    assert best().members == [0, 2]
+    logs[:, second + 3] = -0.3
+    found = best()
+    # One set at a time is kept for where no bank can run.
+    assert (found.one_set, found.bank) == (PAIRED_SETTINGS[5], BANK_SETTINGS[3])
+    assert found.expected["bank"].loss == expected_loss(logs[:, second + 3], names)
+    monkeypatch.setattr(tuning, "RELIES_ON_LIVE", True)
+    rng = np.random.default_rng(7)
+    alone = labelled([with_motions("s", rng, 100)])
+    assert choose(alone, 2).bank == BankSettings()
+
+
+def test_members_are_chosen_in_both_ways():
+    rng = np.random.default_rng(7)
+    data = labelled([in_stretches(with_motions(f"s{i}", rng, 500)) for i in range(2)])
+    assert set(cancelling_members(data, 0, 2)) == {0, 8}
+    found = complementary_members(data, 0, 4)
+    assert found[0] == 0
+    assert len(set(found)) == 4
+    # A set whose motions are unknown is no member.
+    few = [replace(s, vectors={t: s.vectors[t] for t in (0, 3)}) for s in data.sequences]
+    assert complementary_members(labelled(few), 0, 4) == [0, 3]
+
+
+def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
+    rng = np.random.default_rng(8)
+    sequences = [with_motions(f"s{i}", rng, 100) for i in range(3)]
+    seen = []
+    simulate = BankSimulation.errors
+
+    def errors(self, weights):
+        seen.append(weights.weights)
+        return simulate(self, weights)
+
+    def bank_weights(near, _):
+        weights = np.zeros((len(near.fixed), near.products.shape[-1]))
+        weights[::2, 0] = weights[1::2, 1] = 1.0
+        near.evidence.familiarity[:] = 1.0
+        return weights, np.ones(len(weights))
+
+    monkeypatch.setattr(BankSimulation, "errors", errors)
+    monkeypatch.setattr(tuning, "bank_weights", bank_weights)
+    choose(labelled(sequences), [0, 8], one_set=False)
+    assert len(seen) == 3 * len(BANK_SETTINGS)
+    for weights in seen:
+        np.testing.assert_allclose(weights[:2], [[1.0, 0.0], [0.5, 0.5]], atol=0.01)
+        assert np.abs(weights[5:] - 0.5).max() < 0.11
