@@ -53,6 +53,8 @@ BANK_SETTINGS = [
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
+ROUNDING = 1e-6
+"""A smaller loss, or gain, is one of rounding."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
 NO_BANK = BankSettings(adapt=False)
 
@@ -141,6 +143,7 @@ def least_loss(
         How many of the columns are about one set at a time.
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
+    losses[~(np.abs(losses) > ROUNDING)] = 0.0
     expected: dict[str, Figures] = {}
     one_set, bank, members = DO_NOT_ADAPT, NO_BANK, next(iter(banks.values()), [])
     if n_single:

@@ -60,6 +60,7 @@ SLOW = [
     "offline/test_pictures.py",
     "adaptune/odometry/test_guarded.py",
     "adaptune/test_mistakes.py",
+    "offline/test_tuning.py",
 ]
 """Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
 

@@ -17,7 +17,7 @@ MIN_RECORDINGS = 6
 """With as many, whole recordings are left out; with fewer, stretches of them."""
 BANK, ONE_SET = "bank", "one set"
 """Names of the ways to adapt."""
-RELIES_ON_LIVE = False
+RELIES_ON_LIVE = True
 """Whether a bank adapts where too little is known to compare it: only if it measures the errors of
 its members while it drives."""
 

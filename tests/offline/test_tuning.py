@@ -103,6 +103,10 @@ def test_the_least_loss_wins(monkeypatch):
     # One set at a time is kept for where no bank can run.
     assert (found.one_set, found.bank) == (PAIRED_SETTINGS[5], BANK_SETTINGS[3])
     assert found.expected["bank"].loss == expected_loss(logs[:, second + 3], names)
+    # What rounding gains is no gain.
+    logs[:] = 0.0
+    logs[:, second + 3] = -1e-9
+    assert (best().one_set, best().bank) == (DO_NOT_ADAPT, NO_BANK)
     monkeypatch.setattr(tuning, "RELIES_ON_LIVE", True)
     rng = np.random.default_rng(7)
     alone = labelled([with_motions("s", rng, 100)])

@@ -69,6 +69,31 @@ def test_views_are_of_one_place():
     assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
 
 
+def test_evidence_is_of_stretches():
+    model = random_model()
+    assert model.training_data(model.pca()).sequence.max() == 1
+    stretch = np.arange(50) // 25
+    cut = dataclasses.replace(model, stretch=stretch)
+    number = cut.training_data(cut.pca()).sequence
+    np.testing.assert_array_equal(number, 2 * model.sequence + stretch)
+    # Each stretch keeps its frames, however few.
+    few = cut.thinned(1)
+    assert sorted(zip(few.sequence, few.stretch, strict=True)) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    # A view shares the stretches of its recording.
+    view = dataclasses.replace(cut, sequences=["b", "b+mirrored"])
+    np.testing.assert_array_equal(view.training_data(view.pca()).sequence, stretch)
+
+
+def test_stretches_are_kept_in_the_file(tmp_path):
+    expected = {"bank": {"loss": -0.2, "n_stretches": 4.0}}
+    model = dataclasses.replace(random_model(), stretch=np.arange(50) // 7, expected=expected)
+    model.save(tmp_path / "m")
+    again = ErrorModel.load(tmp_path / "m")
+    np.testing.assert_array_equal(again.stretch, model.stretch)
+    assert again.expected == expected
+    assert again.digest == model.digest != random_model().digest
+
+
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 70))
 def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
     model = dataclasses.replace(
@@ -328,6 +353,7 @@ def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
         {"descriptors": np.zeros((49, 90), np.uint16)},
         {"descriptors": np.zeros((50, 80), np.uint16)},
         {"sequence": np.zeros(49, np.uint32)},
+        {"stretch": np.zeros(49, np.uint32)},
         {"sequence": np.full(50, 2, np.uint32)},
         {"errors": np.zeros((50, 5), np.float32)},
         {"errors": np.zeros(50, np.float32)},
