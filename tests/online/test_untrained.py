@@ -27,10 +27,10 @@ WHOLE = (
 
 
 class Measuring(UntrainedSelector):
-    """Weighs evenly, and says that it is lost at the second of its selections."""
+    """Says that it is lost at the second of its selections."""
 
-    def __init__(self, sets):
-        super().__init__(sets)
+    def __init__(self, sets, length):
+        super().__init__(sets, length)
         self.n = 0
 
     def select(self):
@@ -68,7 +68,7 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     assert about["switching"]["members"] == list(sets.parameters)
     assert about["model"] is None
     for row in read(folder / "untrained/selections.csv"):
-        assert row["weights"] == "0:0.250 1:0.250 2:0.250 3:0.250"
+        assert row["weights"] == "0:1.000 1:0.000 2:0.000 3:0.000"
     rows = compare(study)
     assert [(row.sequence, row.mode, row.rte) for row in rows] == [
         ("three", m, None) for m in MODES

@@ -19,7 +19,7 @@ def street(length=60.0, seed=0):
         front = np.array([x + rng.uniform(0.0, 2.0), rng.choice([-1.0, 1.0]) * rng.uniform(3, 5)])
         face = rng.uniform([0.0, -1.0, -1.5], [0.0, 1.0, 2.0], (150, 3))
         side = rng.uniform([0.0, -1.0, -1.5], [1.5, -1.0, 2.0], (150, 3))
-        boxes += [face + [*front, 0.0], side + [*front, 0.0]]
+        boxes.append(np.concatenate([face, side]) + np.append(front, 0.0))
     return np.concatenate([ground, walls, *boxes])
 
 
@@ -33,7 +33,7 @@ def tunnel(length=60.0, seed=0):
 
 def scan_at(world, x, stamp=0, seed=None):
     """The scan of a sensor that stands at x and looks along x."""
-    points = world - [x, 0.0, 0.0]
+    points = world - np.array([x, 0.0, 0.0])
     seen = points[np.abs(points[:, 0]) < REACH]
     noise = np.random.default_rng(int(1000 * x) if seed is None else seed)
     return Scan(stamp, (seen + noise.normal(0.0, 0.01, seen.shape)).astype(np.float32))
