@@ -72,8 +72,8 @@ class BankSimulation:
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
-    _agreeing: dict[tuple[int, ...], NDArray[np.bool_]] = field(default_factory=dict)
-    _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict)
+    _agreeing: dict[tuple[int, ...], NDArray[np.bool_]] = field(default_factory=dict, init=False)
+    _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
     def _steps(self, members: tuple[int, ...]) -> Poses:
         """Motions of members; where nobody's is known, the reference's stands in."""

@@ -117,6 +117,7 @@ def part_of(simulation: BankSimulation, extent: Extent) -> tuple[BankSimulation,
         T_ref_sensor=simulation.T_ref_sensor[frames],
         descriptors=simulation.descriptors[frames],
         period=simulation.period[frames],
+        hops=simulation.hops.part(first, stop),
         motions=motions,
     )
     return part, extent._replace(frames=extent.frames - first, ends=extent.ends - first)

@@ -48,6 +48,12 @@ class Hops(NamedTuple):
     T_start_end: Poses  # (n, 4, 4)
     projection: NDArray[np.float64]  # (n, 3, 3): see `Hop`
 
+    def part(self, first: int, stop: int) -> "Hops":
+        """Those between the frames from `first` to before `stop`, whose numbers begin anew."""
+        inside = (self.start >= first) & (self.end < stop)
+        start, end, T_start_end, projection = (array[inside] for array in self)
+        return Hops(start - first, end - first, T_start_end, projection)
+
     @classmethod
     def of(cls, hops: Sequence[tuple[int, int, Hop]]) -> "Hops":
         """Gather hops with their frames."""

@@ -8,46 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from random_models import random_model
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from adaptune.model import RULES, BankSettings, ErrorModel, ModelError, make_rule
 from adaptune.model.model_file import FORMAT, checksum
-from adaptune.parameter_sets import ParameterSets
-from adaptune.space import Categorical, Float, Integer, ParameterSpace
-
-SPACE = ParameterSpace(
-    {
-        "distance": Float(low=1.0, high=10.0, baseline=4.0, log=True),
-        "points": Integer(low=1, high=50, baseline=20),
-        "kernel": Categorical(choices=("none", 1, True), baseline="none"),
-    }
-)
-
-
-TRIALS = (0, 2, 4, 6, 8, 10)
-
-
-def random_model(seed=0, n_frames=50, n_sets=6):
-    rng = np.random.default_rng(seed)
-    errors = rng.gamma(1.0, 2.0, (n_frames, n_sets)).astype(np.float32)
-    errors[rng.random(errors.shape) < 0.05] = np.inf
-    return ErrorModel(
-        odometry={"name": "gicp", "settings": {"downsampling": 0.1 + 0.2}},
-        sets=ParameterSets(SPACE, TRIALS[:n_sets], tuple(SPACE.from_unit(rng.random((n_sets, 3))))),
-        fixed=4,
-        length=25.0,
-        sequences=["cave", "Straße"],
-        blocks={"ndt": 90},
-        window=1,
-        descriptors=rng.integers(0, 500, (n_frames, 90)).astype(np.float32),
-        sequence=rng.integers(0, 2, n_frames),
-        errors=errors,
-        bank=[4, 10],
-        vectors=rng.normal(0.0, 1.0, (n_frames, 2, 3)).astype(np.float32),
-        provenance={"seed": n_sets, "note": None},
-        elevations=[-30.7, -15.0],
-    )
 
 
 def test_knows_the_sensors_of_its_training():
@@ -67,31 +33,6 @@ def test_views_are_of_one_place():
     np.testing.assert_array_equal(data.vectors, model.vectors[:, ::-1])
     apart = random_model()
     assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
-
-
-def test_evidence_is_of_stretches():
-    model = random_model()
-    assert model.training_data(model.pca()).sequence.max() == 1
-    stretch = np.arange(50) // 25
-    cut = dataclasses.replace(model, stretch=stretch)
-    number = cut.training_data(cut.pca()).sequence
-    np.testing.assert_array_equal(number, 2 * model.sequence + stretch)
-    # Each stretch keeps its frames, however few.
-    few = cut.thinned(1)
-    assert sorted(zip(few.sequence, few.stretch, strict=True)) == [(0, 0), (0, 1), (1, 0), (1, 1)]
-    # A view shares the stretches of its recording.
-    view = dataclasses.replace(cut, sequences=["b", "b+mirrored"])
-    np.testing.assert_array_equal(view.training_data(view.pca()).sequence, stretch)
-
-
-def test_stretches_are_kept_in_the_file(tmp_path):
-    expected = {"bank": {"loss": -0.2, "n_stretches": 4.0}}
-    model = dataclasses.replace(random_model(), stretch=np.arange(50) // 7, expected=expected)
-    model.save(tmp_path / "m")
-    again = ErrorModel.load(tmp_path / "m")
-    np.testing.assert_array_equal(again.stretch, model.stretch)
-    assert again.expected == expected
-    assert again.digest == model.digest != random_model().digest
 
 
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 70))
