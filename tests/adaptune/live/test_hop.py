@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from rooms import moved, scan_at, street, tunnel
 
-from adaptune.live.hop import Hops, HopCloud, register
+from adaptune.live.hop import HopCloud, Hops, register
 from adaptune.sequence.scan import Scan
 
 EMPTY = Scan(0, np.zeros((0, 3), np.float32))
@@ -34,7 +34,7 @@ def test_the_first_sound_guess_wins():
 
 
 def test_scans_that_share_no_place_are_rejected():
-    elsewhere = np.random.default_rng(0).uniform(-15.0, 15.0, (3000, 3)) + [10.0, 0.0, 0.0]
+    elsewhere = np.random.default_rng(0).uniform(-5.0, 25.0, (3000, 3)) - np.array([0.0, 10, 10])
     assert hop(street(), other=elsewhere) is None
 
 

@@ -73,7 +73,7 @@ def test_the_weights_leave_a_member_that_drifts():
     assert squares.products[0, 0] < 0.3**2
     assert squares.products[2, 2] == pytest.approx(3.0**2, rel=0.15)
     assert squares.products[1, 1] < 1.0
-    first, second, third = measured_weights(3, squares)
+    first, _, third = measured_weights(3, squares)
     assert third < 0.02
     assert first > 0.6
     assert live.own_error(10.0).mean < 0.3

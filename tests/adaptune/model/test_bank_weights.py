@@ -11,9 +11,9 @@ from adaptune.live.squares import LiveSquares
 from adaptune.metrics import FAILURE
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.bank_weights import (
+    SMOOTHING,
     UNFAMILIAR,
     bank_weights,
-    SMOOTHING,
     choose_members,
     clip_errors,
     measured_weights,
