@@ -78,7 +78,7 @@ class BankSimulation:
     def _steps(self, members: tuple[int, ...]) -> Poses:
         """Motions of members; where nobody's is known, the reference's stands in."""
         T_previous_current = self.motions(members)
-        unknown = np.flatnonzero(np.isnan(T_previous_current).any(axis=(2, 3)).all(axis=1))
+        unknown = np.flatnonzero(np.asarray(np.isnan(T_previous_current[..., 0, 0])).all(axis=1))
         if len(unknown):
             T_previous_current = T_previous_current.copy()
             T_ref = invert(self.T_ref_sensor[unknown]) @ self.T_ref_sensor[unknown + 1]
