@@ -51,8 +51,12 @@ class Hops(NamedTuple):
     def part(self, first: int, stop: int) -> "Hops":
         """Those between the frames from `first` to before `stop`, whose numbers begin anew."""
         inside = (self.start >= first) & (self.end < stop)
-        start, end, T_start_end, projection = (array[inside] for array in self)
-        return Hops(start - first, end - first, T_start_end, projection)
+        return Hops(
+            self.start[inside] - first,
+            self.end[inside] - first,
+            self.T_start_end[inside],
+            self.projection[inside],
+        )
 
     @classmethod
     def of(cls, hops: Sequence[tuple[int, int, Hop]]) -> "Hops":
