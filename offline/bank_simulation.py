@@ -75,6 +75,16 @@ class BankSimulation:
     _agreeing: dict[tuple[int, ...], NDArray[np.bool_]] = field(default_factory=dict, init=False)
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
+    def _steps(self, members: tuple[int, ...]) -> Poses:
+        """Motions of members; where nobody's is known, the reference's stands in."""
+        T_previous_current = self.motions(members)
+        unknown = np.flatnonzero(np.asarray(np.isnan(T_previous_current[..., 0, 0])).all(axis=1))
+        if len(unknown):
+            T_previous_current = T_previous_current.copy()
+            T_ref = invert(self.T_ref_sensor[unknown]) @ self.T_ref_sensor[unknown + 1]
+            T_previous_current[unknown] = T_ref[:, None]
+        return T_previous_current
+
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         """What is measured of members before the first frame of each period."""
         if members not in self._live:
@@ -86,7 +96,7 @@ class BankSimulation:
         start, end, T_start_end, projection = self.hops
         if not len(start):
             return [None] * len(first)
-        T_previous_current = self.motions(members)
+        T_previous_current = self._steps(members)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
         T_odom_sensor = chained(np.where(known[..., None, None], T_previous_current, np.eye(4)))
         moved = invert(T_odom_sensor[start]) @ T_odom_sensor[end]
@@ -109,7 +119,7 @@ class BankSimulation:
         All members have the same vote, so that it is the same whatever their weights are.
         """
         if members not in self._agreeing:
-            T_previous_current = self.motions(members)
+            T_previous_current = self._steps(members)
             agreement, votes = Agreement(len(members), self.lost_track), np.ones(len(members))
             agreeing = np.zeros(T_previous_current.shape[:2], bool)
             for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
@@ -123,7 +133,7 @@ class BankSimulation:
 
     def errors(self, weights: MemberWeights) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory."""
-        T_previous_current, agreeing = self.motions(weights.members), self.agreeing(weights.members)
+        T_previous_current, agreeing = self._steps(weights.members), self.agreeing(weights.members)
         of_steps = weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))

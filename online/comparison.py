@@ -179,9 +179,9 @@ def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
 
 
 def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every replay in which the bank was lost."""
+    """A sentence about every replay that was lost for a while."""
     return [
-        f"On {row.sequence} the bank of `{row.mode}` was lost for {row.lost_seconds:.1f} s."
+        f"On {row.sequence} `{row.mode}` was lost for {row.lost_seconds:.1f} s."
         for row in rows
         if row.lost_seconds and row.sequence != ALL
     ]

@@ -148,11 +148,13 @@ def replay(
 
 
 def _tell_of_loss(choices: list[Choice], what: str) -> None:
-    """Log that the bank is lost since the last selection, or not any more."""
-    lost = choices[-1].selection.lost
+    """Log that the bank, or the odometry, is lost since the last selection, or not any more."""
+    lost, weights = choices[-1].selection.lost, choices[-1].selection.weights
     if lost != (len(choices) > 1 and choices[-2].selection.lost):
         seconds = (choices[-1].stamp - choices[0].stamp) * 1e-9
-        _log.warning("%s: the bank %s at %.1f s", what, "is lost" if lost else "goes on", seconds)
+        who = "odometry" if weights is None else "bank"
+        does = "is lost" if lost else "goes on"
+        _log.warning("%s: the %s %s at %.1f s", what, who, does, seconds)
 
 
 def _recorded(steps: list[RegisteredScan], choices: list[Choice], seconds: float) -> Replay:

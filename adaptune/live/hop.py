@@ -28,6 +28,8 @@ _FEWEST = 100
 _REACHES = (2.0, 0.5)
 """Metres of the greatest distance of correspondences, one registration after the other."""
 _ITERATIONS = 20
+_OF_A_PLANE = 0.5
+"""Information that small_gicp ascribes to a pair of points along their plane; there is none."""
 
 
 class Hop(NamedTuple):
@@ -129,7 +131,7 @@ def register(start: HopCloud, end: HopCloud, guesses: Iterable[Poses]) -> Hop | 
         result = _align(target, source, tree, guess)
         T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= MIN_INLIERS * source.size():
-            return Hop(T, T[:3, :3] @ _known_directions(result.H) @ T[:3, :3].T)
+            return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)
     return None
 
 
@@ -148,19 +150,21 @@ def _align(target: Any, source: Any, tree: Any, T_target_guess: Poses) -> Any:
     return result
 
 
-def _known_directions(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def _known_directions(result: Any) -> NDArray[np.float64]:
     """Projection, in the end's frame, on the directions of translation that are well determined.
 
     Parameters
     ----------
-    information
-        Of rotation and translation, of shape (6, 6).
+    result
+        What small_gicp found.
     """
+    information = np.asarray(result.H)
     of_rotation = information[:3, :3] + 1e-9 * np.eye(3)
     # What is known of the translation if the rotation is not.
     marginal = information[3:, 3:] - information[3:, :3] @ np.linalg.solve(
         of_rotation, information[:3, 3:]
     )
     values, vectors = np.linalg.eigh(marginal)
-    known = vectors[:, values >= DEGENERATE * values[-1]]
+    found = values - _OF_A_PLANE * result.num_inliers
+    known = vectors[:, found >= DEGENERATE * values[-1]]
     return np.asarray(known @ known.T)

@@ -157,7 +157,7 @@ class LiveEvidence:
             tried = True
             hop = register(start.cloud, end.cloud, self._guesses(start, end))
             if hop is not None:
-                self._short = 0 if long else max(self._short, 1)
+                self._short = 0 if long else self._short
                 self._take(start, end, hop)
                 return Measured(start.stamp, end.stamp, hop)
             if long:

@@ -66,7 +66,7 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         members = ", ".join(map(str, bank_members(study.config.online.switching, model)))
         words = f"`online` will drive the bank of trials {members} as `paired`."
         if not model.expected:
-            words += f" {_too_little(model)}: the bank relies on what it measures while it drives."
+            words += f" It relies on what it measures while it drives, for {_too_little(model)}."
         return Driven("bank", words, paper)
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"

@@ -9,11 +9,14 @@ from hypothesis import strategies as st
 
 from adaptune.descriptor.motion import speed_and_turn_rate
 from adaptune.descriptor.ndt_histogram import describe
+from adaptune.live.live_evidence import LiveEvidence, OwnError
+from adaptune.live.squares import LiveSquares
 from adaptune.model import BankRule, BankSettings, ErrorModel
+from adaptune.model.bank_weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
-from adaptune.selector import Selector
+from adaptune.selector import AVOIDED, WORSE, Selector
 from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import simulate
@@ -22,6 +25,7 @@ from adaptune.space import Float, ParameterSpace
 SPACE = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
 SETS = ParameterSets(SPACE, (3, 5), ({"speed": 1.0}, {"speed": 8.0}))
 STILL = Motions(np.eye(4), {})
+IN_A_BANK = Motions(np.eye(4), {3: np.eye(4), 5: np.eye(4)})
 
 
 @cache
@@ -135,10 +139,10 @@ def test_a_scan_comes_before_a_selection():
 def test_after_a_reset_it_is_as_new():
     scans = drive_cave("hdl32e", 3)
     selector = Selector(replace(of_two_caves(), window=3))
-    first = selections(selector, scans)
-    assert repr(selections(selector, scans)) != repr(first)
+    first = selections(selector, scans, IN_A_BANK)
+    assert repr(selections(selector, scans, IN_A_BANK)) != repr(first)
     selector.reset()
-    assert repr(selections(selector, scans)) == repr(first)
+    assert repr(selections(selector, scans, IN_A_BANK)) == repr(first)
 
 
 def test_it_takes_the_bank_that_was_shown_to_pay():
@@ -155,31 +159,113 @@ def test_a_banks_weights_change_slowly(monkeypatch):
     found = [(1.0, 0.0), (0.0, 1.0), (0.0, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 1.0), (0.0, 1.0)]
     model, left = of_two_caves(), []
 
-    def selection(weights, familiarity=1.0):
-        weights = dict(zip((3, 5), weights, strict=True))
-        return Selection(3, {}, weights, 0.2, 1.0, familiarity, 2.0)
+    def weigh(*_):
+        weights = left.pop(0) if left else (1.0, 0.0)
+        return Selection(3, {}, dict(zip((3, 5), weights, strict=True)), 0.2, 1.0, 1.0, 2.0)
 
-    monkeypatch.setattr(
-        BankRule, "select", lambda *_: selection(left.pop(0) if left else (1.0, 0.0))
-    )
+    monkeypatch.setattr(BankRule, "weigh", weigh)
     selector = Selector(model)
     left[:] = found
-    made = selections(selector, drive_cave("hdl32e", 3)[: len(found)])
+    made = selections(selector, drive_cave("hdl32e", 3)[: len(found)], IN_A_BANK)
     for i, one in enumerate(made):
         mean = np.mean(found[max(0, i - 4) : i + 1], axis=0)
         np.testing.assert_allclose(list(one.weights.values()), mean)
         assert one.trial == (3, 5)[np.argmax(mean)]
         assert one.parameters == SETS[one.trial]
-    # Doubt acts at once, but not for long.
-    left[:] = [(0.0, 1.0)]
-    scan = drive_cave("hdl32e", 3)[0]
-    with monkeypatch.context() as patched:
-        patched.setattr(BankRule, "select", lambda *_: selection((1.0, 0.0), 0.0))
-        assert selections(selector, [scan])[0].weights == {3: 1.0, 5: 0.0}
-    (one,) = selections(selector, [scan])
-    np.testing.assert_allclose(list(one.weights.values()), [0.2, 0.8])
-    # Another sensor leaves the fixed set all the weight, and at once.
+    # Of another sensor's scans the training says nothing, and nothing is measured yet.
     selector.reset()
     left[:] = found[1:3]
-    for one in selections(selector, drive_cave("vlp16", 3)[:2]):
+    for one in selections(selector, drive_cave("vlp16", 3)[:2], IN_A_BANK):
         assert one.weights == {3: 1.0, 5: 0.0}
+
+
+class Told:
+    """In place of `LiveEvidence`: says what it is told, from the next measurement on."""
+
+    lost = False
+
+    def __init__(self, monkeypatch):
+        self.next = self.now = self.error = None
+        self.forgotten = 0
+        for name in ("squares", "measure", "own_error", "forget"):
+            monkeypatch.setattr(
+                LiveEvidence, name, lambda _, *args, n=name: getattr(self, n)(*args)
+            )
+
+    def squares(self):
+        return self.now
+
+    def measure(self):
+        self.now = self.next
+
+    def own_error(self, _length):
+        return self.error
+
+    def forget(self):
+        self.error = None
+        self.forgotten += 1
+
+
+def test_what_is_measured_counts_from_the_next_selection_on(monkeypatch):
+    told, scans = Told(monkeypatch), drive_cave("hdl32e", 3)
+    selector = Selector(of_two_caves())
+    (before,) = selections(selector, scans[:1], IN_A_BANK)
+    told.next = LiveSquares(np.diag([100.0, 1.0]), 0.0, 1000.0)
+    selector.observe(scans[1].stamp, scans[1], IN_A_BANK)
+    assert selector.select().weights == before.weights
+    selector.measure()
+    (after,) = selections(selector, scans[2:3], IN_A_BANK)
+    # Two of three selections knew nothing of it.
+    known = (3.0 * after.weights[5] - 2.0 * before.weights[5]) / 1.0
+    assert known > 0.9
+    assert before.weights[5] < 0.6
+
+
+def test_a_sensor_that_was_not_trained_with_gets_weights_by_what_is_measured(monkeypatch):
+    told = Told(monkeypatch)
+    selector, scans = Selector(of_two_caves()), drive_cave("vlp16", 3)
+    told.now = LiveSquares(np.diag([100.0, 1.0]), 0.0, 30.0)
+    (one,) = selections(selector, scans[:1], IN_A_BANK)
+    assert one.weights[5] > 0.8
+    assert (one.trial, one.parameters, one.familiarity) == (5, SETS[5], 0.0)
+    assert list(one.weights.values()) == pytest.approx(measured_weights(2, told.now))
+    # A single odometry has nothing to compare with.
+    (one,) = selections(Selector(of_two_caves(), members=()), scans[:1])
+    assert (one.trial, one.weights) == (3, None)
+
+
+def test_a_single_odometry_leaves_a_set_that_does_worse_than_predicted(monkeypatch):
+    told, (scan, *_) = Told(monkeypatch), drive_cave("hdl32e", 3)
+    selector = Selector(of_two_caves(), members=())
+
+    def select(seconds):
+        selector.observe(int(seconds * 1e9), scan, STILL)
+        return selector.select()
+
+    first = select(0.0)
+    assert first.trial == 5
+    limit, forgotten = WORSE * first.predicted_error, told.forgotten
+    told.error = OwnError(9.0, 0.99 * limit, 20.0)  # not surely worse
+    assert select(1.0).trial == 5
+    assert told.forgotten == forgotten
+    told.error = OwnError(9.0, 1.01 * limit, 20.0)
+    left = select(2.0)
+    assert (left.trial, left.parameters) == (3, SETS[3])
+    # The hops were those of the set that it left.
+    assert told.forgotten == forgotten + 1
+    assert select(AVOIDED + 1.9).trial == 3
+    assert select(AVOIDED + 2.1).trial == 5
+    # After a reset nothing is held against it.
+    told.error = OwnError(9.0, 1.01 * limit, 20.0)
+    assert select(AVOIDED + 3.0).trial == 3
+    selector.reset()
+    assert select(0.0).trial == 5
+
+
+def test_a_selection_tells_what_was_measured(monkeypatch):
+    told, scans = Told(monkeypatch), drive_cave("hdl32e", 3)
+    selector = Selector(of_two_caves())
+    assert np.isnan(selections(selector, scans[:1], IN_A_BANK)[0].estimated_error)
+    told.error = OwnError(1.0, 0.5, 2.0)
+    (one,) = selections(selector, scans[1:2], IN_A_BANK)
+    assert (one.estimated_error, one.estimated_low, one.estimated_high) == (1.0, 0.5, 2.0)

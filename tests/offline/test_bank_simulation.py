@@ -5,6 +5,8 @@ import pytest
 
 from adaptune.archive import Frames, Trial
 from adaptune.geometry import invert, steps
+from adaptune.live.hop import Hop, Hops
+from adaptune.live.squares import CLIP
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model.bank_weights import MemberWeights
 from adaptune.odometry import InProcess, Odometry, WarmUp
@@ -17,6 +19,7 @@ from offline.bank_simulation import BankSimulation, error_vectors, recorded_moti
 
 N = 60
 LENGTH = 5.0
+NOTHING = Hops.of([])
 
 
 def straight(scales):
@@ -51,9 +54,13 @@ def lost_at(i, scale=0.3):
     return trial(T, restarted)
 
 
-def simulated(trials, weights, lost_track=3.0):
+NEARLY = 0.3 + 1e-12
+"""A trial whose poses are those of the reference would count as pieces."""
+
+
+def simulated(trials, weights, lost_track=3.0, hops=NOTHING):
     f = frames()
-    motions = recorded_motions(f, trials, lost_track)
+    motions = recorded_motions(f, trials)
     simulation = BankSimulation(
         f.stamps,
         f.T_ref_sensor,
@@ -61,6 +68,7 @@ def simulated(trials, weights, lost_track=3.0):
         np.arange(N) // 10,
         LENGTH,
         lost_track,
+        hops,
         lambda members: motions[:, list(members)],
     )
     members = tuple(range(len(trials)))
@@ -94,23 +102,72 @@ def test_members_that_err_in_opposite_directions_make_up_for_it():
 
 def test_a_member_that_lost_track_is_left_out():
     sound, lost = trial(straight(0.31)), lost_at(20, 0.29)
-    _, errors = simulated([sound, lost], [0.6, 0.4])
-    # Of the 17 scans of a window, it is left out of those within a second.
-    assert errors[5:20].max() == pytest.approx(100 * (9 * 0.01 + 8 * 0.002) / LENGTH)
-    # If it is heard more, its failure is the bank's.
-    _, errors = simulated([sound, lost], [0.1, 0.9])
-    assert (errors[10:20] == 30.0).all()
-    assert (errors[20:30] < 30.0).all()
-    # Where all are lost, so is the bank, and agreement in that is none.
+    simulation, errors = simulated([sound, sound, lost], [0.3, 0.3, 0.4])
+    agreeing = simulation.agreeing((0, 1, 2))
+    assert agreeing[:, :2].all()
+    assert not agreeing[25:28, 2].any()
+    assert agreeing[:19, 2].all()
+    # The windows across the loss are not worse than the sound members alone.
+    assert errors[5:20].max() < 100 * 0.01 * 17 / LENGTH + 5.0
+    # Where all are lost, nobody knows, and the bank stands still with them for a second.
     _, errors = simulated([lost, lost_at(20)], [0.5, 0.5])
     assert (errors[10:20] == 30.0).all()
+
+
+def test_a_member_that_lost_track_stands_still_until_it_is_noticed():
+    motions = recorded_motions(frames(), [lost_at(20, 0.29), trial(straight(0.29))])
+    still = (motions[:, 0] == np.eye(4)).all(axis=(1, 2))
+    # The step to the frame at which it was lost, and those that begin within a second of it.
+    assert np.flatnonzero(still).tolist() == list(range(19, 29))
+    np.testing.assert_allclose(motions[~still, 0, 0, 3], 0.29)
+    np.testing.assert_allclose(motions[:, 1, 0, 3], 0.29)
+
+
+def hops_of(pairs, far=0.3):
+    """Hops that measure the reference."""
+    moved = [np.eye(4) for _ in pairs]
+    for T, (start, end) in zip(moved, pairs, strict=True):
+        T[0, 3] = far * (end - start)
+    return Hops.of([(a, b, Hop(T, np.eye(3))) for T, (a, b) in zip(moved, pairs, strict=True)])
+
+
+def test_what_is_measured_comes_before_the_period():
+    trials = [trial(straight(NEARLY)), trial(straight(0.309)), lost_at(45, NEARLY)]
+    hops = hops_of([(0, 10), (5, 30), (20, 40), (30, 50)])
+    simulation, _ = simulated(trials, np.ones(3) / 3, hops=hops)
+    live = simulation.live((0, 1, 2))
+    assert live is simulation.live((0, 1, 2))
+    assert live[:2] == [None, None]  # a hop that ends at the first frame of a period comes too late
+    for found, windows in zip(live[2:4], (1.0, 1.0), strict=True):
+        # 3 % of what the odometry should have moved.
+        np.testing.assert_allclose(found.products.diagonal(), [0.0, 9.0, 0.0], atol=1e-9)
+        assert found.windows == windows
+    np.testing.assert_allclose(live[5].products.diagonal()[:2], [0.0, 9.0], atol=1e-9)
+    # The last member stood still, but no hop has said so yet.
+    np.testing.assert_allclose(live[5].products[2, 2], 0.0, atol=1e-9)
+    simulation, _ = simulated(trials, np.ones(3) / 3, hops=hops_of([(30, 49)]))
+    assert simulation.live((0, 1, 2))[5].products[2, 2] > 4.0
+    # In another order, and without the lost one.
+    other = simulation.live((1, 0))[5]
+    np.testing.assert_allclose(other.products.diagonal(), [9.0, 0.0], atol=1e-9)
+
+
+def test_over_a_motion_that_is_unknown_nothing_is_measured():
+    T = straight(0.33)
+    T[30:] = T[30:] + (frames().T_ref_sensor[30] - T[30])
+    simulation, _ = simulated(
+        [trial(straight(NEARLY)), trial(T)], [0.5, 0.5], hops=hops_of([(20, 35)])
+    )
+    products = simulation.live((0, 1))[4].products
+    assert products[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert products[1, 1] == pytest.approx(CLIP**2)
 
 
 def test_where_a_piece_of_a_trial_began_nothing_is_known():
     T = straight(0.33)
     T[30:] = T[30:] + (frames().T_ref_sensor[30] - T[30])
     pieces = trial(T)
-    motions = recorded_motions(frames(), [pieces], 3.0)
+    motions = recorded_motions(frames(), [pieces])
     assert np.isnan(motions[29]).all()
     assert np.isfinite(np.delete(motions, 29, axis=0)).all()
     # Vectors point where they would without the border, but for the one step.

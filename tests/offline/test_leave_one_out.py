@@ -277,9 +277,15 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     assert "what is left out, over 6 stretches (" in found.verdicts[2]
     # Where it cannot be judged it says what is driven.
     alone = labelled(six.sequences[:1])
-    match = r"one stretch cannot .* will drive the fixed set .* too little .* takes 80 m of rec"
-    with pytest.raises(ValidationError, match=match):
-        judged(alone, study, monkeypatch)
+    for mechanism, what in (
+        ("bank", r"the bank of trials .* as `paired`\. It relies on what it measures"),
+        ("live", "the fixed set"),
+    ):
+        given = [f"online.switching.mechanism={mechanism}", "online.switching.size=3"]
+        study = load_study(study_file, given, tmp_path)
+        match = f"one stretch cannot .* will drive {what} .* too little .* takes 80 m of rec"
+        with pytest.raises(ValidationError, match=match):
+            judged(alone, study, monkeypatch)
 
 
 def test_validate_says_that_the_baseline_is_better(study_file, tmp_path, monkeypatch):

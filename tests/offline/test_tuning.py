@@ -135,7 +135,8 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
         seen.append(weights.weights)
         return simulate(self, weights)
 
-    def bank_weights(near, _):
+    def bank_weights(near, _, live):
+        assert len(live) == len(near.fixed)
         weights = np.zeros((len(near.fixed), near.products.shape[-1]))
         weights[::2, 0] = weights[1::2, 1] = 1.0
         near.evidence.familiarity[:] = 1.0

@@ -77,7 +77,7 @@ class Chooser:
 
     def __init__(self, sets, choose=lambda n: n % 2):
         self.sets, self.choose = sets, choose
-        self.seen, self.asked = [], []
+        self.seen, self.asked, self.measured = [], [], []
 
     def observe(self, stamp, scan, motions):
         assert scan.stamp == stamp
@@ -88,6 +88,9 @@ class Chooser:
         i = self.choose(len(self.asked))
         return Selection(i, self.sets[i], None, 0.5, 1.0)
 
+    def measure(self):
+        self.measured.append((self.seen[-1][0], len(self.asked)))
+
 
 def test_selects_at_the_first_scan_and_then_every_period_before_registering():
     odometry = Scripted()
@@ -96,6 +99,8 @@ def test_selects_at_the_first_scan_and_then_every_period_before_registering():
     result = replay(scans(stamps), InProcess(odometry), HEALTH, selector)
     assert [s / 1e9 for s in selector.asked] == [0.0, 1.0, 2.3, 4.95, 5.0]
     assert [c.stamp for c in result.choices] == selector.asked
+    # It measures once after every selection.
+    assert selector.measured == [(stamp, n + 1) for n, stamp in enumerate(selector.asked)]
     # Every scan is observed, with the motion over the scan before it.
     assert [stamp / 1e9 for stamp, _ in selector.seen] == stamps
     moved = [x for _, x in selector.seen][:9]  # then the health check steps in
@@ -211,15 +216,15 @@ class Losing(Chooser):
         return selection._replace(lost=self.lost[len(self.asked) - 1])
 
 
-def test_the_log_says_when_a_bank_is_lost_and_when_it_goes_on(tmp_path, caplog):
+def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, caplog):
     selector = Losing([True, True, False, True])
     result = replay(
         scans(np.arange(36) / 10), InProcess(Scripted()), HEALTH, selector, what="a, paired"
     )
     assert caplog.messages == [
-        "a, paired: the bank is lost at 0.0 s",
-        "a, paired: the bank goes on at 2.0 s",
-        "a, paired: the bank is lost at 3.0 s",
+        "a, paired: the odometry is lost at 0.0 s",
+        "a, paired: the odometry goes on at 2.0 s",
+        "a, paired: the odometry is lost at 3.0 s",
     ]
     write_replay(tmp_path, result, ABOUT, None)
     summary = json.loads((tmp_path / "replay.json").read_text())
@@ -234,10 +239,10 @@ def test_a_bank_without_a_model_takes_odometries_that_are_not_live():
 
     sets = untrained_sets(Scripted.space)
     odometry = Bank(lambda _: InProcess(Stiff()), {n: sets[n] for n in sets}, WarmUp())
-    result = replay(scans(np.arange(20) / 10), odometry, HEALTH, UntrainedSelector(sets))
+    result = replay(scans(np.arange(20) / 10), odometry, HEALTH, UntrainedSelector(sets, 25.0))
     np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], 0.1 * np.arange(20))
     assert [choice.selection.weights for choice in result.choices] == [
-        dict.fromkeys(sets, 0.25)
+        {0: 1.0} | dict.fromkeys(list(sets)[1:], 0.0)
     ] * 2
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from tables import table
 
+from adaptune.live.hop import Hops
 from adaptune.metrics import sub_trajectory_vectors
 from offline.bank_simulation import BankSimulation
 from offline.labelled import LabelledData, LabelledSequence
@@ -53,7 +54,14 @@ def with_motions(of, rng, n_steps=300):
     described = rng.poisson(3.0, (n_steps, 90)).astype(np.float32)
     period = np.arange(n_steps) // 10
     simulation = BankSimulation(
-        stamps, T_ref_sensor, described, period, 10.0, 3.0, lambda m: motions[:, SETS.columns(m)]
+        stamps,
+        T_ref_sensor,
+        described,
+        period,
+        10.0,
+        3.0,
+        Hops.of([]),
+        lambda m: motions[:, SETS.columns(m)],
     )
     return LabelledSequence(
         of,

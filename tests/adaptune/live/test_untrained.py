@@ -4,6 +4,8 @@ import sys
 import numpy as np
 import pytest
 
+from adaptune.live.live_evidence import LiveEvidence
+from adaptune.live.squares import LiveSquares
 from adaptune.live.untrained import CANDIDATES, UntrainedSelector, untrained_sets
 from adaptune.odometry.base import Motions
 from adaptune.sequence.scan import Scan
@@ -55,18 +57,25 @@ def test_no_set_is_in_the_bank_twice(space, n):
     assert len({str(one) for one in sets.parameters}) == n
 
 
-def test_all_members_have_the_same_weight():
+def test_the_baseline_has_all_the_weight_until_others_are_confirmed(monkeypatch):
     sets = untrained_sets(SPACE)
-    selector = UntrainedSelector(sets)
+    selector = UntrainedSelector(sets, 25.0)
     assert (selector.fixed, selector.members) == (0, (0, 1, 2, 3))
     selector.observe(0, Scan(0, np.zeros((0, 3), np.float32)), Motions(np.eye(4), {}))
     selection = selector.select()
-    assert selection.weights == dict.fromkeys(sets, 0.25)
-    assert selection.parameters == sets[selection.trial]
+    assert selection.weights == {0: 1.0, 1: 0.0, 2: 0.0, 3: 0.0}
+    assert (selection.trial, selection.parameters) == (0, SPACE.baseline)
     assert np.isnan(selection.estimated_error)
     assert not selection.lost
+    selector.measure()  # a single scan
     selector.reset()
     assert selector.select() == selection
+    # The second does as well as the baseline, the others are far off.
+    squares = LiveSquares(np.diag([1.0, 1.0, 100.0, 100.0]), 0.0, 6.0)
+    monkeypatch.setattr(LiveEvidence, "squares", lambda _: squares)
+    weights = selector.select().weights
+    assert weights[0] > weights[1] > 0.3
+    assert max(weights[2], weights[3]) < 0.1
 
 
 def test_it_is_imported_fast():

@@ -2,18 +2,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from tables import table
 
+from adaptune.live.squares import LiveSquares
 from adaptune.metrics import FAILURE
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.bank_weights import (
-    RIDGE,
     SMOOTHING,
+    UNFAMILIAR,
+    bank_weights,
     choose_members,
     clip_errors,
+    measured_weights,
     minimum_variance_weights,
     smooth_weights,
 )
@@ -69,26 +72,62 @@ def test_weights_are_of_the_places_that_are_near():
 
 
 @pytest.mark.parametrize(
-    ("settings", "kept"),
+    ("of", "kept"),
     [
         (BankSettings(min_fixed_share=0.5), 0.5),
         (BankSettings(min_fixed_share=1.0), 1.0),
         (BankSettings(adapt=False), 1.0),
     ],
 )
-def test_the_fixed_set_keeps_its_minimum_share(settings, kept):
+def test_the_fixed_set_keeps_its_minimum_share(of, kept):
     data = places(np.random.default_rng(2))
-    weights = BankRule(settings).fit(data).select(data.features[0]).weights
+    rule = BankRule(of).fit(data)
+    weights = rule.select(data.features[0]).weights
     assert sum(weights.values()) == pytest.approx(1.0)
     assert weights[0] == pytest.approx(kept, abs=0.05)
+    if of.adapt:
+        # What is measured takes its place: 9 windows next to the prior's 3.
+        live = LiveSquares(np.diag([100.0, 1.0, 1.0, 100.0]), 0.0, 9.0)
+        weights = rule.weigh(data.features[0], live).weights
+        assert weights[0] == pytest.approx(kept / 4.0, abs=0.05)
 
 
-def test_in_a_place_unlike_all_others_the_fixed_set_is_kept():
+def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more():
     data = places(np.random.default_rng(3))
-    selection = BankRule().fit(data).select(np.array([500.0, 0.0]))
-    assert selection.familiarity == 0.0
-    assert selection.weights == {0: 1.0, 1: 0.0, 2: 0.0, 3: 0.0}
-    assert selection.predicted_error == pytest.approx(selection.predicted_fixed)
+    rule = BankRule().fit(data)
+    # The training says 1 and 2; driving says 0.
+    live = LiveSquares(np.diag([1.0, 4.0, 4.0, 4.0]), 0.0, 3.0)
+    known, new = data.features[5], np.array([500.0, 0.0])
+    (near,) = rule.near(new[None]).evidence.trust
+    assert near == 0.0
+    assert rule.select(new).familiarity == 0.0
+    assert rule.weigh(new, live).weights[0] > rule.weigh(known, live).weights[0] + 0.1
+    # Without measurements it is still the best guess.
+    assert rule.select(new).weights[0] < 0.1
+    # As many windows as the prior has there: half and half.
+    few = live._replace(windows=UNFAMILIAR * rule.settings.prior_windows)
+    (found,), _ = bank_weights(rule.near(new[None]), rule.settings, [few])
+    assert found[0] == pytest.approx(rule.weigh(new, few).weights[0])
+
+
+def test_many_windows_overrule_the_training():
+    data = places(np.random.default_rng(6))
+    rule = BankRule(BankSettings(even=0.0)).fit(data)
+    live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1000.0)
+    assert rule.weigh(data.features[0], live).weights[3] > 0.9
+    assert rule.weigh(data.features[0], live._replace(windows=1e-3)).weights[3] < 0.1
+    # The registrations' own part, which all share, changes nothing.
+    shifted = live._replace(products=live.products + 0.2, noise=0.2)
+    found, plain = (rule.weigh(data.features[0], one).weights for one in (shifted, live))
+    np.testing.assert_allclose(list(found.values()), list(plain.values()), atol=1e-5)
+
+
+def test_without_training_the_first_member_has_the_weight_until_others_are_confirmed():
+    assert measured_weights(3, None).tolist() == [1.0, 0.0, 0.0]
+    alike = measured_weights(3, LiveSquares(np.eye(3), 0.0, 3.0))
+    assert alike[0] > alike[1] == pytest.approx(alike[2])
+    many = measured_weights(3, LiveSquares(np.diag([100.0, 1.0, 1.0]), 0.0, 30.0))
+    assert many[0] < 0.1
 
 
 def test_a_bank_needs_members():
@@ -98,14 +137,16 @@ def test_a_bank_needs_members():
             BankRule().fit(replace(data, **lacking))
 
 
-@given(st.integers(1, 5), st.integers(0, 2**32 - 1))
-def test_the_least_mean_square_of_all_weights(n, seed):
+@settings(deadline=None)
+@given(st.integers(1, 5), st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.05, 1.0]))
+def test_the_least_mean_square_of_all_weights(n, seed, even):
     errors = np.random.default_rng(seed).normal(size=(n, 7))
     squares = errors @ errors.T
-    weights = minimum_variance_weights(squares)
+    weights = minimum_variance_weights(squares, even)
     assert weights.sum() == pytest.approx(1.0)
     assert weights.min() >= 0.0
-    ridged = squares + np.eye(n) * RIDGE * squares[0, 0]
+    harmonic = 1.0 / (1.0 / squares.diagonal()).mean()
+    ridged = squares + np.eye(n) * even * harmonic
     found = minimize(
         lambda w: w @ ridged @ w,
         np.full(n, 1.0 / n),
@@ -152,22 +193,20 @@ def test_a_bank_is_of_sets_whose_errors_cancel():
 @given(st.integers(1, 20), st.integers(0, 100))
 def test_smoothed_weights_are_means_of_the_last(n, seed):
     weights = np.random.default_rng(seed).dirichlet(np.ones(3), n)
-    found = smooth_weights(weights, np.ones(n))
+    found = smooth_weights(weights)
     for i in range(n):
         np.testing.assert_allclose(
             found[i], weights[max(0, i + 1 - SMOOTHING) : i + 1].mean(axis=0)
         )
-    assert (smooth_weights(np.eye(2)[[0] * n], np.ones(n)) == [1.0, 0.0]).all()
+    assert (smooth_weights(np.eye(2)[[0] * n]) == [1.0, 0.0]).all()
 
 
-def test_doubt_does_not_wait():
-    weights = np.array([[0.0, 0.6, 0.4]] * 4)
-    # As they are found there: the more is kept by the fixed set, the less is familiar.
-    weights[2], weights[3] = [0.5, 0.3, 0.2], [1.0, 0.0, 0.0]
-    found = smooth_weights(weights, np.array([1.0, 0.1, 0.05, 0.0]))
-    np.testing.assert_allclose(found[:2], weights[:2])
-    np.testing.assert_allclose(found[2], [0.5, 0.3, 0.2])
-    np.testing.assert_allclose(found[3], [1.0, 0.0, 0.0], atol=1e-12)
+def test_the_more_even_the_more_even():
+    squares = np.diag([1.0, 4.0])
+    np.testing.assert_allclose(minimum_variance_weights(squares, 0.0), [0.8, 0.2], atol=1e-6)
+    spread = [np.ptp(minimum_variance_weights(squares, even)) for even in (0.05, 1.0, 100.0)]
+    assert spread == sorted(spread, reverse=True)
+    assert spread[-1] < 0.05
 
 
 def test_a_lost_track_costs_as_much_as_the_clip():

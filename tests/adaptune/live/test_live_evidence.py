@@ -1,0 +1,253 @@
+from functools import cache
+
+import numpy as np
+import pytest
+from rooms import moved, scan_at, street
+
+from adaptune.live import live_evidence
+from adaptune.live.hop import LENGTHS, Hop
+from adaptune.live.live_evidence import LOST, TWICE, LiveEvidence
+from adaptune.model.bank_weights import measured_weights
+from adaptune.odometry.base import Motions
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
+
+STEP = 1.0
+"""Metres from scan to scan, ten a second."""
+NOTHING = Scan(0, np.zeros((0, 3), np.float32))
+
+
+@cache
+def scan(i):
+    return scan_at(street(), STEP * i, seed=i)
+
+
+def exact(start, end, guesses):  # noqa: ARG001 - as `register`
+    """In place of registrations: what the sensor moved, from its numbered scans."""
+    return Hop(moved(STEP * (end.number - start.number)), np.eye(3))
+
+
+class Numbered:
+    """In place of a cloud."""
+
+    def __init__(self, scan, T_previous_current, seconds):  # noqa: ARG002 - as `HopCloud`
+        self.number = scan.stamp // 10**8
+
+
+@pytest.fixture
+def exactly(monkeypatch):
+    """Registrations that are right; the test may put others in their place."""
+    monkeypatch.setattr(live_evidence, "HopCloud", Numbered)
+    monkeypatch.setattr(live_evidence, "register", exact)
+    return lambda register: monkeypatch.setattr(live_evidence, "register", register)
+
+
+def drive(live, n, motions, scans=None, first=0):
+    """Show scans, and measure once a second; returns what was measured."""
+    found = []
+    for i in range(first, first + n):
+        one = NOTHING if scans is None else scans(i)
+        stamp = i * 10**8
+        live.observe(stamp, Scan(stamp, one.points), motions(i - 1))
+        if i % 10 == 0:
+            found.append(live.measure())
+    return [one for one in found if one is not None]
+
+
+def bank(*factors):
+    """Motions of a bank whose first member's are its own, each with a factor on its speed."""
+
+    def motions(i):  # noqa: ARG001 - the same over every scan
+        members = {trial: moved(STEP * factor) for trial, factor in enumerate(factors)}
+        return Motions(members[0], members)
+
+    return motions
+
+
+def test_the_weights_leave_a_member_that_drifts():
+    """By registrations of scans."""
+    live = LiveEvidence((0, 1, 2))
+    found = drive(live, 31, bank(1.0, 1.005, 1.03), scan)
+    assert [round((one.end - one.start) / 1e8) for one in found] == [5, 10, 10]
+    squares = live.squares()
+    assert squares.products[0, 0] < 0.3**2
+    assert squares.products[2, 2] == pytest.approx(3.0**2, rel=0.15)
+    assert squares.products[1, 1] < 1.0
+    first, _, third = measured_weights(3, squares)
+    assert third < 0.02
+    assert first > 0.6
+    assert live.own_error(10.0).mean < 0.3
+    assert not live.lost
+
+
+def test_a_member_in_front_is_left_too(exactly):  # noqa: ARG001
+    live = LiveEvidence((0, 1))
+    drive(live, 200, bank(1.03, 1.0))
+    assert measured_weights(2, live.squares())[1] > 0.95
+
+
+def test_nothing_is_measured_before_the_first_hop(exactly):  # noqa: ARG001
+    live = LiveEvidence()
+    assert drive(live, 6, bank(1.0)) == []
+    assert live.squares() is None
+    assert live.own_error(25.0) is None
+    assert not live.lost
+    selection = live.estimated(Selection(3, {}), 25.0)
+    assert np.isnan(selection.estimated_error)
+
+
+def test_a_shorter_hop_takes_the_place_of_one_that_is_rejected(exactly):
+    def short_only(start, end, guesses):
+        far = end.number - start.number
+        return exact(start, end, guesses) if far < LENGTHS[0] else None
+
+    exactly(short_only)
+    live = LiveEvidence()
+    found = drive(live, 101, bank(1.0))
+    assert {round((one.end - one.start) / 1e8) for one in found} == {int(LENGTHS[1])}
+    assert not live.lost
+
+
+def test_a_robot_that_stands_measures_nothing(exactly):
+    asked = []
+    exactly(lambda *hop: asked.append(hop))
+    live = LiveEvidence((0, 1))
+    assert drive(live, 3000, bank(0.0, 0.001)) == []
+    assert asked == []
+    assert not live.lost
+    # It needs no more memory than at first.
+    assert len(live._anchors) == 1
+
+
+def test_its_memory_is_bounded_on_a_long_drive(exactly):  # noqa: ARG001
+    live = LiveEvidence((0, 1))
+    drive(live, 2000, bank(1.0, 1.01))
+    assert len(live._anchors) <= LENGTHS[0] + 2
+    assert len(live._hops.errors) <= 32
+
+
+def test_it_is_lost_after_two_rejections_in_a_row_and_sound_again(exactly):
+    live = LiveEvidence((0, 1))
+    drive(live, 50, bank(1.0, 1.0))
+    exactly(lambda *_: None)
+    states = []
+    for i in range(50, 80, 10):
+        drive(live, 10, bank(1.0, 1.0), first=i)
+        states.append(live.lost)
+    assert states == [False, True, True]
+    assert live.estimated(Selection(0, {}), 25.0).lost
+    exactly(exact)
+    drive(live, 10, bank(1.0, 1.0), first=80)
+    assert not live.lost
+
+
+def test_it_is_lost_where_two_hops_disagree_with_it(exactly):  # noqa: ARG001
+    live = LiveEvidence((0, 1))
+    far_off = 1.0 + 1.5 * LOST / 100.0
+    drive(live, 20, bank(far_off, 1.0))
+    assert not live.lost  # one hop
+    drive(live, 10, bank(far_off, 1.0), first=20)
+    assert live.lost
+    assert live.wrong == {0}
+    selection = live.estimated(Selection(0, {}), 25.0)
+    assert selection.restart == {0}
+    assert selection.estimated_error > LOST / 2
+    drive(live, 20, bank(1.0, 1.0), first=30)
+    assert not live.lost
+    assert live.wrong == frozenset()
+
+
+def test_a_member_without_poses_is_wrong(exactly):  # noqa: ARG001
+    nan = np.full((4, 4), np.nan)
+
+    def motions(_):
+        return Motions(moved(STEP), {5: moved(STEP), 7: nan})
+
+    live = LiveEvidence((5, 7))
+    drive(live, 10 * (TWICE + 2), motions)
+    assert live.wrong == {7}
+    squares = live.squares()
+    assert np.isfinite(squares.products).all()
+    assert squares.products[1, 1] > 20.0
+    assert measured_weights(2, squares)[1] < 0.05
+    assert not live.lost
+
+
+def test_a_bank_without_a_pose_is_wrong_and_comes_back(exactly):  # noqa: ARG001
+    nan = np.full((4, 4), np.nan)
+    live = LiveEvidence((0,))
+    drive(live, 30, bank(1.0))
+
+    def failing(i):
+        return Motions(nan, {0: nan}) if i in (35, 45) else bank(1.0)(i)
+
+    drive(live, 21, failing, first=30)
+    assert live.lost  # two hops in a row lead over a scan without a pose
+    assert live.wrong == {0}
+    drive(live, 20, failing, first=51)
+    assert not live.lost
+    assert live.wrong == frozenset()
+
+
+def test_after_a_reset_it_is_as_new(exactly):  # noqa: ARG001
+    live = LiveEvidence((0, 1))
+    drive(live, 60, bank(1.5, 1.0))
+    assert live.lost
+    live.reset()
+    assert not live.lost
+    assert live.squares() is None
+    assert live.wrong == frozenset()
+    drive(live, 60, bank(1.0, 1.0))
+    assert live.own_error(10.0).mean < 0.01
+
+
+def test_it_forgets_the_hops_of_another_set(exactly):  # noqa: ARG001
+    live = LiveEvidence()
+    drive(live, 60, bank(1.05))
+    live.forget()
+    assert live.squares() is None
+    # No hop goes back to what another set drove.
+    found = drive(live, 40, bank(1.0), first=60)
+    assert found
+    assert min(one.start for one in found) >= 59 * 10**8
+    assert live.own_error(10.0).mean < 0.01
+
+
+def test_the_own_error_is_scaled_to_the_length(exactly):  # noqa: ARG001
+    live = LiveEvidence()
+    drive(live, 101, bank(1.02))
+    # Of the way that the odometry believes to have driven.
+    error = live.own_error(100.0)
+    at_ten, at_hundred = live.own_error(10.0).mean, error.mean
+    assert at_ten == pytest.approx(2.0, rel=0.1)
+    assert at_hundred / at_ten == pytest.approx(10.0**live_evidence.GROWTH)
+    assert 0.5 * error.mean < error.low < error.mean < error.high < 3.0 * error.mean
+    drive(live, 200, bank(1.02), first=101)
+    more = live.own_error(100.0)
+    assert more.mean == pytest.approx(error.mean, rel=0.1)
+    assert more.high - more.low < error.high - error.low
+
+
+def test_only_members_that_disagree_are_further_guesses(exactly):
+    asked = []
+
+    def register(start, end, guesses):
+        asked.append([guess[0, 3] for guess in guesses])
+        return exact(start, end, guesses)
+
+    exactly(register)
+    live = LiveEvidence((0, 1, 2, 3, 4))
+    drive(live, 21, bank(1.0, 1.01, 1.1, 1.2, 1.3))
+    assert len(asked[0]) == 3
+    np.testing.assert_allclose(np.array(asked[0]) / asked[0][0], [1.0, 1.1, 1.2], atol=1e-6)
+
+
+def test_what_a_hop_cannot_tell_counts_for_nothing(exactly):
+    def blind_along(start, end, guesses):
+        return exact(start, end, guesses)._replace(projection=np.diag([0.0, 1.0, 1.0]))
+
+    exactly(blind_along)
+    live = LiveEvidence((0, 1))
+    drive(live, 60, bank(1.0, 1.5))
+    np.testing.assert_allclose(live.squares().products, 0.0, atol=1e-12)
+    assert live.wrong == frozenset()

@@ -1,0 +1,137 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from adaptune.live.hop import NOISE
+from adaptune.live.squares import (
+    CLIP,
+    METRES,
+    SECONDS,
+    HopErrors,
+    LiveSquares,
+    blend,
+    clip_to_median,
+    live_squares,
+)
+from adaptune.model.bank_weights import minimum_variance_weights
+
+ERRORS = arrays(np.float64, (6, 4, 3), elements=st.floats(-1.0, 1.0))
+OFFSETS = arrays(np.float64, (6, 1, 3), elements=st.floats(-0.2, 0.2))
+
+
+def hops(errors, start=None, length=10.0):
+    n = len(errors)
+    start = 10.0 * np.arange(n) if start is None else np.asarray(start, float)
+    return HopErrors(np.asarray(errors, float), start, start + length, np.arange(n, dtype=float))
+
+
+def empty(n_members):
+    return HopErrors(np.empty((0, n_members, 3)), *np.empty((3, 0)))
+
+
+@settings(deadline=None)  # SciPy is imported when it is first needed
+@given(ERRORS, st.floats(0.0, 2.0))
+def test_what_all_members_share_changes_no_weights(errors, constant):
+    """Such as the registration's own error."""
+    products = live_squares(hops(errors)).products + 0.1 * np.eye(4)
+    plain, shifted = (
+        minimum_variance_weights(s, even=0.0) for s in (products, products + constant)
+    )
+    np.testing.assert_allclose(shifted, plain, atol=1e-5)
+
+
+@given(ERRORS, OFFSETS)
+def test_an_offset_of_a_hop_moves_all_errors_and_none_is_clipped_for_it(errors, offset):
+    apart, missing = clip_to_median(errors + offset)
+    np.testing.assert_allclose(apart, errors + offset, atol=1e-12)
+    assert not missing.any()
+
+
+def test_products_are_means_over_hops():
+    errors = np.zeros((2, 2, 3))
+    errors[0, 0], errors[0, 1], errors[1, 1] = [1.0, 2.0, 0.0], [2.0, 0.0, 1.0], [0.0, 2.0, 0.0]
+    found = live_squares(hops(errors))
+    np.testing.assert_allclose(found.products, [[2.5, 1.0], [1.0, 4.5]])
+    assert live_squares(empty(2)) is None
+
+
+def test_a_member_that_departs_from_the_others_counts_up_to_a_limit():
+    errors = np.zeros((1, 3, 3))
+    errors[:, 2, 0] = 40.0
+    kept, _ = clip_to_median(errors)
+    np.testing.assert_allclose(kept[0, :, 0], [0.0, 0.0, CLIP])
+    # If all err alike it is the place, or the registration, and nobody is clipped.
+    kept, _ = clip_to_median(errors * 0.0 + 40.0)
+    np.testing.assert_allclose(kept, 40.0)
+
+
+def test_a_member_without_a_pose_counts_as_lost():
+    errors = np.ones((2, 3, 3))
+    errors[1, 1] = np.nan
+    found = live_squares(hops(errors))
+    np.testing.assert_allclose(found.products.diagonal(), [3.0, 3.0 + CLIP**2 / 2, 3.0])
+    np.testing.assert_allclose(found.products[0, 2], 3.0)
+    # Nobody had one.
+    found = live_squares(hops(np.full((1, 2, 3), np.nan)))
+    np.testing.assert_allclose(found.products, CLIP**2 * np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("start", "windows"),
+    [
+        ([0.0], 1.0),
+        ([0.0, 10.0, 20.0], 3.0),
+        ([0.0, 5.0], 1.5),
+        ([0.0, 1.0, 2.0, 3.0, 4.0, 5.0], 1.5),
+        ([30.0, 0.0], 2.0),  # what lies between them was not driven
+        ([0.0, 0.0, 0.0], 1.0),
+    ],
+)
+def test_windows_are_counted_by_the_path_that_they_cover(start, windows):
+    assert live_squares(hops(np.ones((len(start), 2, 3)), start)).windows == pytest.approx(windows)
+
+
+def test_a_hop_within_another_adds_no_window():
+    inner = HopErrors(
+        np.ones((3, 1, 3)), np.array([0.0, 2.0, 10.0]), np.array([10.0, 7.0, 20.0]), np.zeros(3)
+    )
+    assert live_squares(inner).windows == pytest.approx(20.0 / (25.0 / 3.0))
+
+
+@pytest.mark.parametrize("length", [10.0, 5.0])
+def test_the_registrations_own_part_grows_with_shorter_hops(length):
+    found = live_squares(hops(np.ones((3, 2, 3)), length=length))
+    assert found.noise == pytest.approx((100.0 * NOISE / length) ** 2)
+
+
+def test_a_hop_counts_while_it_is_young_or_near():
+    old = hops(np.zeros((1, 1, 3)))
+    kept = old.recent(METRES, SECONDS + 9.0)
+    assert len(kept.errors) == 1
+    assert len(old.recent(METRES + 1.0, SECONDS).errors) == 1
+    assert [len(a) for a in old.recent(METRES + 1.0, SECONDS + 1.0)] == [0, 0, 0, 0]
+    every = empty(1)
+    for i in range(500):
+        every = every.with_hop(np.full((1, 3), float(i)), 1.0 * i, 1.0 * i + 10.0, 1.0 * i)
+    assert len(every.errors) <= SECONDS + 1
+    assert every.errors[-1, 0, 0] == 499.0
+
+
+def test_a_prior_and_measurements_weigh_by_their_windows():
+    prior = np.array([[1.0, 0.5], [0.5, 4.0]])
+    # Squares of 3 and 12 without noise: the same comparison as the prior, at a harder place.
+    live = LiveSquares(3.0 * prior + 1.0, 1.0, 2.0)
+    np.testing.assert_allclose(blend(prior, 2.0, live), prior + 1.0 / 6.0)
+    other = LiveSquares(prior[::-1, ::-1], 0.0, 6.0)
+    np.testing.assert_allclose(blend(prior, 2.0, other), 0.25 * prior + 0.75 * prior[::-1, ::-1])
+    np.testing.assert_array_equal(blend(prior, 2.0, None), prior)
+
+
+def test_measurements_without_error_and_with_nothing_but_noise_are_finite():
+    for products, noise in ((np.zeros((2, 2)), 0.0), (np.full((2, 2), 0.01), 5.0)):
+        found = blend(np.eye(2), 3.0, LiveSquares(products, noise, 4.0))
+        assert np.isfinite(found).all()
+        assert (found.diagonal() > 0.0).all()
+    assert np.isfinite(blend(np.zeros((2, 2)), 3.0, LiveSquares(np.eye(2), 0.0, 1.0))).all()
