@@ -11,7 +11,7 @@ mean of the training sequences' errors; a bank whose members always have the sam
 
 import argparse
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,12 +20,14 @@ from gain_data import ODOMETRIES, WINDOW, factory_of, labelled, training_courses
 from numpy.typing import NDArray
 
 from adaptune.descriptor.ndt_histogram import N_FEATURES
+from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
 from adaptune.model.bank_weights import weighted_selection
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.health import HealthCheck
 from adaptune.selection import Selection
 from adaptune.selector import Selector
@@ -67,6 +69,9 @@ class Constant:
         """See `adaptune.selector.Selector.select`."""
         return self._selection
 
+    def measure(self) -> None:
+        """See `adaptune.selector.Selector.measure`."""
+
 
 def geometric(data: LabelledData) -> int:
     """The set with the least geometric mean of the sequences' errors."""
@@ -82,8 +87,15 @@ def model_of(odometry: str, data: LabelledData) -> ErrorModel:
     return replace(model, paired=choose(data, 0).one_set)
 
 
-def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
-    """All ways to replay a course, by name."""
+def untrained(factory: OdometryFactory) -> Way:
+    """A bank of which nothing is known."""
+    sets = untrained_sets(factory.space)
+    members = dict(zip(sets.trials, sets.parameters, strict=True))
+    return lambda: Bank(factory, members, WarmUp()), UntrainedSelector(sets, SUB_TRAJECTORY)
+
+
+def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, Way]:
+    """Ways to replay a course, by name."""
     model = model_of(odometry, data)
     print(f"settings of the paired rule: {model.paired}")
     factory, sets = factory_of(odometry), model.sets
@@ -107,24 +119,26 @@ def ways(odometry: str, data: LabelledData) -> dict[str, Way]:
             selector = Constant(weighted_selection(sets, weights))
         return lambda: Bank(factory, {t: sets[t] for t in members}, WarmUp()), selector
 
-    return {
-        "baseline": alone(None),
-        "fixed": alone(model.fixed),
-        "fixed, geometric": alone(geometric(data)),
-        "paper": live("paper"),
-        "paired": live("paired"),
-        "bank of 2": bank(2),
-        "bank of 3": bank(3),
-        "bank of 4": bank(4),
-        "4, even weights": bank(4, even=True),
+    made: dict[str, Callable[[], Way]] = {
+        "baseline": lambda: alone(None),
+        "fixed": lambda: alone(model.fixed),
+        "fixed, geometric": lambda: alone(geometric(data)),
+        "paper": lambda: live("paper"),
+        "paired": lambda: live("paired"),
+        "bank of 2": lambda: bank(2),
+        "bank of 3": lambda: bank(3),
+        "bank of 4": lambda: bank(4),
+        "4, even weights": lambda: bank(4, even=True),
+        "untrained": lambda: untrained(factory),
     }
+    return {name: make() for name, make in made.items() if name == "fixed" or name in modes}
 
 
 def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[Replay]:
     """Replay a course in all ways."""
     replays = []
     for make, selector in compared.values():
-        if isinstance(selector, Selector):
+        if isinstance(selector, Selector | UntrainedSelector):
             selector.reset()
         replays.append(replay(scans, make(), HealthCheck(), selector))
     return replays
@@ -152,18 +166,27 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=8)
     parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
-    parser.add_argument("--modes", nargs="+", help="besides fixed; all if left out")
+    parser.add_argument(
+        "--modes", nargs="+", default=["baseline", "bank of 4", "untrained"], help="besides fixed"
+    )
+    parser.add_argument("--without", nargs="+", default=[], help="scenes that are not trained on")
     parser.add_argument("--length", type=float, default=120.0, help="of the training courses")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
     odometry, seed = arguments.odometry, arguments.seed
-    paths = trials(arguments.folder, odometry, training_courses(seed, arguments.length), seed)
-    compared = ways(odometry, labelled(paths, factory_of(odometry).space))
-    if arguments.modes:
-        compared = {n: way for n, way in compared.items() if n == "fixed" or n in arguments.modes}
+    courses = {
+        name: course
+        for name, course in training_courses(seed, arguments.length).items()
+        if not set(course.scenes) & set(arguments.without)
+    }
+    paths = trials(arguments.folder, odometry, courses, seed)
+    data = labelled(paths, factory_of(odometry).space)
+    compared = ways(odometry, data, arguments.modes)
     print(f"{'mean RTE [%]':32}" + "".join(f"{name:>18}" for name in compared))
     means: list[list[float]] = []
     for i, scenes in enumerate(ORDERS):
+        if arguments.without and not set(scenes) & set(arguments.without):
+            continue
         course = Course(scenes=scenes, length=LENGTH, seed=1000 * seed + 500 + i)
         scans = list(simulate(course))
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])

@@ -306,10 +306,12 @@ def minimum_variance_weights(
     harmonic = 1.0 / (1.0 / np.maximum(squares.diagonal(), 1e-12)).mean()
     squares = squares + np.eye(n) * (even * harmonic + 1e-9 * squares.diagonal().max() + 1e-12)
     # Up to a factor they are those for which w'Sw - 2 sum w is least.
-    root = np.linalg.cholesky(squares)
-    from scipy.optimize import nnls  # not needed to load a model
+    weights = np.linalg.solve(squares, np.ones(n))
+    if weights.min() < 0.0:
+        from scipy.optimize import nnls  # not needed to load a model
 
-    weights, _ = nnls(root.T, np.linalg.solve(root, np.ones(n)))
+        root = np.linalg.cholesky(squares)
+        weights, _ = nnls(root.T, np.linalg.solve(root, np.ones(n)))
     return np.asarray(weights / weights.sum())
 
 
