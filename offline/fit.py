@@ -83,7 +83,11 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
         bank=members,
         vectors=complete.vectors(members),
         bank_settings=chosen.bank,
-        expected={way: figures._asdict() for way, figures in chosen.expected.items()},
+        # As they are read back, so that the same model is the same file.
+        expected={
+            way: {key: float(value) for key, value in figures._asdict().items()}
+            for way, figures in chosen.expected.items()
+        },
     )
 
 

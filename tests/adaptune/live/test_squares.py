@@ -95,9 +95,9 @@ def test_windows_are_counted_by_the_path_that_they_cover(start, windows):
 
 def test_a_hop_within_another_adds_no_window():
     inner = HopErrors(
-        np.ones((3, 1, 3)), np.array([0.0, 2.0, 10.0]), np.array([10.0, 7.0, 20.0]), np.zeros(3)
+        np.ones((3, 1, 3)), np.array([0.0, 2.0, 10.0]), np.array([20.0, 7.0, 25.0]), np.zeros(3)
     )
-    assert live_squares(inner).windows == pytest.approx(20.0 / (25.0 / 3.0))
+    assert live_squares(inner).windows == pytest.approx(25.0 / (40.0 / 3.0))
 
 
 @pytest.mark.parametrize("length", [10.0, 5.0])
