@@ -21,7 +21,7 @@ LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
 TWICE = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
-GROWTH = -0.3
+GROWTH = -0.15
 """The error over `length` metres, as a share of them, grows with this power of the length."""
 _APART = 0.3
 """Metres between guesses that are worth a registration each."""
