@@ -23,10 +23,10 @@ class Selection(NamedTuple):
     predicted_fixed : float
         Percent, the predicted error of the fixed set at this scan.
     familiarity : float
-        Share of the training frames that are farther from the other training sequences than the
+        Share of the training frames that are farther from the other training stretches than the
         scan is from all of them; NaN where the rule does not compute it.
     n_sequences : float
-        Effective number of training sequences that the selection rests on: one over the sum of
+        Effective number of training stretches that the selection rests on: one over the sum of
         their squared weights; NaN where they have none.
     estimated_error, estimated_low, estimated_high : float
         Percent, the odometry's own error over the last metres as it was measured without ground

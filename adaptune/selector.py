@@ -56,7 +56,7 @@ class Selector:
     members
         Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
         weighs them, others choose among them. None takes the model's bank for the paired rule if
-        the bank was shown to pay; an empty one is for a single odometry.
+        that is what is driven; an empty one is for a single odometry.
     switch_cost
         What a switch must promise, as a share of the fixed set's error.
     descriptors

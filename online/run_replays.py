@@ -192,14 +192,14 @@ def _replay(
 
 
 def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:
-    """Warn of selections that rest on hardly more than one training sequence."""
+    """Warn of selections that rest on hardly more than one training stretch."""
     left = [s for s in selections if s.trial != fixed]
     few = sum(s.n_sequences < SCANT for s in left)
     if few:
         _log.warning(
             "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
-            "one training sequence (see selections.csv); more sequences would show whether they "
-            "hold",
+            "one stretch of the training (see selections.csv); more recordings would show whether "
+            "they hold",
             what,
             few,
             len(left),

@@ -120,7 +120,7 @@ def measure_switching(
         | dict(zip(study.config.training, ratios[what], strict=True))
         for what, mean in means.items()
     ]
-    # A bank never switches: where it was not shown to pay, one set follows another.
+    # A bank never switches: where another way has less expected loss, one set follows another.
     live = study.mechanism != "hand_over" and study.odometry.description.live
     own = "live" if live else _name(warm_up)
     found = {

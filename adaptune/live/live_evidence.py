@@ -28,6 +28,8 @@ _APART = 0.3
 _GUESSES = 3
 _TRY_AGAIN = 5
 """After so many shorter hops, a long one is tried again."""
+_FEWEST_DIRECTIONS = 1.5
+"""A hop must tell the motion in two directions at least."""
 _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
 
@@ -117,7 +119,11 @@ class LiveEvidence:
         if self._newest is None:
             T[:] = np.eye(4)
         self._T_odom_sensor = rectify(self._T_odom_sensor @ T)
-        self._metres += float(np.linalg.norm(T[0, :3, 3]))
+        # The straight way since the last anchor: a robot that stands does not drive by jitter.
+        if self._anchors:
+            last = self._anchors[-1]
+            way = invert(last.T_odom_sensor[0]) @ self._T_odom_sensor[0]
+            self._metres = last.metres + float(np.linalg.norm(way[:3, 3]))
         seconds = 0.0 if self._newest is None else (before - self._newest.stamp) * 1e-9
         self._newest = _Anchor(
             before,
@@ -156,6 +162,10 @@ class LiveEvidence:
                 continue
             tried = True
             hop = register(start.cloud, end.cloud, self._guesses(start, end))
+            if hop is not None and np.trace(hop.projection) < _FEWEST_DIRECTIONS:
+                # On an open plain only height can be told; that is no loss of track.
+                self._measured = end.metres
+                return None
             if hop is not None:
                 self._short = 0 if long else self._short
                 self._take(start, end, hop)
@@ -190,7 +200,9 @@ class LiveEvidence:
         self._hops = self._hops.with_hop(errors, start.metres, end.metres, end.stamp * 1e-9)
         self._measured = end.metres
         self._rejected = 0
-        wrong = ~(np.linalg.norm(errors, axis=1) <= LOST)
+        # A scan without a pose says nothing of the rest of the hop.
+        with np.errstate(invalid="ignore"):
+            wrong = np.linalg.norm(errors, axis=1) > LOST
         self._wrong = np.where(wrong, self._wrong + 1, 0)
         self._disagreeing = int(self._wrong[0])
         self._update_lost()
@@ -198,11 +210,16 @@ class LiveEvidence:
     def _update_lost(self) -> None:
         self.lost = max(self._rejected, self._disagreeing) >= TWICE
 
-    @property
-    def wrong(self) -> frozenset[int]:
-        """Trial numbers of the members that two hops in a row have shown to be lost."""
-        pairs = zip(self.members, self._wrong[1:], strict=True)
-        return frozenset(trial for trial, n in pairs if n >= TWICE)
+    def _told_to_restart(self) -> frozenset[int]:
+        """Trial numbers of the members that two hops in a row have shown to be lost.
+
+        Each is told once. Then only hops that begin after that count against it.
+        """
+        told = self._wrong >= TWICE
+        told[0] = False
+        self._wrong = np.where(told, 0, self._wrong)
+        self._no_pose = self._no_pose + told
+        return frozenset(np.array(self.members, np.intp)[told[1:]].tolist())
 
     def squares(self) -> LiveSquares | None:
         """What the last hops say of the members, or of a single odometry; None without any."""
@@ -215,6 +232,10 @@ class LiveEvidence:
         """
         self._hops = HopErrors(*(array[:0] for array in self._hops))
         self._anchors.clear()
+        self._measured = -np.inf
+        self._wrong[:] = 0
+        self._rejected = self._disagreeing = 0
+        self.lost = False
 
     def own_error(self, length: float) -> OwnError | None:
         """The odometry's, or the bank's, own error over the last hops; None without any.
@@ -249,7 +270,7 @@ class LiveEvidence:
             estimated_low=error.low,
             estimated_high=error.high,
             lost=self.lost,
-            restart=self.wrong,
+            restart=self._told_to_restart(),
         )
 
 

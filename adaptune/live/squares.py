@@ -10,8 +10,8 @@ from adaptune.live.hop import NOISE
 SECONDS, METRES = 30.0, 30.0
 """A hop counts as long as it is no older, or no farther behind, than this."""
 CLIP = 5.0
-"""Percent of a hop by which a member may differ from the others' median, for weights: beyond that
-it is lost, and how far says nothing more."""
+"""Percent of a hop by which a member may differ from the best one, for weights: beyond that it is
+lost, and how far says nothing more."""
 
 
 class HopErrors(NamedTuple):
@@ -61,7 +61,7 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
     if not n_hops:
         return None
     length = hops.end - hops.start
-    errors, missing = clip_to_median(hops.errors)
+    errors, missing = clip_to_best(hops.errors)
     products = np.einsum("hix,hjx->ij", errors, errors) / n_hops
     products += np.diag(missing.mean(axis=0)) * CLIP**2
     noise = float(((100.0 * NOISE / length) ** 2).mean())
@@ -71,10 +71,10 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
     return LiveSquares(products, noise, max(1.0, float(covered / length.mean())))
 
 
-def clip_to_median(
+def clip_to_best(
     errors: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Clip errors at `CLIP` from the members' median.
+    """Clip errors at `CLIP` from those of the member with the least error of each hop.
 
     Parameters
     ----------
@@ -84,14 +84,15 @@ def clip_to_median(
     Returns
     -------
     errors : ndarray of the same shape
-        The median where there was none.
+        The best member's where there was none.
     missing : ndarray of shape (n_hops, n_members)
         Where there was none.
     """
     missing = np.asarray(~np.isfinite(errors).all(axis=-1))
     known = np.where(missing[..., None], np.nan, errors)
     known[missing.all(axis=1)] = 0.0
-    centre = np.nanmedian(known, axis=1, keepdims=True)
+    best = np.nanargmin(np.linalg.norm(known, axis=-1), axis=1)
+    centre = known[np.arange(len(known)), best][:, None]
     apart = np.where(missing[..., None], 0.0, known - centre)
     lengths = np.linalg.norm(apart, axis=-1, keepdims=True)
     return centre + apart * np.minimum(1.0, CLIP / np.maximum(lengths, 1e-9)), missing

@@ -142,7 +142,7 @@ class ErrorModel:
 
     @property
     def bank_adapts(self) -> bool:
-        """Whether there is a bank, and it was shown to pay."""
+        """Whether there is a bank, and it is what is driven."""
         return bool(self.bank) and self.bank_settings.adapt
 
     def pca(self) -> "ScaledPCA":

@@ -128,7 +128,7 @@ def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool)
     mode
         A selection rule.
     model
-        The error model. A bank that was not shown to pay would only cost.
+        The error model. A bank with more expected loss would only cost.
     mechanism
         The study's.
     live

@@ -12,7 +12,7 @@ from adaptune.live.squares import (
     HopErrors,
     LiveSquares,
     blend,
-    clip_to_median,
+    clip_to_best,
     live_squares,
 )
 from adaptune.model.bank_weights import minimum_variance_weights
@@ -44,7 +44,7 @@ def test_what_all_members_share_changes_no_weights(errors, constant):
 
 @given(ERRORS, OFFSETS)
 def test_an_offset_of_a_hop_moves_all_errors_and_none_is_clipped_for_it(errors, offset):
-    apart, missing = clip_to_median(errors + offset)
+    apart, missing = clip_to_best(errors + offset)
     np.testing.assert_allclose(apart, errors + offset, atol=1e-12)
     assert not missing.any()
 
@@ -60,10 +60,10 @@ def test_products_are_means_over_hops():
 def test_a_member_that_departs_from_the_others_counts_up_to_a_limit():
     errors = np.zeros((1, 3, 3))
     errors[:, 2, 0] = 40.0
-    kept, _ = clip_to_median(errors)
+    kept, _ = clip_to_best(errors)
     np.testing.assert_allclose(kept[0, :, 0], [0.0, 0.0, CLIP])
     # If all err alike it is the place, or the registration, and nobody is clipped.
-    kept, _ = clip_to_median(errors * 0.0 + 40.0)
+    kept, _ = clip_to_best(errors * 0.0 + 40.0)
     np.testing.assert_allclose(kept, 40.0)
 
 
