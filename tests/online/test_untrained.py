@@ -183,7 +183,8 @@ def test_the_command_line_names_what_follows(study_file, tmp_path):
     done = CliRunner().invoke(app, ["online", *words, "--untrained"])
     assert done.exit_code == 0, done.output
     assert "2 of 2 replays made" in done.stdout
-    done = CliRunner().invoke(app, ["compare", *words])
+    # A narrow terminal breaks the column's name.
+    done = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["compare", *words])
     assert done.exit_code == 0, done.output
     assert "vs baseline" in done.stdout
     assert "fixed.yaml" not in done.stdout
