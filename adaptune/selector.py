@@ -98,7 +98,7 @@ class Selector:
             BankRule(model.bank_settings) if weighs else make_rule(rule, model.paired, switch_cost)
         )
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
-        self._live = LiveEvidence(self.members)
+        self._live = LiveEvidence(self.members, model.length)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -172,7 +172,7 @@ class Selector:
         elif selection.trial != self._current:
             self._live.forget()  # the hops were those of another set
         self._current, self._predicted = selection.trial, selection.predicted_error
-        return self._live.estimated(selection, self._model.length)
+        return self._live.estimated(selection)
 
     def measure(self) -> None:
         """Measure how wrong the odometry, or each member of the bank, was over the last metres.
@@ -193,7 +193,7 @@ class Selector:
         """The sets that have done worse than predicted over the last metres."""
         seconds = self._stamp * 1e-9
         self._avoided = {t: until for t, until in self._avoided.items() if until > seconds}
-        error = self._live.own_error(self._model.length)
+        error = self._live.own_error()
         current = self._current
         if error is not None and current is not None and error.low > WORSE * self._predicted:
             self._avoided[current] = seconds + AVOIDED

@@ -5,7 +5,8 @@
 Rules are fitted on the 24 sequences of `benchmarks/gain.py`, and eight mixed courses of other
 worlds are replayed with keyframe GICP (or NDT), each with the health check. The script prints the
 mean of min(RTE, 30 %) over 25 m, in brackets how often the health check restarted the odometry, and
-ratios to the fixed set's error. The rivals: the defaults; the set that is fixed by the geometric
+ratios to the fixed set's error. Below the errors are the odometry's own estimates, where it made
+any. The rivals: the defaults; the set that is fixed by the geometric
 mean of the training sequences' errors; a bank whose members always have the same weight.
 """
 
@@ -191,13 +192,16 @@ def main() -> None:
         scans = list(simulate(course))
         T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
-        row = f"{' '.join(scenes):32}"
+        row, estimated = f"{' '.join(scenes):32}", ""
         for result in replays_of(scans, compared):
             T_odom_sensor = result.trajectory.T_world_sensor
             errors = sub_trajectory_rte(T_world_sensor, T_odom_sensor, SUB_TRAJECTORY)
             means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
             row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
-        print(row, flush=True)
+            own = [choice.selection.estimated_error for choice in result.choices]
+            known = not np.isnan(own).all()
+            estimated += f"{np.nanmean(own):12.3f}      " if known else " " * 18
+        print(row, f"{'  its own estimate':32}{estimated}".rstrip(), sep="\n", flush=True)
     print_table(list(compared), np.array(means))
 
 

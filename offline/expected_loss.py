@@ -93,7 +93,9 @@ def standard_error(logs: Logs, recordings: Sequence[str]) -> float:
         return float(np.sqrt(sums @ sums * n / (n - 1)) / len(logs))
     # Means of few vary too little.
     scale = np.sqrt(len(logs) / (len(logs) - 1))
-    return float(scale * _resampled_means(logs, number).std())
+    # Of two or three stretches, nearly all resamples are alike.
+    independent = float(logs.std(ddof=1) / np.sqrt(len(logs)))
+    return max(independent, float(scale * _resampled_means(logs, number).std()))
 
 
 def _resampled_means(logs: Logs, number: NDArray[np.intp], seed: int = 0) -> NDArray[np.float64]:

@@ -53,6 +53,8 @@ BANK_SETTINGS = [
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
+ELSEWHERE, AS_MANY = float(np.log(0.8)), 2
+"""The loss of banks elsewhere, and as how many stretches it counts: few stretches show little."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
@@ -144,6 +146,8 @@ def least_loss(
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
+    if RELIES_ON_LIVE:
+        losses[n_single:] = _with_elsewhere(losses[n_single:], len(logs))
     expected: dict[str, Figures] = {}
     one_set, bank, members = DO_NOT_ADAPT, NO_BANK, next(iter(banks.values()), [])
     if n_single:
@@ -159,6 +163,12 @@ def least_loss(
         if losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
     return Policy(one_set, bank, members, expected)
+
+
+def _with_elsewhere(losses: NDArray[np.float64], n_stretches: int) -> NDArray[np.float64]:
+    """Expected losses of banks, drawn to what they are elsewhere; one that never adapts has 0."""
+    drawn = (n_stretches * losses + AS_MANY * ELSEWHERE) / (n_stretches + AS_MANY)
+    return np.where(losses == 0.0, 0.0, drawn)
 
 
 def _has_motions(data: LabelledData) -> bool:

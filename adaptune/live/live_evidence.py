@@ -1,7 +1,7 @@
 """What the errors of an odometry, or of a bank's members, were over the last metres."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, rectify, rotation_angle
 from adaptune.live.hop import LENGTHS, Hop, HopCloud, register
+from adaptune.live.own_error import Link, OwnError, OwnErrors
 from adaptune.live.squares import HopErrors, LiveSquares, live_squares
 from adaptune.odometry.base import Motions
 from adaptune.selection import Selection
@@ -19,10 +20,10 @@ SPACING = 1.0
 """Metres between scans that may be the start or the end of a hop."""
 LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
+DOUBTFUL = 5.0
+"""Percent of a hop. One that differs so much from the odometry is taken if the next does, too."""
 TWICE = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
-GROWTH = -0.15
-"""The error over `length` metres, as a share of them, grows with this power of the length."""
 _APART = 0.3
 """Metres between guesses that are worth a registration each."""
 _GUESSES = 3
@@ -32,14 +33,6 @@ _FEWEST_DIRECTIONS = 1.5
 """A hop must tell the motion in two directions at least."""
 _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
-
-
-class OwnError(NamedTuple):
-    """An odometry's own error, estimated without ground truth, in percent of the distance."""
-
-    mean: float
-    low: float  # 95 % interval
-    high: float
 
 
 class Measured(NamedTuple):
@@ -61,6 +54,20 @@ class _Anchor:
     no_pose: NDArray[np.intp]  # (1 + n_members,): scans without a pose so far
 
 
+class _Found(NamedTuple):
+    """A hop, and where it starts and ends."""
+
+    start: _Anchor
+    end: _Anchor
+    hop: Hop
+
+    def errors(self) -> NDArray[np.float64]:
+        """Of the odometry and the members, percent of the hop, of shape (1 + n_members, 3)."""
+        moved = invert(self.start.T_odom_sensor) @ self.end.T_odom_sensor
+        apart = (moved[:, :3, 3] - self.hop.T_start_end[:3, 3]) @ self.hop.projection.T
+        return np.asarray(100.0 / (self.end.metres - self.start.metres) * apart)
+
+
 class LiveEvidence:
     """Measures errors by hops, see `adaptune.live.hop`.
 
@@ -73,6 +80,8 @@ class LiveEvidence:
     ----------
     members
         Trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
+    length
+        Metres of the sub-trajectories whose mean error `own_error` estimates.
 
     Attributes
     ----------
@@ -80,8 +89,9 @@ class LiveEvidence:
         Whether the odometry or bank has lost track, as far as the last hops tell.
     """
 
-    def __init__(self, members: tuple[int, ...] = ()):
+    def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):
         self.members = members
+        self._own = OwnErrors(length)
         self.reset()
 
     def reset(self) -> None:
@@ -95,9 +105,12 @@ class LiveEvidence:
         self._anchors: deque[_Anchor] = deque()
         self._measured = -np.inf
         self._short = 0
+        self._doubtful: _Found | None = None
+        self._taken: _Found | None = None
         self._rejected = self._disagreeing = 0
         n = 1 + len(self.members)
         self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
+        self._own.clear()
         self._wrong = np.zeros(n, np.intp)
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
@@ -141,64 +154,87 @@ class LiveEvidence:
         """Register the newest scan whose motion is known to one some metres before.
 
         Nothing is measured before the first hop is complete, nor where the sensor has moved less
-        than a metre since the last one.
+        than a metre since the last one. A hop that contradicts the odometry counts only if the next
+        one does so, too: where a scene repeats itself, a registration can be wrong by metres.
 
         Returns
         -------
         Measured or None
-            None if no registration was accepted.
+            None if no registration was accepted, or this one is still in doubt.
         """
         end = self._newest
         if end is None or end.metres - self._measured < SPACING:
             return None
-        tried = False
-        for length in LENGTHS:
-            start = self._start_of(length, end)
-            if start is None:
-                continue
-            long = length == LENGTHS[0]
-            if long and 0 < self._short < _TRY_AGAIN:
-                self._short += 1
-                continue
-            tried = True
-            hop = register(start.cloud, end.cloud, self._guesses(start, end))
-            if hop is not None and np.trace(hop.projection) < _FEWEST_DIRECTIONS:
-                # On an open plain only height can be told; that is no loss of track.
-                self._measured = end.metres
-                return None
-            if hop is not None:
-                self._short = 0 if long else self._short
-                self._take(start, end, hop)
-                return Measured(start.stamp, end.stamp, hop)
-            if long:
-                self._short = 1
-        if tried:
-            self._measured = end.metres
+        starts = self._starts(end)
+        if not starts:
+            return None
+        self._measured = end.metres
+        found = self._register(starts, end)
+        if found is None:
             self._rejected += 1
             self._update_lost()
+        # On an open plain only height can be told; that is no loss of track.
+        elif np.trace(found.hop.projection) >= _FEWEST_DIRECTIONS:
+            return self._confirm(found)
         return None
 
-    def _start_of(self, length: float, end: _Anchor) -> _Anchor | None:
-        far = [anchor for anchor in self._anchors if end.metres - anchor.metres >= length]
-        return far[-1] if far and far[-1].stamp < end.stamp else None
+    def _starts(self, end: _Anchor) -> list[_Anchor]:
+        """Where a hop may start, in the order in which that is tried."""
+        long, short = (
+            next((a for a in reversed(self._anchors) if end.metres - a.metres >= length), None)
+            for length in LENGTHS
+        )
+        if long is not None and 0 < self._short < _TRY_AGAIN:
+            self._short += 1
+            long = None
+        return [a for a in (long, short) if a is not None and a.stamp < end.stamp]
 
-    def _guesses(self, start: _Anchor, end: _Anchor) -> Iterator[Poses]:
+    def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> _Found | None:
+        """The first registration that is accepted.
+
+        The odometry's own motion is the guess from every start, before members that disagree with
+        it are asked: where a scene repeats itself, one that is lost finds a registration, too.
+        """
+        guesses = [self._guesses(start, end) for start in starts]
+        for first, stop in ((0, 1), (1, _GUESSES)):
+            for start, of_start in zip(starts, guesses, strict=True):
+                hop = register(start.cloud, end.cloud, of_start[first:stop])
+                if end.metres - start.metres >= LENGTHS[0]:
+                    self._short = int(hop is None)
+                if hop is not None:
+                    return _Found(start, end, hop)
+        return None
+
+    def _guesses(self, start: _Anchor, end: _Anchor) -> list[Poses]:
         """The odometry's motion, and those of members that disagree with it."""
-        moved = invert(start.T_odom_sensor) @ end.T_odom_sensor
         tried: list[Poses] = []
-        for T in moved:
+        for T in invert(start.T_odom_sensor) @ end.T_odom_sensor:
             if all(_apart(T, other) > _APART for other in tried) and len(tried) < _GUESSES:
                 tried.append(T)
-                yield T
+        return tried
 
-    def _take(self, start: _Anchor, end: _Anchor, hop: Hop) -> None:
+    def _confirm(self, found: _Found) -> Measured | None:
+        """Take a hop that agrees with the odometry, or with the hop before."""
+        before, self._doubtful = self._doubtful, None
+        wrong = found.errors()[0]
+        if np.linalg.norm(wrong) > DOUBTFUL:
+            self._doubtful = found
+            if before is None or not _alike(wrong, before.errors()[0]):
+                return None
+            if before is not self._taken:
+                self._take(before)
+        self._take(found)
+        return Measured(found.start.stamp, found.end.stamp, found.hop)
+
+    def _take(self, found: _Found) -> None:
         """Compare with what was measured."""
-        length = end.metres - start.metres
-        moved = invert(start.T_odom_sensor) @ end.T_odom_sensor
-        errors = 100.0 / length * (moved[:, :3, 3] - hop.T_start_end[:3, 3]) @ hop.projection.T
+        self._taken = found
+        start, end, hop = found
+        errors = found.errors()
         errors[end.no_pose > start.no_pose] = np.nan
-        self._hops = self._hops.with_hop(errors, start.metres, end.metres, end.stamp * 1e-9)
-        self._measured = end.metres
+        ends = start.metres, end.metres, end.stamp * 1e-9
+        self._hops = self._hops.with_hop(errors, *ends)
+        self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
         self._rejected = 0
         # A scan without a pose says nothing of the rest of the hop.
         with np.errstate(invalid="ignore"):
@@ -231,38 +267,21 @@ class LiveEvidence:
         The next one begins at the newest scan.
         """
         self._hops = HopErrors(*(array[:0] for array in self._hops))
+        self._own.clear()
+        self._doubtful = None
         self._anchors.clear()
         self._measured = -np.inf
         self._wrong[:] = 0
         self._rejected = self._disagreeing = 0
         self.lost = False
 
-    def own_error(self, length: float) -> OwnError | None:
-        """The odometry's, or the bank's, own error over the last hops; None without any.
+    def own_error(self) -> OwnError | None:
+        """The odometry's, or the bank's, own error over the last metres; None without any hop."""
+        return self._own.estimate()
 
-        The interval is that of a mean square over as many independent windows as the hops cover,
-        with errors normally distributed.
-
-        Parameters
-        ----------
-        length
-            Metres of the sub-trajectories whose mean error it stands for.
-        """
-        hops = self._hops._replace(errors=self._hops.errors[:, :1])
-        if (found := live_squares(hops)) is None:
-            return None
-        from scipy.stats import chi2
-
-        square, noise = float(found.products[0, 0]), found.noise
-        freedom = 3.0 * found.windows
-        low, high = (square * freedom / chi2.ppf(p, freedom) for p in (0.975, 0.025))
-        scale = (length / float((hops.end - hops.start).mean())) ** GROWTH
-        ends = (scale * float(np.sqrt(max(end - noise, 0.0))) for end in (square, low, high))
-        return OwnError(*ends)
-
-    def estimated(self, selection: Selection, length: float) -> Selection:
-        """A selection with what is measured; `length` is that of `own_error`."""
-        error = self.own_error(length)
+    def estimated(self, selection: Selection) -> Selection:
+        """A selection with what is measured."""
+        error = self.own_error()
         if error is None:
             return selection._replace(lost=self.lost)
         return selection._replace(
@@ -272,6 +291,12 @@ class LiveEvidence:
             lost=self.lost,
             restart=self._told_to_restart(),
         )
+
+
+def _alike(error: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether two errors, of shape (3,), have about the same direction and length."""
+    apart = np.linalg.norm(error - other)
+    return bool(apart < min(np.linalg.norm(error), np.linalg.norm(other)))
 
 
 def _apart(T: Poses, other: Poses) -> float:

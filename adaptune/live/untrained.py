@@ -74,8 +74,8 @@ class UntrainedSelector:
     def __init__(self, sets: ParameterSets, length: float):
         self.members = sets.trials
         self.fixed = self.members[0]
-        self._sets, self._length = sets, length
-        self._live = LiveEvidence(self.members)
+        self._sets = sets
+        self._live = LiveEvidence(self.members, length)
 
     def reset(self) -> None:
         """Forget all scans and selections, as before a new recording."""
@@ -89,7 +89,7 @@ class UntrainedSelector:
         """Choose the weights to apply before the newest scan is registered."""
         weights = measured_weights(len(self.members), self._live.squares())
         of_members = dict(zip(self.members, weights.tolist(), strict=True))
-        return self._live.estimated(weighted_selection(self._sets, of_members), self._length)
+        return self._live.estimated(weighted_selection(self._sets, of_members))
 
     def measure(self) -> None:
         """See `adaptune.selector.Selector.measure`."""

@@ -199,7 +199,9 @@ def bank_weights(
     """
     relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
     of_sequences = near.evidence.weights(settings.sharpness)
+    trust = near.evidence.trust[:, None, None]
     learned = np.einsum("qs,qsjk->qjk", of_sequences, relative)
+    learned = trust * learned + (1.0 - trust) * _untried(len(near.members))
     windows = settings.prior_windows * (UNFAMILIAR + (1.0 - UNFAMILIAR) * near.evidence.trust)
     squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
     weights = np.array([minimum_variance_weights(of_scan, settings.even) for of_scan in squares])
@@ -234,8 +236,13 @@ def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.flo
     """
     if live is None:
         return np.asarray(np.eye(n_members)[0])
-    prior = np.diag([1.0, *[DOUBT] * (n_members - 1)])
+    prior = _untried(n_members)
     return minimum_variance_weights(blend(prior, BankSettings().prior_windows, live))
+
+
+def _untried(n_members: int) -> NDArray[np.float64]:
+    """Mean products of the errors of members of which the training says nothing."""
+    return np.diag([1.0, *[DOUBT] * (n_members - 1)])
 
 
 def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:

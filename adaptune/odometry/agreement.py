@@ -14,9 +14,9 @@ WINDOW = 1.0
 """Seconds over which motions are compared. Jitter within them cancels, departure adds up."""
 FLOOR = 0.1
 """Metres a second by which motions may always differ and agree."""
-SHARE = 0.15
+SHARE = 0.08
 """Share of the way by which they may always differ and agree."""
-SPREAD = 4.0
+SPREAD = 6.0
 """They may also differ by this many times what agreeing members usually differ by."""
 MOST = 2.0
 """But not by more than this many times what they may always differ by: a departure that was not
@@ -186,7 +186,9 @@ class Agreement:
         ways = sorted(np.linalg.norm(came[known, 9:], axis=1).tolist())
         far = ways[len(ways) // 2] if ways else 0.0
         least = max(FLOOR * scale, SHARE * far)
-        bound = min(max(least, SPREAD * self._usual.value * scale), MOST * least)
+        # As long as nothing is usual, they may differ by the most.
+        usual = SPREAD * self._usual.value * scale if self._usual else np.inf
+        bound = min(max(least, usual), MOST * least)
         near &= apart <= min(bound, self._lost_track * span)
         return near, apart / scale
 
@@ -268,6 +270,9 @@ class RunningMedian:
         insort(self._sorted, value)
         while time - self._values[0][0] > self._seconds:
             del self._sorted[bisect_left(self._sorted, self._values.popleft()[1])]
+
+    def __bool__(self) -> bool:
+        return bool(self._values)
 
     @property
     def value(self) -> float:

@@ -198,7 +198,7 @@ class Told:
     def measure(self):
         self.now = self.next
 
-    def own_error(self, _length):
+    def own_error(self):
         return self.error
 
     def forget(self):

@@ -103,6 +103,15 @@ def test_the_least_loss_wins(monkeypatch):
     # One set at a time is kept for where no bank can run.
     assert (found.one_set, found.bank) == (PAIRED_SETTINGS[5], BANK_SETTINGS[3])
     assert found.expected["bank"].loss == expected_loss(logs[:, second + 3], names)
+    # What banks gained elsewhere outweighs a little harm on two stretches, and not much harm on
+    # them, nor a little on many.
+    logs[:] = 0.0
+    for harm, n, adapts in ((0.02, 2, True), (0.3, 2, False), (0.1, 8, False)):
+        logs[:, second + 3] = harm
+        found = tuning.least_loss(logs[:n], names[:n], banks, len(PAIRED_SETTINGS))
+        assert found.bank.adapt == adapts, (harm, n)
+        if adapts:  # what is reported was seen here
+            assert found.expected["bank"].loss == expected_loss(logs[:n, second + 3], names[:n])
     # What rounding gains is no gain.
     logs[:] = 0.0
     logs[:, second + 3] = -1e-9

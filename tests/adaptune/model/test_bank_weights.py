@@ -102,8 +102,9 @@ def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more():
     assert near == 0.0
     assert rule.select(new).familiarity == 0.0
     assert rule.weigh(new, live).weights[0] > rule.weigh(known, live).weights[0] + 0.1
-    # Without measurements it is still the best guess.
-    assert rule.select(new).weights[0] < 0.1
+    # Without measurements, the fixed set is the best guess.
+    assert rule.select(known).weights[0] < 0.1
+    assert max(rule.select(new).weights.items(), key=lambda item: item[1])[0] == 0
     # As many windows as the prior has there: half and half.
     few = live._replace(windows=UNFAMILIAR * rule.settings.prior_windows)
     (found,), _ = bank_weights(rule.near(new[None]), rule.settings, [few])

@@ -1,0 +1,110 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from rooms import moved
+
+from adaptune.live.hop import Hop
+from adaptune.live.own_error import COVERED, GROWTH, UNSURE, Link, OwnErrors
+from adaptune.live.squares import SECONDS
+
+KNOWN = np.eye(3)
+
+
+def turned(degrees):
+    angle = np.radians(degrees)
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return T
+
+
+def link(start, end, believed, projection=KNOWN):
+    """A hop that is right, and what was believed: poses as a function of the metres driven."""
+    hop = Hop(moved(end - start), projection)
+    return Link(start, end, end, believed(start), believed(end), hop)
+
+
+def along(length, believed, n=40, **given):
+    """The estimates after hops of 10 m, each a metre farther."""
+    own, found = OwnErrors(length), []
+    for start in range(n):
+        own.add(link(start, start + 10.0, believed, **given))
+        found.append(own.estimate())
+    return own, found
+
+
+def test_nothing_is_known_before_the_first_hop():
+    own = OwnErrors(25.0)
+    assert own.estimate() is None
+    own.add(link(0.0, 10.0, moved))
+    assert own.estimate().mean == pytest.approx(0.0, abs=1e-9)
+    own.clear()
+    assert own.estimate() is None
+
+
+def test_a_scale_that_is_wrong_is_wrong_over_every_length():
+    _, found = along(25.0, lambda metres: moved(1.02 * metres))
+    assert found[-1].mean == pytest.approx(2.0 * (25.0 / 20.0) ** GROWTH)
+
+
+def test_errors_of_the_rotation_add_up_over_a_chain():
+    """What single hops could not tell: over 25 m they are much worse than over 10 m."""
+    per_metre = 0.05  # degrees
+    poses = [np.eye(4)]
+    for _ in range(1000):
+        poses.append(poses[-1] @ moved(0.1) @ turned(0.1 * per_metre))
+
+    def believed(metres):
+        return poses[round(10 * metres)]
+
+    _, found = along(25.0, believed)
+    end = 20.0  # a chain of two hops of 10 m
+    true = 100.0 / end * np.linalg.norm((believed(end) - moved(end))[:3, 3])
+    short = 100.0 / 10.0 * np.linalg.norm((believed(10.0) - moved(10.0))[:3, 3])
+    assert true > 1.9 * short
+    assert found[-1].mean == pytest.approx(true * (25.0 / end) ** GROWTH, rel=0.02)
+
+
+def test_hops_with_short_gaps_are_chained_and_with_long_ones_not():
+    def believed(metres):
+        return moved(1.02 * metres)
+
+    apart = 1.0 / COVERED
+    for share in (0.9, 1.1):
+        own, start = OwnErrors(40.0), 10.0 * (2.0 * share * apart - 1.0)
+        reach = start + 10.0 if share < 1.0 else 10.0
+        own.add(link(0.0, 10.0, believed))
+        own.add(link(start, start + 10.0, believed))
+        newest = own._chains[-1]
+        assert newest.end - newest.start == pytest.approx(reach)
+
+
+def test_a_direction_that_no_hop_can_tell_counts_for_nothing():
+    _, found = along(25.0, lambda metres: moved(1.1 * metres), projection=np.diag([0.0, 1.0, 1.0]))
+    assert found[-1].mean == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_length_that_no_chain_reaches_is_scaled_and_less_sure():
+    own = OwnErrors(100.0)
+    own.add(link(0.0, 10.0, lambda metres: moved(1.02 * metres)))
+    one = own.estimate()
+    assert one.mean == pytest.approx(2.0 * 10.0**GROWTH)
+    deviation = UNSURE * np.sqrt(1.0 + np.log(10.0) ** 2)
+    assert one.high / one.mean == pytest.approx(np.exp(1.96 * deviation))
+    assert one.mean / one.low == pytest.approx(one.high / one.mean)
+
+
+def test_the_interval_narrows_with_the_path_it_rests_on():
+    _, found = along(10.0, lambda metres: moved(1.02 * metres), n=21)
+    width = [one.high / one.low for one in found]
+    assert all(late <= early for early, late in pairwise(width))
+    assert np.log(width[-1]) == pytest.approx(np.log(width[0]) / np.sqrt(3.0))
+
+
+def test_what_is_long_ago_is_forgotten():
+    """First it is wrong by 5 %, from 100 m on it is right."""
+    own, found = along(25.0, lambda metres: moved(metres + 0.05 * min(metres, 100.0)), n=300)
+    assert found[80].mean == pytest.approx(5.0, rel=0.05)
+    assert found[100 + 25 + int(SECONDS) + 1].mean == pytest.approx(0.0, abs=1e-9)
+    assert len(own._chains) < 2 * SECONDS
+    assert len(own._links) < 40
