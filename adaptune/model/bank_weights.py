@@ -17,7 +17,7 @@ from adaptune.selection import Selection
 
 UNFAMILIAR = 0.2
 """Share of the prior's windows that remain where a scan is unlike all training."""
-DOUBT = 2.0
+DOUBT = 4.0
 """Mean square of a member that nobody has tried, in that of the first one."""
 SMOOTHING = 5
 """Selections whose weights are averaged: errors cancel each other while weights stay the same."""

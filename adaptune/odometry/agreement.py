@@ -21,6 +21,8 @@ SPREAD = 6.0
 MOST = 2.0
 """But not by more than this many times what they may always differ by: a departure that was not
 noticed must not become usual."""
+FAR = 2.0
+"""Members restart where they differ from those that agree by this many times what they may."""
 LEVER = 5.0
 """Metres. A turn that differs counts as much as the way that it makes at this distance."""
 RESTART = 1.0
@@ -72,8 +74,9 @@ class Agreement:
         How the bank moved over the last scan: the weighted mean of the members that agree; NaN if
         no member had a motion.
     due : ndarray of shape (n_members,)
-        Which members should restart at the bank's pose: those that were left out at the last scan
-        and have not restarted in the last second.
+        Which members should restart at the bank's pose: those that were left out at the last scan,
+        that differ by more than `FAR` times what they may, and that have not restarted in the last
+        second.
     judged : bool
         Whether the short registrations decided at the last scan.
 
@@ -133,7 +136,7 @@ class Agreement:
         known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
         moved = np.where(known[:, None, None], T_previous_current, np.eye(4))
         self._advance(moved, seconds)
-        near, apart = self._near(known, moved, seconds)
+        near, far, apart = self._near(known, moved, seconds)
         agreeing = self._heaviest(near, weights, moved, alignment, lost)
         self._move(T_previous_current, weights, agreeing)
         self.due = np.zeros_like(agreeing)
@@ -145,7 +148,7 @@ class Agreement:
             sure = agreeing.sum() > 1 or self.judged
             # Stamps are not quite even.
             long_ago = self._times[-1] - self._restarted > 0.95 * RESTART
-            self.due = ~agreeing & (sure | ~known) & long_ago
+            self.due = far[:, agreeing].all(axis=1) & (sure | ~known) & long_ago
         return agreeing
 
     def restarted(self, members: NDArray[np.bool_]) -> None:
@@ -170,8 +173,11 @@ class Agreement:
 
     def _near(
         self, known: NDArray[np.bool_], moved: Poses, seconds: float
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Which members are near each other, and how far they are apart, (n_members, n_members)."""
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
+        """Which members are near each other, which are far, and by how many metres a second.
+
+        All of shape (n_members, n_members).
+        """
         tracks = np.array(self._tracks)[:, :-1]
         times = np.array(self._times)
         times -= times.mean()
@@ -182,15 +188,15 @@ class Agreement:
         scale = max(span, WINDOW)
         near = (_distances(_vectors(moved)) <= self._lost_track * seconds) & known & known[:, None]
         if span < 0.5 * WINDOW:
-            return near, apart / scale
+            return near, ~near, apart / scale
         ways = sorted(np.linalg.norm(came[known, 9:], axis=1).tolist())
-        far = ways[len(ways) // 2] if ways else 0.0
-        least = max(FLOOR * scale, SHARE * far)
+        least = max(FLOOR * scale, SHARE * (ways[len(ways) // 2] if ways else 0.0))
         # As long as nothing is usual, they may differ by the most.
         usual = SPREAD * self._usual.value * scale if self._usual else np.inf
         bound = min(max(least, usual), MOST * least)
-        near &= apart <= min(bound, self._lost_track * span)
-        return near, apart / scale
+        most = self._lost_track * span
+        far = ~near | (apart > min(FAR * bound, most))
+        return near & (apart <= min(bound, most)), far, apart / scale
 
     def _heaviest(
         self,
