@@ -1,7 +1,7 @@
 """What selection gains on simulated sequences that were left out.
 
     python benchmarks/gain.py runs/gain --seeds 10 11    # hours on one core; resumes
-    python benchmarks/gain.py runs/gain --seeds 10 --odometries gicp --ablate | --curve | ...
+    python benchmarks/gain.py runs/gain --seeds 10 --odometries gicp --ablate | --kinds | ...
 
 Each seed is another world of 24 sequences: 4 caves, 4 streets, 4 open, 4 gardens, of 120 m each,
 and 8 mixed ones of three scenes, each 0.4 times as long. On all of them keyframe GICP and NDT run
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from gain_ablation import ablate, less
 from gain_data import ODOMETRIES, describe, factory_of, labelled, training_courses, trials
-from gain_modes import by_descriptor, curve, validate
+from gain_modes import by_descriptor, by_kind, curve, own_errors, validate
 
 from offline.labelled import LabelledData
 from offline.leave_one_out import BANK_SIZE
@@ -30,6 +30,10 @@ def compare(data: LabelledData, arguments: argparse.Namespace) -> None:
         less(data)
     elif arguments.curve:
         curve(data)
+    elif arguments.kinds:
+        by_kind(data, arguments.bank)
+    elif arguments.own_error:
+        own_errors(data)
     elif arguments.ablate:
         ablate(data, arguments.bank)
     else:
@@ -50,6 +54,8 @@ def main() -> None:
     what.add_argument("--ablate", action="store_true", help="without one thing after the other")
     what.add_argument("--curve", action="store_true", help="with fewer training sequences")
     what.add_argument("--less", action="store_true", help="with fewer frames, or runs")
+    what.add_argument("--kinds", action="store_true", help="with a whole kind of scene left out")
+    what.add_argument("--own-error", action="store_true", help="how right the own error is")
     what.add_argument("--descriptors", action="store_true", help="with other descriptors")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)

@@ -1,18 +1,22 @@
 """What is compared on the sequences that `gain.py` leaves out, and the printed table."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from gain_data import PERIOD, WINDOW
+from gain_data import KINDS, PERIOD, WINDOW, training_courses
 from numpy.typing import NDArray
 
 from adaptune.descriptor import DESCRIPTORS, averaged
+from adaptune.live.hop import Hop
+from adaptune.live.own_error import Link, OwnErrors
+from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.bank_weights import MemberWeights, clip_errors, minimum_variance_weights
+from offline.bank_simulation import chained
 from offline.curves import learning_curve
 from offline.labelled import LabelledData, LabelledSequence, periods
-from offline.leave_one_out import Validation, leave_one_out
+from offline.leave_one_out import Validation, leave_one_out, leave_out
 from offline.tuning import cancelling_members, on_labelled, simulated_with
 
 Errors = dict[str, NDArray[np.float64]]
@@ -32,6 +36,67 @@ def validate(data: LabelledData, size: int) -> None:
         print(f"{mode}: " + ", ".join(f"{of.name} {ratio:.2f}" for of, ratio in each))
     known = " ".join(f"{ratio:.3f}" for ratio in validation.portfolio())
     print(f"if the best of 1, 2, ... complementary sets were known: {known}", flush=True)
+
+
+def by_kind(data: LabelledData, size: int) -> None:
+    """Leave out all sequences with one kind of scene after the other, and print the ratios."""
+    scenes = {name: course.scenes for name, course in training_courses(0, 1.0).items()}
+    every = []
+    for kind in KINDS:
+        others = data._replace(sequences=[s for s in data.sequences if kind not in scenes[s.name]])
+        left_out = [
+            leave_out(s, others, None, size, by_recording=True)
+            for s in data.sequences
+            if kind in scenes[s.name]
+        ]
+        every += left_out
+        print(f"without {kind}, {len(left_out)} sequences: ", end="")
+        print_summary(Validation(left_out), ["paired"])
+    print("all of them: ", end="")
+    print_summary(Validation(every), ["paired"])
+
+
+def own_errors(data: LabelledData) -> None:
+    """Compare what each set would have estimated of its own error with the true one.
+
+    At every hop, the estimate is compared with the mean error of the sub-trajectories that begin
+    and end where the estimate looked. Sets that lose track (more than 10 % on a sequence) are left
+    out.
+    """
+    found = [compared for s in data.sequences for compared in own_errors_on(s)]
+    estimate, low, high, true = np.array(found).T
+    ratio = estimate / true
+    print(
+        f"estimated to true: geometric mean {np.exp(np.log(ratio).mean()):.2f}, 95 % of them "
+        f"{np.quantile(ratio, 0.025):.2f}-{np.quantile(ratio, 0.975):.2f}, right within a quarter "
+        f"{(np.abs(np.log(ratio)) < np.log(1.25)).mean():.0%}, intervals that hold the truth "
+        f"{((low <= true) & (true <= high)).mean():.0%} of {len(found)}",
+        flush=True,
+    )
+
+
+def own_errors_on(sequence: LabelledSequence) -> Iterator[tuple[float, float, float, float]]:
+    """The estimate, its interval and the true error, after every hop of every set."""
+    simulation = sequence.simulation
+    assert simulation is not None
+    T_ref, hops, length = simulation.T_ref_sensor, simulation.hops, simulation.length
+    metres, ends = travelled(T_ref), window_ends(T_ref, length)
+    seconds = (simulation.stamps - simulation.stamps[0]) * 1e-9
+    for trial in sequence.vectors:
+        T_odom = chained(simulation.motions((trial,))[:, 0])
+        true = sub_trajectory_rte(T_ref, T_odom, length)
+        if not np.nanmean(true) <= 10.0:
+            continue
+        own = OwnErrors(length)
+        for start, end, *hop in zip(*hops, strict=True):
+            link = Link(
+                *(metres[start], metres[end], seconds[end]),
+                *(T_odom[start], T_odom[end], Hop(*hop)),
+            )
+            own.add(link)
+            inside = (metres >= own.begin) & (ends >= 0) & (ends <= end)
+            if inside.any() and (found := own.estimate()) is not None:
+                yield *found, float(true[inside].mean())
 
 
 def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:

@@ -6,8 +6,8 @@ Rules are fitted on the 24 sequences of `benchmarks/gain.py`, and eight mixed co
 worlds are replayed with keyframe GICP (or NDT), each with the health check. The script prints the
 mean of min(RTE, 30 %) over 25 m, in brackets how often the health check restarted the odometry, and
 ratios to the fixed set's error. Below the errors are the odometry's own estimates, where it made
-any. The rivals: the defaults; the set that is fixed by the geometric
-mean of the training sequences' errors; a bank whose members always have the same weight.
+any. The rivals: the defaults; the set that is fixed by the geometric mean of the training
+sequences' errors; a bank whose members always have the same weight; a bank without a model.
 """
 
 import argparse
@@ -37,7 +37,7 @@ from adaptune.simulation import Course
 from adaptune.simulation.simulate import SimulatedScan, simulate
 from offline.fit import fit
 from offline.labelled import LabelledData
-from offline.tuning import choose
+from offline.tuning import Policy, choose
 from online.replay import Replay, Selects, replay
 
 ORDERS = (
@@ -95,6 +95,22 @@ def untrained(factory: OdometryFactory) -> Way:
     return lambda: Bank(factory, members, WarmUp()), UntrainedSelector(sets, SUB_TRAJECTORY)
 
 
+def bank_of(
+    data: LabelledData, model: ErrorModel, factory: OdometryFactory, size: int
+) -> tuple[Policy, Way]:
+    """A bank that is chosen on sequences, and what chose it."""
+    chosen = choose(data, size, one_set=False)
+    members = {trial: model.sets[trial] for trial in chosen.members}
+    of_bank = replace(
+        model,
+        bank=chosen.members,
+        vectors=data.vectors(chosen.members),
+        bank_settings=chosen.bank,
+    )
+    selector = Selector(of_bank, "paired", chosen.members)
+    return chosen, (lambda: Bank(factory, members, WarmUp()), selector)
+
+
 def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, Way]:
     """Ways to replay a course, by name."""
     model = model_of(odometry, data)
@@ -108,17 +124,12 @@ def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, W
         return lambda: factory(sets[model.fixed]), Selector(model, rule, ())
 
     def bank(size: int, even: bool = False) -> Way:
-        chosen = choose(data, size, one_set=False)
-        members, settings = chosen.members, chosen.bank
-        print(f"bank of {size}: trials {members}, {settings}", flush=True)
-        of_bank = replace(
-            model, bank=members, vectors=data.vectors(members), bank_settings=settings
-        )
-        selector: Selects = Selector(of_bank, "paired", members)
+        chosen, (make, selector) = bank_of(data, model, factory, size)
+        print(f"bank of {size}: trials {chosen.members}, {chosen.bank}", flush=True)
         if even:
-            weights = dict.fromkeys(members, 1.0 / size)
+            weights = dict.fromkeys(chosen.members, 1.0 / size)
             selector = Constant(weighted_selection(sets, weights))
-        return lambda: Bank(factory, {t: sets[t] for t in members}, WarmUp()), selector
+        return make, selector
 
     made: dict[str, Callable[[], Way]] = {
         "baseline": lambda: alone(None),

@@ -85,6 +85,11 @@ class OwnErrors:
         self._links.clear()
         self._chains.clear()
 
+    @property
+    def begin(self) -> float:
+        """Metres driven where the oldest chain begins that counts."""
+        return min(chain.start for chain in self._chains)
+
     def estimate(self) -> OwnError | None:
         """The mean error over the last chains; None without any."""
         if not self._chains:
