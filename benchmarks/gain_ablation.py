@@ -190,7 +190,6 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
 
     def simulated(
         all_familiar: bool = False,
-        ridge: float = bank_weights.RIDGE,
         smoothing: int = bank_weights.SMOOTHING,
         **changed: Any,
     ) -> NDArray[np.float64]:
@@ -201,7 +200,7 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         near = bank_evidence(sequence, of_members, pca, its)
         if all_familiar:
             near = near._replace(evidence=familiar(near.evidence))
-        with patch.multiple(bank_weights, RIDGE=ridge, SMOOTHING=smoothing):
+        with patch.object(bank_weights, "SMOOTHING", smoothing):
             return bank_errors(sequence, near, its)
 
     found = {
@@ -216,7 +215,9 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         "bank, clip 6": simulated(clip=6.0),
         "bank, clip 18": simulated(clip=18.0),
         "bank, errors count in full": simulated(clip=1e9),
-        "bank, without ridge": simulated(ridge=0.0),
+        "bank, weights as they are": simulated(even=0.0),
+        "bank, no live evidence": simulated(prior_windows=1e9),
+        "bank, live evidence alone": simulated(prior_windows=1e-9),
         "bank, weights of each second": simulated(smoothing=1),
         "bank, weights of 20 seconds": simulated(smoothing=20),
     }
