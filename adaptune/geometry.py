@@ -58,7 +58,9 @@ def scale(T_previous_current: Poses, share: float) -> Poses:
         return T_previous_current
     from scipy.spatial.transform import RigidTransform
 
-    screw = RigidTransform.from_matrix(T_previous_current).as_exp_coords()
+    # SciPy wants the last row exactly; products of poses have it but for rounding.
+    T = np.vstack([T_previous_current[:3], [0.0, 0.0, 0.0, 1.0]])
+    screw = RigidTransform.from_matrix(T).as_exp_coords()
     return np.asarray(RigidTransform.from_exp_coords(share * screw).as_matrix())
 
 
@@ -70,6 +72,7 @@ def mean_motion(T_previous_current: Poses, weights: NDArray[np.float64]) -> Pose
     """
     shares = weights / weights.sum(axis=-1, keepdims=True)
     T: Poses = np.einsum("...n,...nij->...ij", shares, T_previous_current)
+    T[..., 3, :] = 0.0, 0.0, 0.0, 1.0  # the shares add up to 1 but for rounding
     # Newton's steps double the digits: turns that differ by a radian take five.
     for _ in range(5):
         if np.abs(np.linalg.det(T[..., :3, :3]) - 1.0).max(initial=0.0) < 1e-13:

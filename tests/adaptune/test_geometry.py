@@ -211,6 +211,9 @@ def test_a_motion_scaled_is_a_motion_repeated(seed, n):
     np.testing.assert_allclose(np.linalg.matrix_power(scale(T, 1.0 / n), n), T, atol=1e-9)
     assert scale(T, 1.0) is T
     np.testing.assert_allclose(scale(T, 0.0), np.eye(4), atol=1e-12)
+    rounded = T.copy()
+    rounded[3, 3] -= 1e-13
+    np.testing.assert_array_equal(scale(rounded, 0.5), scale(T, 0.5))
 
 
 @given(seeds, st.floats(0, 50), st.floats(0, 200))
@@ -239,3 +242,9 @@ def test_the_mean_of_motions_is_a_motion_between_them():
     right[1, :3, :3] = Rotation.from_rotvec([0.0, 0.0, np.pi / 2]).as_matrix()
     half = Rotation.from_matrix(mean_motion(right, np.ones(2))[:3, :3]).as_rotvec()
     np.testing.assert_allclose(half, [0.0, 0.0, np.pi / 4], atol=1e-9)
+
+
+@given(st.lists(st.floats(0.01, 1.0), min_size=2, max_size=6))
+def test_the_mean_of_motions_has_the_last_row_of_a_pose_exactly(weights):
+    T = mean_motion(np.tile(np.eye(4), (len(weights), 1, 1)), np.array(weights))
+    assert T[3].tolist() == [0.0, 0.0, 0.0, 1.0]
