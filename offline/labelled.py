@@ -1,6 +1,6 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -59,6 +59,8 @@ class LabelledSequence:
     whole_errors: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
     # Whether the objective is that of the errors alone, and so is known on some frames, too.
     by_frames: bool = False
+    # What it is a part or a view of; it alone when left out.
+    recorded_in: str = ""
     # With all frames; without it there is no bank.
     simulation: BankSimulation | None = None
     # Number of each frame's stretch, of shape (n,), the same in a view; one stretch when left out.
@@ -69,6 +71,11 @@ class LabelledSequence:
     def stretch(self) -> NDArray[np.intp]:
         """Number of each frame's stretch, of shape (n,)."""
         return np.zeros(len(self.errors), np.intp) if self.cuts is None else self.cuts
+
+    @property
+    def recording(self) -> str:
+        """The recording that it is, or is a part or a view of."""
+        return self.recorded_in or origin(self.name)
 
     def frames(self, kept: NDArray[np.bool_]) -> "LabelledSequence":
         """The same with some of the frames."""
@@ -136,8 +143,8 @@ class LabelledData(NamedTuple):
 
     @property
     def recordings(self) -> list[str]:
-        """Names of the recordings; views are none."""
-        return [s.name for s in self.sequences if origin(s.name) == s.name]
+        """The recordings; parts of one, and its views, are none."""
+        return list(dict.fromkeys(s.recording for s in self.sequences))
 
     def folds(
         self, by_recording: bool | None = None
@@ -159,7 +166,7 @@ class LabelledData(NamedTuple):
             if origin(one.name) != one.name:
                 continue
             if by_recording:
-                others = [s for s in self.sequences if origin(s.name) != one.name]
+                others = [s for s in self.sequences if s.recording != one.recording]
                 folds.append((one, LabelledData(others, self.sets)))
             else:
                 folds += [self._without(one, int(n)) for n in np.unique(one.stretch)]
@@ -171,7 +178,7 @@ class LabelledData(NamedTuple):
         """A stretch of a recording, and all that may be known where it is left out."""
         left = one.frames(one.stretch == number)
         others = [
-            s if origin(s.name) != one.name else s.without(left.extent, s.name != one.name)
+            s if s.recording != one.recording else s.without(left.extent, s.name != one.name)
             for s in self.sequences
         ]
         known = [s for s in others if len(s.errors)]
@@ -281,6 +288,7 @@ def labelled_data(
     sets: ParameterSets,
     config: OfflineStudyConfig,
     window: int,
+    recorded_in: Callable[[str], str],
 ) -> LabelledData:
     """Read the labelled data set of a study.
 
@@ -296,6 +304,8 @@ def labelled_data(
         Of the study.
     window
         Number of descriptors that are averaged.
+    recorded_in
+        The recording of a sequence, by its name.
 
     Raises
     ------
@@ -327,7 +337,8 @@ def labelled_data(
             for trial in eligible.intersection(sets).intersection(run[name])
         }
         own = [one is not None and origin(one) == origin(name) for one in owners]
-        labelled.append(replace(sequence, own=np.array(own, bool), vectors=vectors))
+        found = replace(sequence, own=np.array(own, bool), vectors=vectors)
+        labelled.append(replace(found, recorded_in=recorded_in(name)))
     return LabelledData(_with_cuts(_with_whole_runs(archive, labelled, sets, config)), sets)
 
 

@@ -65,6 +65,7 @@ class LeftOut(NamedTuple):
     portfolio: NDArray[np.float64]
     block: int = 1  # frames of a sub-trajectory
     stretch: NDArray[np.intp] | None = None  # (n,): of each frame; one stretch when left out
+    recording: str = ""  # that it is a part of; it alone when left out
 
     @property
     def stretches(self) -> NDArray[np.intp]:
@@ -99,6 +100,7 @@ def joined(parts: Sequence[LeftOut]) -> LeftOut:
         np.average([part.portfolio for part in parts], axis=0, weights=n_frames),
         first.block,
         np.concatenate([part.stretches for part in parts]),
+        first.recording,
     )
 
 
@@ -127,7 +129,9 @@ class Validation:
             )
             for mode in modes
         }
-        self.recordings = [s.name for s in self.left_out for _ in np.unique(s.stretches)]
+        self.recordings = [
+            s.recording or s.name for s in self.left_out for _ in np.unique(s.stretches)
+        ]
 
     @property
     def modes(self) -> list[str]:
@@ -301,6 +305,7 @@ def leave_out(
         portfolio,
         sequence.block,
         sequence.stretch,
+        sequence.recording,
     )
 
 

@@ -231,7 +231,9 @@ def _fit(
     parameters = tuple(verdict.parameters for verdict in feasible.values())
     sets = ParameterSets(study.odometry.space, tuple(feasible), parameters)
     run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
-    data = labelled_data(archive, run, sets, study.config, study.window)
+    data = labelled_data(
+        archive, run, sets, study.config, study.window, study.sequences.recorded_in
+    )
     length = study.config.sub_trajectory
     model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
     model = tuned(model, data, study.config.online.switching)

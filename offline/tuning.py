@@ -22,7 +22,6 @@ from adaptune.model.bank_weights import (
     smooth_weights,
 )
 from adaptune.model.base import complementary, mean_errors
-from adaptune.sequence.names import origin
 from adaptune.study.driven import BANK, ONE_SET, RELIES_ON_LIVE
 from offline.expected_loss import Figures, expected_loss, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
@@ -116,7 +115,7 @@ def choose(
         for left_out, others in folds:
             of_fold = _logs(left_out, others, {way: choosers[way] for way in banks}, one_set)
             logs.append(of_fold)
-            recordings += [origin(left_out.name)] * len(of_fold)
+            recordings += [left_out.recording] * len(of_fold)
     if len(recordings) < 2 or not logs[0].shape[1]:
         unknown = BankSettings(adapt=RELIES_ON_LIVE and len(members) > 1)
         return Policy(DO_NOT_ADAPT, unknown, members, {})

@@ -158,7 +158,9 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     sets = model.sets.subset([model.sets.trials[column] for column in complete])
     run = {name: list(sets) for name in model.sequences}
     archive = Archive(study.folder / "trials")
-    data = labelled_data(archive, run, sets, study.config, study.window)
+    data = labelled_data(
+        archive, run, sets, study.config, study.window, study.sequences.recorded_in
+    )
     if not set(data.whole()) - {0} and model.fixed != 0:
         _log.warning(
             "the candidates for the fixed set have no whole runs with this health check: with a "

@@ -61,6 +61,11 @@ class StudySequences:
             return f"sequences.{name}"
         return f"training: [{whole}: {100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%]"
 
+    def recorded_in(self, name: str) -> str:
+        """What a sequence was recorded in: parts of a recording, and views, share it."""
+        config = self.config(origin(name))
+        return str(next(path for key in _PATHS if (path := getattr(config, key)) is not None))
+
     def open(self, name: str) -> Sequence:
         """Open a sequence, a recorded course, or a view.
 

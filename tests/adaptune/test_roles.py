@@ -32,6 +32,9 @@ def test_parts_become_sequences_of_their_own(study_file, tmp_path):
     )
     assert first + second == [scan.stamp for scan in study.sequences.open("one")]
     assert len(first) == pytest.approx(24, abs=1)
+    recorded_in = study.sequences.recorded_in
+    assert recorded_in("one_0-60") == recorded_in("one_60-100") == recorded_in("one")
+    assert recorded_in("one") != recorded_in("two")
 
 
 def test_parts_are_augmented(study_file):
@@ -40,6 +43,7 @@ def test_parts_are_augmented(study_file):
     plain, backward = study.training
     scans, mirrored = list(study.sequences.open(plain)), list(study.sequences.open(backward))
     assert len(scans) == len(mirrored)
+    assert study.sequences.recorded_in(plain) == study.sequences.recorded_in(backward)
     assert len(scans[0]) == len(mirrored[-1])
 
 
@@ -47,6 +51,7 @@ def test_parts_of_a_course_share_its_recording(study_file, tmp_path):
     overrides = [COURSES, "training=[cave: 0-50%]", "test=[cave: 50-100%]"]
     sequences = load_study(study_file, overrides, tmp_path).sequences
     assert sequences.recording("cave_0-50") == sequences.recording("cave")
+    assert sequences.recorded_in("cave_0-50") == sequences.recorded_in("cave")
     assert sequences.config("cave_0-50").part == (0.0, 0.5)
     with pytest.raises(ConfigurationError, match="adaptune simulate"):
         sequences.open("cave_0-50")

@@ -224,7 +224,9 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
         study.odometry.space, tuple(verdicts), tuple(v.parameters for v in verdicts.values())
     )
     seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
-    data = labelled_data(archive, seen, sets, study.config, study.window)
+    data = labelled_data(
+        archive, seen, sets, study.config, study.window, study.sequences.recorded_in
+    )
     assert np.isnan(data.sequences[0].errors).any()
     complete = data.complete()
     assert list(complete.sets) == [n for n, v in verdicts.items() if v.complete]

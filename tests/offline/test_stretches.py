@@ -147,6 +147,24 @@ def test_with_six_recordings_whole_ones_are_left_out():
         assert not set(np.unique(left.stretch)) & set(np.unique(same.stretch))
 
 
+def test_parts_of_a_recording_are_one_recording():
+    rng = np.random.default_rng(3)
+    one = in_stretches(with_motions("s0", rng, 500))
+    parts = [replace(one, name=f"s{i}", recorded_in="drive.bag") for i in range(6)]
+    data = labelled(parts)
+    assert data.recordings == ["drive.bag"]
+    # So stretches are left out; here all parts show the same place, so none of it is known.
+    folds = data.folds()
+    assert len(folds) == 6 * 3
+    for left, others in folds:
+        numbers = {int(n) for s in others.sequences for n in np.unique(s.stretch)}
+        assert int(left.stretch[0]) not in numbers
+    assert data.folds(by_recording=True) == []
+    other = labelled([*parts[:2], replace(one, name="other")])
+    names = [[s.name for s in others.sequences] for _, others in other.folds(by_recording=True)]
+    assert names == [["other"], ["other"], ["s0", "s1"]]
+
+
 def test_a_stretch_takes_its_part_of_everything():
     one = in_stretches(with_motions("one", np.random.default_rng(3), 500))
     n = len(one.errors)
