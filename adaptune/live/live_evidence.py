@@ -21,7 +21,7 @@ SPACING = 1.0
 LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
 DOUBTFUL = 5.0
-"""Percent of a hop. One that differs so much from the odometry is taken if the next does, too."""
+"""Percent of a hop. One that differs so much from the odometry must be confirmed by another."""
 TWICE = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
 _APART = 0.3
@@ -60,6 +60,7 @@ class _Found(NamedTuple):
     start: _Anchor
     end: _Anchor
     hop: Hop
+    by_odometry: bool = True  # whether its own motion was the guess
 
     def errors(self) -> NDArray[np.float64]:
         """Of the odometry and the members, percent of the hop, of shape (1 + n_members, 3)."""
@@ -105,8 +106,6 @@ class LiveEvidence:
         self._anchors: deque[_Anchor] = deque()
         self._measured = -np.inf
         self._short = 0
-        self._doubtful: _Found | None = None
-        self._taken: _Found | None = None
         self._rejected = self._disagreeing = 0
         n = 1 + len(self.members)
         self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
@@ -147,20 +146,22 @@ class LiveEvidence:
         )
         if not self._anchors or self._metres - self._anchors[-1].metres >= SPACING:
             self._anchors.append(self._newest)
-            while len(self._anchors) > 1 and self._metres - self._anchors[1].metres >= LENGTHS[0]:
+            # Before the start of the longest hop, one more is kept, to confirm it.
+            while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
 
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
 
         Nothing is measured before the first hop is complete, nor where the sensor has moved less
-        than a metre since the last one. A hop that contradicts the odometry counts only if the next
-        one does so, too: where a scene repeats itself, a registration can be wrong by metres.
+        than a metre since the last one. A hop that contradicts the odometry counts only if a
+        registration to another scan says the same: where a scene repeats itself, one can be wrong
+        by metres.
 
         Returns
         -------
         Measured or None
-            None if no registration was accepted, or this one is still in doubt.
+            None if no registration was accepted.
         """
         end = self._newest
         if end is None or end.metres - self._measured < SPACING:
@@ -170,13 +171,15 @@ class LiveEvidence:
             return None
         self._measured = end.metres
         found = self._register(starts, end)
-        if found is None:
+        # On an open plain only height can be told; that is no loss of track.
+        if found is not None and np.trace(found.hop.projection) < _FEWEST_DIRECTIONS:
+            return None
+        if found is None or not self._is_confirmed(found):
             self._rejected += 1
             self._update_lost()
-        # On an open plain only height can be told; that is no loss of track.
-        elif np.trace(found.hop.projection) >= _FEWEST_DIRECTIONS:
-            return self._confirm(found)
-        return None
+            return None
+        self._take(found)
+        return Measured(found.start.stamp, found.end.stamp, found.hop)
 
     def _starts(self, end: _Anchor) -> list[_Anchor]:
         """Where a hop may start, in the order in which that is tried."""
@@ -184,25 +187,27 @@ class LiveEvidence:
             next((a for a in reversed(self._anchors) if end.metres - a.metres >= length), None)
             for length in LENGTHS
         )
+        first, second = long, short
         if long is not None and 0 < self._short < _TRY_AGAIN:
             self._short += 1
-            long = None
-        return [a for a in (long, short) if a is not None and a.stamp < end.stamp]
+            first, second = short, long
+        return [a for a in (first, second) if a is not None and a.stamp < end.stamp]
 
     def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> _Found | None:
         """The first registration that is accepted.
 
-        The odometry's own motion is the guess from every start, before members that disagree with
-        it are asked: where a scene repeats itself, one that is lost finds a registration, too.
+        The odometry's own motion is the guess. Only where the last registration was rejected, too,
+        members that disagree with it are asked: where a scene repeats itself, one that is lost
+        finds a registration as well.
         """
         guesses = [self._guesses(start, end) for start in starts]
-        for first, stop in ((0, 1), (1, _GUESSES)):
+        for first, stop in ((0, 1), (1, _GUESSES))[: 2 if self._rejected else 1]:
             for start, of_start in zip(starts, guesses, strict=True):
                 hop = register(start.cloud, end.cloud, of_start[first:stop])
                 if end.metres - start.metres >= LENGTHS[0]:
                     self._short = int(hop is None)
                 if hop is not None:
-                    return _Found(start, end, hop)
+                    return _Found(start, end, hop, first == 0)
         return None
 
     def _guesses(self, start: _Anchor, end: _Anchor) -> list[Poses]:
@@ -213,28 +218,32 @@ class LiveEvidence:
                 tried.append(T)
         return tried
 
-    def _confirm(self, found: _Found) -> Measured | None:
-        """Take a hop that agrees with the odometry, or with the hop before."""
-        before, self._doubtful = self._doubtful, None
-        wrong = found.errors()[0]
-        if np.linalg.norm(wrong) > DOUBTFUL:
-            self._doubtful = found
-            if before is None or not _alike(wrong, before.errors()[0]):
-                return None
-            if before is not self._taken:
-                self._take(before)
-        self._take(found)
-        return Measured(found.start.stamp, found.end.stamp, found.hop)
+    def _is_confirmed(self, found: _Found) -> bool:
+        """Whether a hop agrees with the odometry, or a hop from another scan agrees with it."""
+        wrong, end = found.errors()[0], found.end
+        if np.linalg.norm(wrong) <= DOUBTFUL:
+            return True
+        at = self._anchors.index(found.start)
+        # The scan before, so that it spans the same way; at the begin of a drive the scan after.
+        other = self._anchors[at - 1 if at else 1]
+        if other.stamp >= end.stamp:
+            return False
+        guess = invert(other.T_odom_sensor[0]) @ end.T_odom_sensor[0]
+        if not found.by_odometry:
+            between = invert(other.T_odom_sensor[0]) @ found.start.T_odom_sensor[0]
+            guess = between @ found.hop.T_start_end
+        hop = register(other.cloud, end.cloud, [guess])
+        return hop is not None and _alike(wrong, _Found(other, end, hop).errors()[0])
 
     def _take(self, found: _Found) -> None:
         """Compare with what was measured."""
-        self._taken = found
-        start, end, hop = found
+        start, end, hop, _ = found
         errors = found.errors()
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
         self._hops = self._hops.with_hop(errors, *ends)
-        self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
+        if np.isfinite(errors[0]).all():
+            self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
         self._rejected = 0
         # A scan without a pose says nothing of the rest of the hop.
         with np.errstate(invalid="ignore"):
@@ -268,7 +277,6 @@ class LiveEvidence:
         """
         self._hops = HopErrors(*(array[:0] for array in self._hops))
         self._own.clear()
-        self._doubtful = None
         self._anchors.clear()
         self._measured = -np.inf
         self._wrong[:] = 0

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert
-from adaptune.live.hop import Hop
-from adaptune.live.squares import METRES, SECONDS
+from adaptune.live.hop import LENGTHS, Hop
+from adaptune.live.squares import METRES, SECONDS, windows
 
 COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
@@ -72,7 +72,7 @@ class OwnErrors:
     def add(self, link: Link) -> None:
         """Add the newest hop."""
         self._links.append(link)
-        while link.end - self._links[0].end > self._length:
+        while link.end - self._links[0].end > self._length + LENGTHS[0] / COVERED:
             self._links.popleft()
         self._chains.append(_chain(self._links, self._length))
         while link.seconds - self._chains[0].seconds > SECONDS and link.end - self._chains[
@@ -96,12 +96,11 @@ class OwnErrors:
             return None
         start, end, _, error = np.array(self._chains).T
         reach = end - start
-        long = reach >= NEARLY * min(self._length, float(reach.max()))
+        long = reach >= NEARLY * min(self._length, float(reach[-1]))
         start, end, reach, error = start[long], end[long], reach[long], error[long]
         times = max(1.0, self._length / float(reach.mean()))
         mean = times**GROWTH * float((100.0 * error / reach).mean())
-        windows = max(1.0, float((end.max() - start.min()) / reach.mean()))
-        deviation = UNSURE * np.sqrt(1.0 / windows + np.log(times) ** 2)
+        deviation = UNSURE * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
         factor = float(np.exp(1.96 * deviation))
         return OwnError(mean, mean / factor, mean * factor)
 

@@ -65,10 +65,23 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
     products = np.einsum("hix,hjx->ij", errors, errors) / n_hops
     products += np.diag(missing.mean(axis=0)) * CLIP**2
     noise = float(((100.0 * NOISE / length) ** 2).mean())
-    order = np.argsort(hops.start)
-    start, end = hops.start[order], np.maximum.accumulate(hops.end[order])
-    covered = end[0] - start[0] + np.maximum(0.0, end[1:] - np.maximum(start[1:], end[:-1])).sum()
-    return LiveSquares(products, noise, max(1.0, float(covered / length.mean())))
+    return LiveSquares(products, noise, windows(hops.start, hops.end))
+
+
+def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
+    """How many stretches of a path that overlap amount to as much as if they did not.
+
+    Parameters
+    ----------
+    start, end
+        Metres driven, of shape (n,).
+    """
+    order = np.argsort(start)
+    start, end = start[order], end[order]
+    length = float((end - start).mean())
+    reached = np.maximum.accumulate(end)
+    new = np.maximum(0.0, end[1:] - np.maximum(start[1:], reached[:-1]))
+    return max(1.0, (float(end[0] - start[0]) + float(new.sum())) / length)
 
 
 def clip_to_best(

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert
+from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.sequence.scan import Scan
@@ -58,7 +58,8 @@ class Tracker:
             unhealthy = self._guard.check(T_previous_current, elapsed, registered)
             if unhealthy is not None:
                 T_healthy = self._guard.go_on(elapsed)
-                T_odom_sensor = T_odom_previous @ T_healthy
+                # The motion was computed from the pose before: their errors of rounding multiply.
+                T_odom_sensor = rectify(T_odom_previous @ T_healthy)
                 self.odometry.start(prepared, T_odom_sensor, T_healthy)
         seconds = time.perf_counter() - begin
         self._last = RegisteredScan(

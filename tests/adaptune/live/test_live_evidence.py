@@ -250,7 +250,7 @@ def test_the_own_error_is_the_odometrys_over_the_length(exactly):  # noqa: ARG00
     assert more.high - more.low < error.high - error.low
 
 
-def test_only_members_that_disagree_are_further_guesses(exactly):
+def test_members_that_disagree_are_asked_where_the_odometry_was_rejected_before(exactly):
     asked = []
 
     def register(start, end, guesses):  # noqa: ARG001 - all are rejected
@@ -259,49 +259,97 @@ def test_only_members_that_disagree_are_further_guesses(exactly):
     exactly(register)
     live = LiveEvidence((0, 1, 2, 3, 4))
     drive(live, 31, bank(1.0, 1.01, 1.1, 1.2, 1.3))
-    # From 10 m and 5 m before: first the bank's own motion, only then those of the others.
-    assert [len(guesses) for guesses in asked[2:6]] == [1, 1, 2, 2]
-    own, short, others, _ = asked[2:6]
+    # First from 5 m before; then from 10 and 5 m before, the odometry's own motion first.
+    assert [len(guesses) for guesses in asked[:5]] == [1, 1, 1, 2, 2]
+    _, own, short, others, _ = asked[:5]
     assert own[0] == pytest.approx(2.0 * short[0])
     np.testing.assert_allclose(np.array(others) / own[0], [1.1, 1.2], atol=1e-6)
 
 
-def test_one_registration_that_contradicts_the_odometry_does_not_count(exactly):
+def test_a_long_hop_is_tried_where_the_short_one_fails(exactly):
+    def long_only(start, end, guesses):
+        return exact(start, end, guesses) if end.number - start.number > 5 else None
+
+    live = LiveEvidence()
+    exactly(lambda start, end, guesses: exact(start, end, guesses) if end.number < 30 else None)
+    drive(live, 41, bank(1.0))  # the last is rejected: for a while short hops come first
+    exactly(long_only)
+    assert len(drive(live, 30, bank(1.0), first=41)) == 3
+
+
+def test_a_registration_that_another_does_not_confirm_counts_as_rejected(exactly):
     """Where a scene repeats itself, a registration may be wrong by metres, and look sound."""
 
-    def wrong_once(start, end, guesses):
-        hop = exact(start, end, guesses)
-        return hop._replace(T_start_end=np.eye(4)) if end.number == 49 else hop
-
-    exactly(wrong_once)
-    live = LiveEvidence((0, 1))
-    found = drive(live, 101, bank(1.01, 0.0))
-    assert 49 * 10**8 not in [one.end for one in found]
-    assert len(found) == 9
-    assert not live.lost
-    assert live.own_error().mean < 1.1
-    assert measured_weights(2, live.squares())[0] > 0.75
-
-
-def test_two_registrations_that_contradict_it_in_the_same_way_count(exactly):
-    def wrong(*where):
+    def wrong(*pairs):
         def register(start, end, guesses):
             hop = exact(start, end, guesses)
-            side = dict(zip(where, (2.0, -2.0), strict=True)).get(end.number, 0.0)
-            hop.T_start_end[1, 3] += side
-            return hop
+            wrong = (start.number, end.number) in pairs
+            return hop._replace(T_start_end=np.eye(4)) if wrong else hop
 
         return register
 
-    exactly(wrong(49, 59))
-    live = LiveEvidence()
-    found = drive(live, 101, bank(1.0))
-    assert not {49 * 10**8, 59 * 10**8} & {one.end for one in found}  # not in the same direction
-    exactly(exact)
-    live = LiveEvidence()
-    found = drive(live, 101, bank(1.3))
-    assert len(found) == 9  # all but the first, which the second confirms
-    assert live.lost
+    for pairs, found, lost in (
+        ([(39, 49)], 9, False),
+        ([(39, 49), (49, 59)], 8, True),
+    ):
+        exactly(wrong(*pairs))
+        live = LiveEvidence((0, 1))
+        taken, states = [], []
+        for i in range(0, 110, 10):
+            taken += [one.end for one in drive(live, 10, bank(1.01, 0.0), first=i)]
+            states.append(live.lost)
+        assert len(taken) == found
+        assert not {end * 10**8 for _, end in pairs} & set(taken)
+        assert any(states) == lost
+        assert not states[-1]
+        assert live.own_error().mean < 1.1
+        assert measured_weights(2, live.squares())[0] > 0.75
+
+
+@pytest.mark.parametrize("speed", [0.5, 5.0, 10.0, 20.0])
+def test_a_slip_counts_at_any_speed(exactly, speed):
+    """The odometry slips aside over half a second; one hop a second sees it."""
+    step, slip = 0.1 * speed, 0.12 * speed
+
+    def register(start, end, guesses):  # noqa: ARG001 - as `register`
+        return Hop(moved(step * (end.number - start.number)), np.eye(3))
+
+    def slipping(i):
+        T = moved(step)
+        T[1, 3] = slip / 5 if 304 <= i < 309 else 0.0
+        return Motions(T, {})
+
+    exactly(register)
+    live, seen = LiveEvidence(), []
+    for i in range(0, 450, 10):
+        drive(live, 10, slipping, first=i)
+        seen.append(live.own_error() and live.own_error().mean)
+    assert seen[28] == pytest.approx(0.0, abs=1e-6)
+    assert max(seen[30:]) > 0.02 * 100.0 * slip / 25.0
+    assert not live.lost
+
+
+@pytest.mark.parametrize("speed", [5.0, 10.0, 20.0])
+def test_an_odometry_that_is_wrong_in_changing_directions_is_lost(exactly, speed):
+    step = 0.1 * speed
+
+    def register(start, end, guesses):  # noqa: ARG001 - as `register`
+        return Hop(moved(step * (end.number - start.number)), np.eye(3))
+
+    def weaving(i):
+        T = moved(step)
+        T[1, 3] = 0.4 * step * (1.0 if i // 10 % 2 else -1.0)
+        return Motions(T, {})
+
+    exactly(register)
+    live, states = LiveEvidence(), []
+    for i in range(0, 200, 10):
+        drive(live, 10, weaving, first=i)
+        states.append(live.lost)
+    if speed >= 10.0:
+        assert all(states[4:])
+    else:  # left and right cancel over a hop
+        assert live.own_error().mean > 1.5
 
 
 def test_what_a_hop_cannot_tell_counts_for_nothing(exactly):

@@ -77,6 +77,10 @@ def test_hops_with_short_gaps_are_chained_and_with_long_ones_not():
         own.add(link(start, start + 10.0, believed))
         newest = own._chains[-1]
         assert newest.end - newest.start == pytest.approx(reach)
+        # In between, nobody measured: twice the path, and errors that are not in one direction.
+        scale = np.sqrt(reach / (20.0 if share < 1.0 else 10.0))
+        true = 0.02 * (20.0 if share < 1.0 else 10.0)
+        assert newest.error == pytest.approx(true * scale)
 
 
 def test_a_direction_that_no_hop_can_tell_counts_for_nothing():
@@ -107,4 +111,27 @@ def test_what_is_long_ago_is_forgotten():
     assert found[80].mean == pytest.approx(5.0, rel=0.05)
     assert found[100 + 25 + int(SECONDS) + 1].mean == pytest.approx(0.0, abs=1e-9)
     assert len(own._chains) < 2 * SECONDS
-    assert len(own._links) < 40
+    assert len(own._links) < 25 + 10 / COVERED + 5
+
+
+def test_path_that_no_hop_covers_does_not_make_it_surer():
+    def wrong(metres):
+        return moved(1.02 * metres)
+
+    for second, windows in ((2.0, 1.2), (550.0, 2.0)):
+        own = OwnErrors(10.0)
+        own.add(link(0.0, 10.0, wrong)._replace(seconds=0.0))
+        own.add(link(second, second + 10.0, wrong)._replace(seconds=27.0))
+        found = own.estimate()
+        assert np.log(found.high / found.mean) == pytest.approx(1.96 * UNSURE / np.sqrt(windows))
+
+
+def test_after_a_gap_the_newest_hop_counts():
+    own = OwnErrors(25.0)
+    for start in range(30):
+        own.add(link(float(start), start + 10.0, moved)._replace(seconds=start / 10.0))
+    before = own.estimate()
+    far = link(500.0, 510.0, lambda metres: moved(1.5 * metres))._replace(seconds=25.0)
+    own.add(far)
+    assert before.mean == pytest.approx(0.0, abs=1e-9)
+    assert own.estimate().mean > 1.0
