@@ -2,22 +2,24 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.geometry import Poses, invert, mean_motion, rectify, steps
+from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.hop import Hops
 from adaptune.live.live_evidence import SPACING
 from adaptune.live.squares import HopErrors, LiveSquares, live_squares
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors, travelled
 from adaptune.model.bank_weights import MemberWeights
-from adaptune.odometry.agreement import Agreement, share
+from adaptune.odometry.agreement import LEVER, Agreement, share
 
 NOTICED = 1.0
 """Seconds until a bank notices that a member has lost track."""
+FELT = 0.25
+"""By how much farther a scan is from the one before, about, in a metre by which it is misplaced."""
 
 
 def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:
@@ -72,7 +74,9 @@ class BankSimulation:
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
-    _agreeing: dict[tuple[int, ...], NDArray[np.bool_]] = field(default_factory=dict, init=False)
+    _agreeing: dict[tuple[tuple[int, ...], bytes], NDArray[np.bool_]] = field(
+        default_factory=dict, init=False
+    )
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
     def _steps(self, members: tuple[int, ...]) -> Poses:
@@ -113,31 +117,61 @@ class BankSimulation:
             found.append(live_squares(before.recent(float(metres[frame]), float(seconds[frame]))))
         return found
 
-    def agreeing(self, members: tuple[int, ...]) -> NDArray[np.bool_]:
+    def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
 
-        All members have the same vote, so that it is the same whatever their weights are.
+        Members vote with the weights that are given. The reference takes the place of the short
+        registrations: it tells a member that is lost from one that is sound.
         """
-        if members not in self._agreeing:
-            T_previous_current = self._steps(members)
-            agreement, votes = Agreement(len(members), self.lost_track), np.ones(len(members))
+        key = votes.members, votes.weights.tobytes()
+        if key not in self._agreeing:
+            T_previous_current = self._steps(votes.members)
+            agreement = Agreement(len(votes.members), self.lost_track)
             agreeing = np.zeros(T_previous_current.shape[:2], bool)
+            of_steps = self._of_steps(votes)
             for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
-                agreeing[i] = agreement.judge(T_previous_current[i], seconds, votes)
+                agreeing[i] = agreement.judge(
+                    T_previous_current[i], seconds, of_steps[i], partial(self._misplaced, i + 1)
+                )
                 if agreeing[i].any():
                     agreement.restarted(agreement.due)
                 else:
                     agreement.start()
-            self._agreeing[members] = agreeing
-        return self._agreeing[members]
+            self._agreeing[key] = agreeing
+        return self._agreeing[key]
 
-    def errors(self, weights: MemberWeights) -> NDArray[np.float64]:
-        """Capped errors of a bank at every frame, NaN without a sub-trajectory."""
-        T_previous_current, agreeing = self._steps(weights.members), self.agreeing(weights.members)
-        of_steps = weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
+    def _of_steps(self, weights: MemberWeights) -> NDArray[np.float64]:
+        """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
+        return weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
+
+    def _misplaced(
+        self, frame: int, T_then_now: Poses, ago: tuple[int, ...]
+    ) -> NDArray[np.float64]:
+        """What short registrations would find at a frame, see `Alignment`."""
+        T_ref_now = self.T_ref_sensor[frame]
+        T_ref = np.array([invert(self.T_ref_sensor[frame - n]) @ T_ref_now for n in ago])
+        T = invert(T_ref)[:, None] @ T_then_now
+        apart = np.linalg.norm(T[..., :3, 3], axis=-1) + LEVER * rotation_angle(T)
+        found = np.minimum(1.0, FELT * apart).mean(axis=0)
+        return np.asarray(np.where(np.isnan(found), np.inf, found))
+
+    def errors(
+        self, weights: MemberWeights, votes: MemberWeights | None = None
+    ) -> NDArray[np.float64]:
+        """Capped errors of a bank at every frame, NaN without a sub-trajectory.
+
+        Parameters
+        ----------
+        weights
+            Of the members.
+        votes
+            The weights with which they vote about who agrees; `weights` when left out.
+        """
+        T_previous_current = self._steps(weights.members)
+        agreeing = self.agreeing(weights if votes is None else votes)
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
-        moved = mean_motion(believed, share(of_steps, agreeing | none[:, None]))
+        moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
         return cap(sub_trajectory_rte(self.T_ref_sensor, chained(moved), self.length))
 
 

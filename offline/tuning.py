@@ -47,7 +47,7 @@ BANK_SETTINGS = [
     )
     for clip in (6.0, 18.0)
     for sharpness in (12.0, 48.0)
-    for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0))
+    for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0), (0.75, 10.0))
 ]
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
@@ -229,12 +229,16 @@ def _bank_errors(
 ) -> Iterator[NDArray[np.float64]]:
     """Capped errors of a bank with each of `BANK_SETTINGS`."""
     near: dict[tuple[float, int], NearProducts] = {}
+    votes: MemberWeights | None = None
     for settings in BANK_SETTINGS:
         key = _evidence(settings)
         if key not in near:
             # Settings that share what is near follow each other: one at a time is kept.
             near = {key: bank_evidence(left_out, of_bank, pca, settings)}
-        yield bank_errors(left_out, near[key], settings)
+        weights = weights_along(left_out, near[key], settings)
+        # Who agrees takes long to find, and hangs on the settings but little.
+        votes = weights if votes is None else votes
+        yield on_labelled(left_out, simulated_with(left_out, weights, votes))
 
 
 def _evidence(settings: BankSettings) -> tuple[float, int]:
@@ -338,10 +342,12 @@ def simulated(
     return simulated_with(sequence, weights_along(sequence, near, settings))
 
 
-def simulated_with(sequence: LabelledSequence, weights: MemberWeights) -> NDArray[np.float64]:
-    """The same with weights that are given."""
+def simulated_with(
+    sequence: LabelledSequence, weights: MemberWeights, votes: MemberWeights | None = None
+) -> NDArray[np.float64]:
+    """The same with weights that are given, and with those that vote about who agrees."""
     assert sequence.simulation is not None
-    errors = sequence.simulation.errors(weights)
+    errors = sequence.simulation.errors(weights, votes)
     return errors[~np.isnan(errors)]
 
 

@@ -103,7 +103,7 @@ def test_members_that_err_in_opposite_directions_make_up_for_it():
 def test_a_member_that_lost_track_is_left_out():
     sound, lost = trial(straight(0.31)), lost_at(20, 0.29)
     simulation, errors = simulated([sound, sound, lost], [0.3, 0.3, 0.4])
-    agreeing = simulation.agreeing((0, 1, 2))
+    agreeing = simulation.agreeing(MemberWeights((0, 1, 2), np.tile([0.3, 0.3, 0.4], (6, 1))))
     assert agreeing[:, :2].all()
     assert not agreeing[25:28, 2].any()
     assert agreeing[:19, 2].all()
@@ -112,6 +112,24 @@ def test_a_member_that_lost_track_is_left_out():
     # Where all are lost, nobody knows, and the bank stands still with them for a second.
     _, errors = simulated([lost, lost_at(20)], [0.5, 0.5])
     assert (errors[10:20] == 30.0).all()
+
+
+def test_members_vote_with_their_weights_and_the_reference_judges():
+    sound, wrong = trial(straight(NEARLY)), trial(straight(0.2))
+    # One sound member outvotes two wrong ones by its weight, but not by number: scans decide.
+    simulation, errors = simulated([sound, wrong, wrong], [0.8, 0.1, 0.1])
+    known = ~np.isnan(errors)
+    assert errors[known].max() < 4.0  # until it is noticed, and after restarts
+    # Two of three that have the votes are believed, as in a bank.
+    _, errors = simulated([sound, wrong, wrong], [0.2, 0.4, 0.4])
+    assert errors[known].min() > 20.0
+    # Other weights than those that vote: the mean of the members that agree.
+    votes = MemberWeights((0, 1, 2), np.tile([0.8, 0.1, 0.1], (6, 1)))
+    even = MemberWeights((0, 1, 2), np.full((6, 3), 1.0 / 3.0))
+    assert simulation.errors(even, votes)[known].max() < 12.0
+    # Where the reference is unknown, nobody judges.
+    unknown = replace(simulation, T_ref_sensor=np.full_like(simulation.T_ref_sensor, np.nan))
+    assert np.isinf(unknown._misplaced(5, np.tile(np.eye(4), (2, 3, 1, 1)), (1, 3))).all()
 
 
 def test_a_member_that_lost_track_stands_still_until_it_is_noticed():

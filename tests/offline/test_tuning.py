@@ -140,9 +140,9 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
     seen = []
     simulate = BankSimulation.errors
 
-    def errors(self, weights):
+    def errors(self, weights, votes):
         seen.append(weights.weights)
-        return simulate(self, weights)
+        return simulate(self, weights, votes)
 
     def bank_weights(near, _, live):
         assert len(live) == len(near.fixed)

@@ -195,6 +195,21 @@ def test_who_has_no_motion_is_left_out_and_begins_anew(nothing):
     assert agreement.judge(sound, 0.1, EVEN).all()
 
 
+@pytest.mark.parametrize(("departs", "due"), [(0.3, False), (0.6, True)])
+def test_who_slips_is_left_out_and_who_is_far_off_restarts_as_well(departs, due):
+    """At 1 m/s members may differ by 0.1 m in a second, and restart from 0.2 m on."""
+    agreement = Agreement(4, 3.0)
+    for _ in range(30):
+        assert agreement.judge(motions(*[0.1] * 4), 0.1, EVEN).all()
+    apart = 0.5 * departs  # twice the greatest that is tolerated, at most
+    found = []
+    for _ in range(10):
+        T = motions(0.1, 0.1, 0.1, 0.1 + 0.1 * apart)
+        found.append((agreement.judge(T, 0.1, EVEN)[3], agreement.due[3]))
+    assert not found[-1][0]
+    assert any(asked for _, asked in found) == due
+
+
 def test_who_has_restarted_and_is_sound_agrees_at_once():
     stands, sound = motions(0.1, 0.1, 0.1, 0.0), motions(*[0.1] * 4)
     agrees = {}
