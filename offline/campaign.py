@@ -229,7 +229,7 @@ class _UnderWay:
 
     def __init__(self, progress: Progress):
         self._progress = progress
-        self._read: dict[str, int] = {}
+        self._read: dict[str, int] = {}  # scans that were read, by what for
         self._runs: dict[tuple[str, tuple[int, ...]], float] = {}
 
     @property
@@ -240,9 +240,10 @@ class _UnderWay:
     def report(self, task: Task, progress: TaskProgress) -> None:
         """Note how far a task is; several workers may read the same sequence."""
         name, (stage, done, total) = task.sequence, progress
-        if stage == "reading":
-            self._read[name] = max(done, self._read.get(name, 0))
-            self._progress(f"reading {name}", self._read[name], total, "")
+        if stage != "running":
+            what = f"{stage} {name}"
+            self._read[what] = max(done, self._read.get(what, 0))
+            self._progress(what, self._read[what], total, "")
         else:
             self._runs[task.key] = len(task.numbers) * done / max(total, 1)
 

@@ -65,10 +65,13 @@ class Death(NamedTuple):
     cause: str
 
 
+Work = Literal["reading", "running", "registering hops of"]
+
+
 class TaskProgress(NamedTuple):
     """How far a task is that goes on."""
 
-    stage: Literal["reading", "running"]
+    stage: Work
     done: int  # scans
     total: int
 
@@ -212,7 +215,7 @@ class Sequences:
         trials = setup.run(sequence, task.sets, task.whole, advance)
         frames = None
         if task.frames:
-            frames = sequence.measured_frames(partial(_report, report, "reading"))
+            frames = sequence.measured_frames(partial(_report, report, "registering hops of"))
         return TaskResult(trials, frames)
 
     def _prepared(self, setup: TrialSetup, task: Task, report: Report) -> PreparedSequence:
@@ -229,7 +232,7 @@ class Sequences:
         return sequence
 
 
-def _report(report: Report, stage: Literal["reading", "running"], done: int, total: int) -> None:
+def _report(report: Report, stage: Work, done: int, total: int) -> None:
     report(TaskProgress(stage, done, total))
 
 

@@ -41,6 +41,15 @@ def test_what_a_dead_worker_had_done_does_not_count():
     assert [done for _, done, *_ in calls] == [1.6, 1.6, 2]
 
 
+def test_a_second_look_at_a_sequence_is_told_apart():
+    pool, calls = TwoWords(), []
+    pool.said = [TaskProgress(what, 9, 10) for what in ("reading", "registering hops of")]
+    list(watched(pool, [Task("one", (0,), ({},))], "runs", lambda *call: calls.append(call)))
+    told = [call[:3] for call in calls]
+    assert ("reading one", 9, 10) in told
+    assert ("registering hops of one", 9, 10) in told
+
+
 def test_the_remark_counts_workers_and_not_runs():
     class TwoWorkers(TwoWords):
         def workers(self):
