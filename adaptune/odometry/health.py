@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from adaptune.geometry import Poses, rotation_angle, scale
+from adaptune.geometry import Poses, invert, rotation_angle, scale
 from adaptune.strict import StrictModel
 
 _STILL = 1e-6
@@ -18,13 +18,16 @@ _INTERVALS = 11
 """Newest intervals between scans whose median is the usual one."""
 _MOST_JITTER = 0.5
 """The largest share of an interval that counts as jitter of its stamps."""
+_PATIENCE = 0.25
+"""Seconds within which an odometry may take back a jump. A noisy one jumps back and forth, and is
+worse off if it is restarted; one that has run away does not come back."""
 
 
 class HealthCheck(StrictModel):
     """Bounds on a platform's motion.
 
     An odometry that predicts by constant velocity runs away after a failure and does not come
-    back. A step that the platform cannot have made reveals it.
+    back. A step that the platform cannot have made reveals it, unless it is taken back.
 
     Attributes
     ----------
@@ -32,7 +35,9 @@ class HealthCheck(StrictModel):
         Metres a second.
     max_acceleration : float
         Metres a second squared, of the step's mean velocity against the last healthy one's;
-        generous enough for the noise of two differentiations. Irregular stamps widen it.
+        generous enough for the noise of two differentiations. Irregular stamps widen it. What
+        counts is the mean velocity over up to a quarter of a second: a jump that is taken back
+        within that time is none.
     max_turn_rate : float
         Degrees a second.
     max_freeze : float
@@ -105,6 +110,8 @@ class Guard:
         self._moving: tuple[Poses, float] | None = None
         self._since = self._still = 0.0
         self._unregistered = 0
+        # The way since the last healthy pose, and its seconds, where a jump may be taken back.
+        self._doubtful: tuple[Poses, float] = np.eye(4), 0.0
 
     def check(
         self, T_previous_current: Poses, elapsed: float, registered: bool = True
@@ -125,23 +132,33 @@ class Guard:
         self._unregistered = 0 if registered else self._unregistered + 1
         if not np.isfinite(T_previous_current).all():
             return "no_pose"
-        motion = T_previous_current, elapsed
-        last = None if self._healthy is None else _velocity(*self._healthy)
         turn_rate = float(rotation_angle(T_previous_current)) / elapsed
-        velocity = _velocity(*motion)
-        noise = self._jitter(elapsed) * float(np.linalg.norm(velocity))
-        what = self._health.exceeded(
-            velocity, last, self._since, turn_rate, noise + self._healthy_noise
-        )
-        if what is not None:
+        velocity = _velocity(T_previous_current, elapsed)
+        if (what := self._health.exceeded(velocity, None, elapsed, turn_rate)) is not None:
             return what
-        if self._frozen(*motion):
+        if self._frozen(T_previous_current, elapsed):
             return "max_freeze"
-        self._healthy, self._healthy_noise, self._since = motion, noise, 0.0
+        noise = self._jitter(elapsed) * float(np.linalg.norm(velocity))
+        T_way, seconds = self._doubtful
+        way = T_way @ T_previous_current, seconds + elapsed
+        if self._accelerates(way, self._since - seconds, noise):
+            if way[1] >= _PATIENCE:
+                return "max_acceleration"
+            self._doubtful = way
+        else:
+            self._healthy, self._healthy_noise, self._since = way, noise, 0.0
+            self._doubtful = np.eye(4), 0.0
         if self._unregistered >= self._health.max_unregistered:
             self._unregistered = 0
             return "max_unregistered"
         return None
+
+    def _accelerates(self, way: tuple[Poses, float], elapsed: float, noise: float) -> bool:
+        """Whether no platform goes on like this from the last healthy motion."""
+        if self._healthy is None:
+            return False
+        last, noise = _velocity(*self._healthy), noise + self._healthy_noise
+        return self._health.exceeded(_velocity(*way), last, elapsed, 0.0, noise) is not None
 
     def _jitter(self, elapsed: float) -> float:
         """The share of an interval by which its stamps are irregular.
@@ -167,10 +184,21 @@ class Guard:
         self._healthy, self._still = self._moving, 0.0
         return True
 
-    def go_on(self, elapsed: float) -> Poses:
-        """The last healthy motion, for so many seconds."""
+    def go_on(self, elapsed: float) -> tuple[Poses, Poses]:
+        """How the last healthy motion goes on.
+
+        Returns
+        -------
+        T_previous_healthy : ndarray of shape (4, 4)
+            From the pose before to where it would have been: takes back a jump of the last scans.
+        T_healthy_current : ndarray of shape (4, 4)
+            The motion from there, for so many seconds.
+        """
         T_previous_current, seconds = self._healthy or (np.eye(4), 1.0)
-        return scale(T_previous_current, elapsed / seconds)
+        T_way, of_way = self._doubtful
+        self._doubtful = np.eye(4), 0.0
+        T_previous_healthy = invert(T_way) @ scale(T_previous_current, of_way / seconds)
+        return T_previous_healthy, scale(T_previous_current, elapsed / seconds)
 
 
 def _velocity(T_previous_current: Poses, seconds: float) -> Poses:

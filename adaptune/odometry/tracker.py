@@ -57,9 +57,9 @@ class Tracker:
                 T_previous_current = invert(T_odom_previous) @ T_odom_sensor
             unhealthy = self._guard.check(T_previous_current, elapsed, registered)
             if unhealthy is not None:
-                T_healthy = self._guard.go_on(elapsed)
+                T_previous_healthy, T_healthy = self._guard.go_on(elapsed)
                 # The motion was computed from the pose before: their errors of rounding multiply.
-                T_odom_sensor = rectify(T_odom_previous @ T_healthy)
+                T_odom_sensor = rectify(T_odom_previous @ T_previous_healthy @ T_healthy)
                 self.odometry.start(prepared, T_odom_sensor, T_healthy)
         seconds = time.perf_counter() - begin
         self._last = RegisteredScan(
