@@ -156,6 +156,11 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
         )
         other = _YARDSTICKS[rows[-1].yardstick]
         said.append(f"Compared with the {other}, {', and '.join(each)} its error.")
+    if unknown := [f"`{row.mode}`" for row in adaptive if _is_unknown(row)]:
+        said.append(
+            f"{rows[-1].sequence} is too short for intervals: whether {' or '.join(unknown)} "
+            f"differs from the {_YARDSTICKS[rows[-1].yardstick]} is not known."
+        )
     return said + _estimates(rows) + _losses(rows) + _restarts(rows)
 
 
@@ -164,17 +169,24 @@ _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 
 
 def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
-    """For each sequence without reference a sentence about what is estimated there."""
+    """What is estimated where there is no reference, and where the reference contradicts it."""
     said = []
     for row in rows:
-        if row.rte is not None or row.estimated is None:
+        if row.estimated is None or row.sequence == ALL:
             continue
         ends = row.estimated_interval
         interval = "" if ends is None else f" (95 % interval {ends[0]:.3f}-{ends[1]:.3f} %)"
-        said.append(
-            f"{row.sequence} has no reference. `{row.mode}` estimates its own mean RTE there: "
-            f"{row.estimated:.3f} %{interval}."
-        )
+        if row.rte is None:
+            said.append(
+                f"{row.sequence} has no reference to compare with over this length. `{row.mode}` "
+                f"estimates its own mean RTE there: {row.estimated:.3f} %{interval}."
+            )
+        elif ends is not None and not ends[0] <= row.rte <= ends[1]:
+            said.append(
+                f"On {row.sequence} `{row.mode}` estimates its own mean RTE at "
+                f"{row.estimated:.3f} %{interval}; by the reference it is {row.rte:.3f} %. One of "
+                f"the two is wrong over this length."
+            )
     return said
 
 
@@ -189,10 +201,17 @@ def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
 
 def _counts(row: ComparisonRow) -> bool:
     """Whether a mode differs from the yardstick by what counts, as far as it is known."""
-    if row.ratio is None or abs(row.ratio - 1.0) < NO_DIFFERENCE:
+    if row.ratio is None or abs(row.ratio - 1.0) < NO_DIFFERENCE or _is_unknown(row):
         return False
     low, high = row.ratio_interval or (row.ratio, row.ratio)
     return not low <= 1.0 <= high
+
+
+def _is_unknown(row: ComparisonRow) -> bool:
+    """Whether a mode may differ from the yardstick, and nobody can tell."""
+    if row.ratio is None or row.ratio_interval is not None or row.sequence == ALL:
+        return False
+    return abs(row.ratio - 1.0) >= NO_DIFFERENCE
 
 
 def _times(row: ComparisonRow) -> str:
@@ -209,6 +228,11 @@ def _of_baseline(row: ComparisonRow) -> str | None:
     if row.ratio is None:
         return None
     has = f"on {_where(row)} the baseline has {_times(row)}"
+    if _is_unknown(row):
+        return (
+            f"{row.sequence} is too short to tell whether the fixed set is better than the "
+            f"baseline: {has} the fixed set's error, with no interval."
+        )
     if not _counts(row):
         return (
             f"There is no difference that counts between the baseline and the fixed set here: "

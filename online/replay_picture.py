@@ -25,7 +25,7 @@ class Track(NamedTuple):
     seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
     xy: NDArray[np.float64]  # metres, seen from the reference's first pose, of shape (n, 2)
     errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
-    errors_behind: NDArray[np.float64]  # the same at the ends of the sub-trajectories
+    errors_behind: NDArray[np.float64]  # the mean of those that ended in the last 30 s
     restarted: NDArray[np.bool_]  # of shape (n,)
     choice_seconds: NDArray[np.float64]  # of shape (m,)
     choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
@@ -198,7 +198,7 @@ def _draw_estimated(axes: Any, mode: str, track: Track, length: float) -> None:
         axes.axvspan(begin, end, color="#999999", alpha=0.35, lw=0, label=label)
         label = "_"  # not twice in the legend
     axes.set(
-        ylabel=f"RTE over the\nlast {length:g} m [%]",
+        ylabel=f"RTE over {length:g} m,\nlast 30 s [%]",
         title=f"{mode}: its error as estimated while driving",
     )
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

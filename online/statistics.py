@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.live.squares import SECONDS
 from adaptune.metrics import (
     KittiError,
     absolute_error,
@@ -55,12 +56,23 @@ class Reference(NamedTuple):
         return sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length)
 
     def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Sub-trajectory RTE in percent, at the frames at which the sub-trajectories end."""
-        behind = np.full(len(odometry), np.nan)
-        if self.trajectory is not None:
-            ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
-            behind[ends[ends >= 0]] = self.errors(odometry)[ends >= 0]
-        return behind
+        """Mean RTE in percent of the sub-trajectories that ended in the last `SECONDS`.
+
+        It is what an odometry estimates while it drives. NaN where none ended.
+        """
+        if self.trajectory is None:
+            return np.full(len(odometry), np.nan)
+        of = self.errors(odometry)
+        ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
+        known = (ends >= 0) & np.isfinite(of)
+        sums, counts = (
+            np.concatenate([[0.0], np.cumsum(np.bincount(ends[known], w, len(odometry)))])
+            for w in (of[known], None)
+        )
+        stop = np.arange(1, len(odometry) + 1)
+        first = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
+        with np.errstate(invalid="ignore"):
+            return np.asarray((sums[stop] - sums[first]) / (counts[stop] - counts[first]))
 
     def standard(self, odometry: Trajectory) -> "StandardErrors | None":
         """The errors that other tools give, where there are reference poses to compare with."""

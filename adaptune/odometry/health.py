@@ -18,6 +18,8 @@ _INTERVALS = 11
 """Newest intervals between scans whose median is the usual one."""
 _MOST_JITTER = 0.5
 """The largest share of an interval that counts as jitter of its stamps."""
+_SETTLED = 0.5
+"""Seconds after which an odometry knows how fast it is: a recording may begin in motion."""
 _PATIENCE = 0.25
 """Seconds within which an odometry may take back a jump. A noisy one jumps back and forth, and is
 worse off if it is restarted; one that has run away does not come back."""
@@ -108,7 +110,7 @@ class Guard:
         self._healthy_noise = 0.0
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
         self._moving: tuple[Poses, float] | None = None
-        self._since = self._still = 0.0
+        self._since = self._still = self._age = 0.0
         self._unregistered = 0
         # The way since the last healthy pose, and its seconds, where a jump may be taken back.
         self._doubtful: tuple[Poses, float] = np.eye(4), 0.0
@@ -128,6 +130,7 @@ class Guard:
             Whether the odometry registered the scan.
         """
         self._since += elapsed
+        self._age += elapsed
         self._intervals.append(elapsed)
         self._unregistered = 0 if registered else self._unregistered + 1
         if not np.isfinite(T_previous_current).all():
@@ -155,7 +158,7 @@ class Guard:
 
     def _accelerates(self, way: tuple[Poses, float], elapsed: float, noise: float) -> bool:
         """Whether no platform goes on like this from the last healthy motion."""
-        if self._healthy is None:
+        if self._healthy is None or self._age < _SETTLED:
             return False
         last, noise = _velocity(*self._healthy), noise + self._healthy_noise
         return self._health.exceeded(_velocity(*way), last, elapsed, 0.0, noise) is not None

@@ -64,15 +64,19 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         return Driven(None, "`online` will drive `paper`, and not `paired` (online.rules).", paper)
     if mechanism == "bank":
         members = ", ".join(map(str, bank_members(study.config.online.switching, model)))
-        words = f"`online` will drive the bank of trials {members} as `paired`."
-        if not model.expected:
-            words += f" It relies on what it measures while it drives, for {_too_little(model)}."
+        words = f"`online` will drive the bank of trials {members} as `paired`"
+        if BANK in model.expected:
+            words += f", because it has the least expected loss: {_expected(model, BANK)}."
+        else:
+            words += f". It relies on what it measures while it drives, for {_too_little(model)}."
         return Driven("bank", words, paper)
+    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
-        words = f"`online` will drive one set at a time as `paired`, {how}."
-        return Driven(mechanism, words, paper)
-    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
+        words = f"`online` will drive one set at a time as `paired`, {how}"
+        if ONE_SET in model.expected:
+            words += f", because it has the least expected loss: {_expected(model, ONE_SET)}"
+        return Driven(mechanism, f"{words}.", paper)
     known = [way for way in ways if way in model.expected]
     if known:
         way = min(known, key=lambda way: model.expected[way]["loss"])
@@ -84,6 +88,10 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     else:
         why = _too_little(model)
     return Driven(None, f"{fixed} as `paired`, because {why}.", paper)
+
+
+def _expected(model: ErrorModel, way: str) -> str:
+    return expected_in_words(model.expected[way])
 
 
 def _too_little(model: ErrorModel) -> str:
@@ -113,8 +121,9 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
     else:
         reach = f"elsewhere along {'this recording' if recordings == 1 else 'these recordings'}"
     of = "one recording" if recordings == 1 else f"{recordings} recordings"
+    interval = f"95 % interval {low:.0f} to {high:.0f} %" if low >= -1000.0 else "no interval"
     return (
-        f"expected gain {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %), in the worst tenth "
+        f"expected gain {gain:.0f} % ({interval}), in the worst tenth "
         f"{expected['worst_tenth']:.2f} times the fixed set's error, {reach} "
         f"({stretches} stretches of {of})"
     )

@@ -327,7 +327,12 @@ def rows_of(sequence="a", **ratios):
 @pytest.mark.parametrize(
     ("ratio", "interval", "words"),
     [
-        (0.5, None, "The baseline is better than the fixed set here: on a the baseline has 0.50 "),
+        (
+            0.5,
+            (0.4, 0.6),
+            "The baseline is better than the fixed set here: on a the baseline ",
+        ),
+        (0.5, None, "a is too short to tell .*: on a the baseline has 0.50 times the fixed set's"),
         (
             1.25,
             (1.1, 1.4),
@@ -349,9 +354,17 @@ def test_baseline_and_fixed_set_are_compared_in_words(ratio, interval, words):
 
 
 def test_modes_that_adapt_are_told_where_they_differ():
-    rows = rows_of(baseline=0.5, paired=0.4, paper=2.0)
+    rows = [
+        replace(row, ratio_interval=(0.9 * row.ratio, 1.1 * row.ratio))
+        for row in rows_of(baseline=0.5, paired=0.4, paper=2.0)
+    ]
     said = "Compared with the fixed set, `paired` is better, with 0.40 times, and `paper` is worse"
-    assert remarks(rows)[2] == f"{said}, with 2.00 times its error."
+    said = said.replace("times,", "times (95 % interval 0.36-0.44),")
+    assert remarks(rows)[2] == f"{said}, with 2.00 times (95 % interval 1.80-2.20) its error."
+    short = remarks(rows_of(baseline=1.0, paired=0.4, paper=1.0))
+    assert short[-1] == (
+        "a is too short for intervals: whether `paired` differs from the fixed set is not known."
+    )
     # All sequences together decide.
     pooled = rows_of("all", baseline=1.5, paired=1.0)
     mean, verdict = remarks([*rows, *pooled])

@@ -96,8 +96,8 @@ def test_estimated_and_true_error_are_drawn_over_each_other(tmp_path):
     path, said = drawn(tmp_path, {"baseline": bare, "untrained": bank})
     for label in (
         "untrained: its error as estimated while driving",
-        "RTE over the",
-        "last 15 m [%]",
+        "RTE over 15 m,",
+        "last 30 s [%]",
         "estimated",
         "95 % interval",
         "true",

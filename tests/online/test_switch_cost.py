@@ -62,12 +62,11 @@ def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_p
     assert said().endswith("It never switches, so there is no switch cost.")
     members = ", ".join(map(str, model.bank))
     bank = said(bank_adapts=True)
-    assert bank.startswith(f"`online` will drive the bank of trials {members} as `paired`. It")
+    assert bank.startswith(f"`online` will drive the bank of trials {members} as `paired`")
     assert bank.endswith("no switch cost.")
-    assert said(adapts=True) == (
-        "`online` will drive one set at a time as `paired`, changed live. "
-        "Then a switch costs 25.0% of the RTE."
-    )
+    alone = said(adapts=True)
+    assert alone.startswith("`online` will drive one set at a time as `paired`, changed live")
+    assert alone.endswith(". Then a switch costs 25.0% of the RTE.")
     handed = load_study(study_file, ["online.switching.mechanism=hand_over"], folder)
     assert said(study=handed).endswith(
         "It never switches; `paper` does, and then a switch costs 0.0% of the RTE."
