@@ -178,8 +178,8 @@ def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
         interval = "" if ends is None else f" (95 % interval {ends[0]:.3f}-{ends[1]:.3f} %)"
         if row.rte is None:
             said.append(
-                f"{row.sequence} has no reference to compare with over this length. `{row.mode}` "
-                f"estimates its own mean RTE there: {row.estimated:.3f} %{interval}."
+                f"{row.sequence} has no reference. `{row.mode}` estimates its own mean RTE there: "
+                f"{row.estimated:.3f} %{interval}."
             )
         elif ends is not None and not ends[0] <= row.rte <= ends[1]:
             said.append(
