@@ -20,7 +20,9 @@ _MOST_JITTER = 0.5
 """The largest share of an interval that counts as jitter of its stamps."""
 _SETTLED = 0.5
 """Seconds after which an odometry knows how fast it is: a recording may begin in motion."""
-_PATIENCE = 0.25
+_RECENT = 0.5
+"""Seconds of healthy motion whose mean goes on where the odometry restarts: one step is noisy."""
+_PATIENCE = 1.0
 """Seconds within which an odometry may take back a jump. A noisy one jumps back and forth, and is
 worse off if it is restarted; one that has run away does not come back."""
 
@@ -38,8 +40,7 @@ class HealthCheck(StrictModel):
     max_acceleration : float
         Metres a second squared, of the step's mean velocity against the last healthy one's;
         generous enough for the noise of two differentiations. Irregular stamps widen it. What
-        counts is the mean velocity over up to a quarter of a second: a jump that is taken back
-        within that time is none.
+        counts is the mean velocity over up to a second: what is taken back within it does not.
     max_turn_rate : float
         Degrees a second.
     max_freeze : float
@@ -110,10 +111,12 @@ class Guard:
         self._healthy_noise = 0.0
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
         self._moving: tuple[Poses, float] | None = None
+        self._recent: deque[tuple[Poses, float]] = deque()
         self._since = self._still = self._age = 0.0
         self._unregistered = 0
         # The way since the last healthy pose, and its seconds, where a jump may be taken back.
         self._doubtful: tuple[Poses, float] = np.eye(4), 0.0
+        self._taken_back = self._doubtful  # at the last fault
 
     def check(
         self, T_previous_current: Poses, elapsed: float, registered: bool = True
@@ -133,6 +136,17 @@ class Guard:
         self._age += elapsed
         self._intervals.append(elapsed)
         self._unregistered = 0 if registered else self._unregistered + 1
+        before = self._doubtful
+        what = self._fault(T_previous_current, elapsed)
+        if what is None and self._unregistered >= self._health.max_unregistered:
+            self._unregistered = 0
+            what = "max_unregistered"
+        if what is not None:
+            self._taken_back, self._doubtful = before, (np.eye(4), 0.0)
+        return what
+
+    def _fault(self, T_previous_current: Poses, elapsed: float) -> str | None:
+        """What is wrong with the motion itself."""
         if not np.isfinite(T_previous_current).all():
             return "no_pose"
         turn_rate = float(rotation_angle(T_previous_current)) / elapsed
@@ -145,15 +159,16 @@ class Guard:
         T_way, seconds = self._doubtful
         way = T_way @ T_previous_current, seconds + elapsed
         if self._accelerates(way, self._since - seconds, noise):
-            if way[1] >= _PATIENCE:
+            # Stamps are not quite even.
+            if way[1] >= 0.95 * _PATIENCE:
                 return "max_acceleration"
             self._doubtful = way
         else:
             self._healthy, self._healthy_noise, self._since = way, noise, 0.0
+            self._recent.append(way)
+            while sum(of for _, of in self._recent) - self._recent[0][1] >= _RECENT:
+                self._recent.popleft()
             self._doubtful = np.eye(4), 0.0
-        if self._unregistered >= self._health.max_unregistered:
-            self._unregistered = 0
-            return "max_unregistered"
         return None
 
     def _accelerates(self, way: tuple[Poses, float], elapsed: float, noise: float) -> bool:
@@ -185,6 +200,7 @@ class Guard:
         if not self._health.frozen(self._still, float(np.linalg.norm(T[:3, 3])) / seconds):
             return False
         self._healthy, self._still = self._moving, 0.0
+        self._recent = deque([self._moving])
         return True
 
     def go_on(self, elapsed: float) -> tuple[Poses, Poses]:
@@ -197,9 +213,11 @@ class Guard:
         T_healthy_current : ndarray of shape (4, 4)
             The motion from there, for so many seconds.
         """
-        T_previous_current, seconds = self._healthy or (np.eye(4), 1.0)
-        T_way, of_way = self._doubtful
-        self._doubtful = np.eye(4), 0.0
+        T_previous_current, seconds = np.eye(4), 0.0
+        for T, of in self._recent:
+            T_previous_current, seconds = T_previous_current @ T, seconds + of
+        seconds = seconds or 1.0
+        T_way, of_way = self._taken_back
         T_previous_healthy = invert(T_way) @ scale(T_previous_current, of_way / seconds)
         return T_previous_healthy, scale(T_previous_current, elapsed / seconds)
 

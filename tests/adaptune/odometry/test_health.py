@@ -94,7 +94,7 @@ def test_bounds_that_make_no_sense(bounds):
 
 
 def test_what_would_have_been_said_of_a_drive():
-    steps = [0.1, 0.1, 9.0, 0.1, 0.1, np.nan, 0.1, *[0.0] * 6, 0.1, 0.8, *[0.1] * 5]
+    steps = [0.1, 0.1, 9.0, 0.1, 0.1, np.nan, 0.1, *[0.0] * 6, 0.1, *[0.8] * 10, *[0.1] * 5]
     check = HealthCheck(max_speed=10.0, max_acceleration=20.0, max_freeze=0.45, max_unregistered=3)
     registered = np.ones(len(steps) + 1, bool)
     registered[-4:] = False
@@ -150,48 +150,49 @@ def test_jitter_of_stamps_is_not_acceleration():
 @pytest.mark.parametrize("elapsed", [0.1, 0.02, 0.07, 0.13, 0.2])
 def test_a_step_is_not_excused_by_jitter(elapsed):
     """A step of three times what the robot drives, however its stamps are."""
-    n = int(np.ceil(0.25 / elapsed))  # so many scans it may take to take it back
+    n = int(np.ceil(0.95 / elapsed))  # so many scans it may take to take it back
     said = drive([*[0.1] * 12, *[elapsed] * n], [*[1.0] * 12, *[30.0 * elapsed] * n])
     assert said == [*[None] * (11 + n), "max_acceleration"]
 
 
-@pytest.mark.parametrize("seconds", [0.1, 0.5])
+@pytest.mark.parametrize("seconds", [0.1, 1.0])
 def test_a_jump_that_is_taken_back_at_once_is_no_fault(seconds):
     """As a noisy odometry makes them in a garden; where scans are rare, nobody can wait."""
     jump = 1.2 * 30.0 * seconds**2
     steps = 10.0 * seconds + jump * np.array([0, 0, 0, 0, 0, 0, 1, -1, 0, -1, 1, 0])
     said = drive([seconds] * len(steps), steps)
-    assert (set(said) == {None}) == (seconds < 0.25)
+    assert (set(said) == {None}) == (seconds < 1.0)
 
 
 def test_a_recording_may_begin_in_motion():
     """The odometry takes some scans to learn that the car drives at 15 m/s."""
     assert set(drive([0.1] * 20, [0.2, 0.6, *[1.5] * 18])) == {None}
-    assert drive([0.1] * 20, [*[0.2] * 9, *[1.5] * 11])[11] == "max_acceleration"
+    assert drive([0.1] * 20, [*[0.2] * 9, *[1.5] * 11])[18] == "max_acceleration"
 
 
 def test_a_restart_takes_back_the_jump():
     guard = Guard(HealthCheck())
     assert {guard.check(moved(1.0), 0.1) for _ in range(8)} == {None}
-    # Two steps aside in doubt, and the third is one too many.
+    # Nine steps aside in doubt, and the tenth is one too many.
     aside = moved(1.0)
     aside[1, 3] = 0.6
-    assert [guard.check(aside, 0.1) for _ in range(3)] == [None, None, "max_acceleration"]
+    assert [guard.check(aside, 0.1) for _ in range(10)] == [*[None] * 9, "max_acceleration"]
     T_previous_healthy, T_healthy = guard.go_on(0.1)
     np.testing.assert_allclose(T_healthy, moved(1.0), atol=1e-12)
-    where = aside @ aside @ T_previous_healthy @ T_healthy
-    np.testing.assert_allclose(where, moved(3.0), atol=1e-9)
-    # Nothing of it is remembered.
+    where = np.linalg.matrix_power(aside, 9) @ T_previous_healthy @ T_healthy
+    np.testing.assert_allclose(where, moved(10.0), atol=1e-9)
+    # Nothing of it is remembered at the next fault.
     assert guard.check(moved(1.0), 0.1) is None
+    assert guard.check(np.full((4, 4), np.nan), 0.1) == "no_pose"
     np.testing.assert_allclose(guard.go_on(0.1)[0], np.eye(4))
 
 
 def test_regular_stamps_excuse_nothing():
     """3 m/s within 0.1 s is the bound, before and after stamps that jitter."""
     regular = [0.1] * 12
-    three = [0.1] * 3
-    assert drive([*regular, *three], [*[1.0] * 12, *[1.31] * 3])[-1] == "max_acceleration"
-    assert drive([*regular, *three], [*[1.0] * 12, *[1.29] * 3])[-1] is None
+    ten = [0.1] * 10
+    assert drive([*regular, *ten], [*[1.0] * 12, *[1.31] * 10])[-1] == "max_acceleration"
+    assert drive([*regular, *ten], [*[1.0] * 12, *[1.29] * 10])[-1] is None
     jittered = [*regular, 0.13, 0.07, *regular]
-    said = drive([*jittered, *three], [*[1.0] * 26, *[1.31] * 3])
-    assert said == [*[None] * 28, "max_acceleration"]
+    said = drive([*jittered, *ten], [*[1.0] * 26, *[1.31] * 10])
+    assert said == [*[None] * 35, "max_acceleration"]
