@@ -141,6 +141,8 @@ class Guard:
         if what is None and self._unregistered >= self._health.max_unregistered:
             self._unregistered = 0
             what = "max_unregistered"
+            # A jump that was taken back just now is none.
+            before = before if self._doubtful[1] else self._doubtful
         if what is not None:
             self._taken_back, self._doubtful = before, (np.eye(4), 0.0)
         return what

@@ -130,6 +130,15 @@ def test_scans_that_do_not_register(in_a_row, said):
     np.testing.assert_allclose(T_healthy, moved(0.2), atol=1e-12)
 
 
+def test_a_jump_that_came_back_is_not_undone_where_scans_do_not_register():
+    guard = Guard(HealthCheck(max_unregistered=2))
+    for _ in range(8):
+        guard.check(moved(1.0), 0.1)
+    assert guard.check(moved(1.6), 0.1, registered=False) is None  # a doubtful step
+    assert guard.check(moved(0.4), 0.1, registered=False) == "max_unregistered"
+    np.testing.assert_allclose(guard.go_on(0.1)[0], np.eye(4))
+
+
 def drive(elapsed, steps):
     """What a guard of a vehicle says of steps in metres that are stamped so many seconds apart."""
     guard = Guard(HealthCheck())
