@@ -147,6 +147,7 @@ def _tasks(missing: Sequence[Missing], without_frames: Sequence[str], n_workers:
     ]
     to_read = [name for name in without_frames if name not in {n for n, *_ in lacking}]
     tasks = [Task(name, (), (), frames=True) for name in to_read]
+    n_workers = max(1, n_workers)  # those of a cluster may all be on their way back
     for last, (name, numbers, parameters) in enumerate(lacking, 1 - len(lacking)):
         # The first task of a sequence returns what all trials on it share.
         first = numbers[0] if name in without_frames else None
