@@ -9,15 +9,13 @@ with the health check and live evidence. Limit: within 10 % of each other on nin
 The last column is the fixed set's error, from its trial.
 """
 
-import argparse
 import os
-from pathlib import Path
 
 import numpy as np
-from gain_data import ODOMETRIES, factory_of, labelled, training_courses, trials
-from replays import SUB_TRAJECTORY, bank_of, model_of, replays_of
+from gain_data import factory_of, labelled, training_courses, trials
+from replays import bank_of, mean_error, model_of, of_world, replays_of
 
-from adaptune.metrics import cap, sub_trajectory_rte
+from adaptune.metrics import cap
 from adaptune.simulation.simulate import simulate
 from offline.labelled import LabelledData, LabelledSequence
 from offline.tuning import Policy, bank_data, bank_errors, bank_evidence
@@ -34,14 +32,7 @@ def predict(sequence: LabelledSequence, others: LabelledData, chosen: Policy) ->
 
 def main() -> None:
     """Predict and drive all courses."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=8)
-    parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
-    parser.add_argument("--length", type=float, default=120.0, help="of the courses")
-    arguments = parser.parse_args()
+    arguments = of_world(__doc__).parse_args()
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
     courses = training_courses(arguments.seed, arguments.length)
     factory = factory_of(arguments.odometry)
@@ -55,10 +46,7 @@ def main() -> None:
         predicted = predict(sequence, others, chosen)
         scans = list(simulate(courses[sequence.name]))
         (result,) = replays_of(scans, {"bank": way})
-        T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
-        T_odom_sensor = result.trajectory.T_world_sensor
-        errors = sub_trajectory_rte(T_world_sensor, T_odom_sensor, SUB_TRAJECTORY)
-        driven = float(cap(errors[~np.isnan(errors)]).mean())
+        driven = mean_error(scans, result)
         fixed = cap(sequence.errors)[:, data.sets.column(model.fixed)].mean()
         ratios.append(driven / predicted)
         print(

@@ -156,6 +156,25 @@ def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[
     return replays
 
 
+def mean_error(scans: list[SimulatedScan], result: Replay) -> float:
+    """Mean capped error of a replay in percent."""
+    T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
+    errors = sub_trajectory_rte(T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY)
+    return float(cap(errors[~np.isnan(errors)]).mean())
+
+
+def of_world(text: str | None) -> argparse.ArgumentParser:
+    """What is given about a world of `gain.py`: the folder of its trials, its seed, its courses."""
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=8)
+    parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
+    parser.add_argument("--length", type=float, default=120.0, help="of the training courses")
+    return parser
+
+
 def print_table(names: list[str], means: NDArray[np.float64]) -> None:
     """Print means over the courses, and ratios to the fixed set's error."""
     fixed = means[:, [names.index("fixed")]]
@@ -172,17 +191,11 @@ def print_table(names: list[str], means: NDArray[np.float64]) -> None:
 
 def main() -> None:
     """Replay all courses in all ways."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=8)
-    parser.add_argument("--odometry", default="gicp", choices=ODOMETRIES)
+    parser = of_world(__doc__)
     parser.add_argument(
         "--modes", nargs="+", default=["baseline", "bank of 4", "untrained"], help="besides fixed"
     )
     parser.add_argument("--without", nargs="+", default=[], help="scenes that are not trained on")
-    parser.add_argument("--length", type=float, default=120.0, help="of the training courses")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {int(os.environ.get("CORE", max(os.sched_getaffinity(0))))})
     odometry, seed = arguments.odometry, arguments.seed
@@ -201,13 +214,10 @@ def main() -> None:
             continue
         course = Course(scenes=scenes, length=LENGTH, seed=1000 * seed + 500 + i)
         scans = list(simulate(course))
-        T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
         means.append([])
         row, estimated = f"{' '.join(scenes):32}", ""
         for result in replays_of(scans, compared):
-            T_odom_sensor = result.trajectory.T_world_sensor
-            errors = sub_trajectory_rte(T_world_sensor, T_odom_sensor, SUB_TRAJECTORY)
-            means[-1].append(float(cap(errors[~np.isnan(errors)]).mean()))
+            means[-1].append(mean_error(scans, result))
             row += f"{means[-1][-1]:12.3f} ({result.restarted.sum():3})"
             own = [choice.selection.estimated_error for choice in result.choices]
             known = not np.isnan(own).all()

@@ -75,9 +75,8 @@ class OwnErrors:
         while link.end - self._links[0].end > self._length + LENGTHS[0] / COVERED:
             self._links.popleft()
         self._chains.append(_chain(self._links, self._length))
-        while link.seconds - self._chains[0].seconds > SECONDS and link.end - self._chains[
-            0
-        ].start > max(METRES, self._length):
+        until, behind = link.seconds - SECONDS, link.end - max(METRES, self._length)
+        while self._chains[0].seconds < until and self._chains[0].start < behind:
             self._chains.popleft()
 
     def clear(self) -> None:

@@ -83,7 +83,7 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         best = "a bank" if way == BANK else "one set at a time"
         why = (
             f"it has the least expected loss; the best alternative is {best}: "
-            f"{expected_in_words(model.expected[way])}"
+            f"{_expected(model, way)}"
         )
     else:
         why = _too_little(model)
