@@ -1,0 +1,137 @@
+"""Commands of the online stage."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from adaptune.commands.options import Folder, Override, StudyFile, load
+from adaptune.errors import AdaptuneError
+from adaptune.next_command import say_next, say_next_of_study, say_next_online
+from adaptune.terminal import begin_work, console, progress, say
+
+
+def online(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
+    ] = None,
+    again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
+    untrained: Annotated[
+        bool,
+        typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
+    ] = False,
+) -> None:
+    """Replay the test sequences: baseline, fixed, and adaptive by every rule.
+
+    Once a second, an adaptive replay describes the newest scan and selects a parameter set with the
+    error model. Each replay writes its trajectory (TUM), every selection with its predicted error,
+    and the time of each scan (CSV).
+
+    With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
+    if the study names no test.
+    """
+    if untrained and model is not None:
+        raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    loaded = load(study, override, folder)
+    from adaptune.cores import pin
+    from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
+    from online.run_replays import run_replays, run_untrained
+
+    # Ask for the number of cores before the replays are bound to one.
+    _ = loaded.mechanism
+    unpin = pin(os.getpid())
+    try:
+        with progress() as show:
+            if untrained:
+                made = run_untrained(loaded, again, show)
+            else:
+                made = run_replays(loaded, model or loaded.model_path, again, show)
+    finally:
+        unpin()
+    n = len(loaded.config.test) * len(ReplaySetup.of(loaded).modes)
+    if untrained:
+        n = len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
+    there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
+    say(f"{there}: {loaded.folder / 'replays'}/")
+    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+
+
+def switching(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    seconds: Annotated[
+        float, typer.Option(help="Seconds of every training sequence to use.", min=10.0)
+    ] = 60.0,
+) -> None:
+    """Measure what a change of parameters costs during a replay.
+
+    Replays the training sequences with the odometry's own parameters, and switches every 5 s to the
+    same parameters: with every mechanism that the odometry supports, and several warm-ups. The
+    study keeps the switch cost of one set at a time, which selections take into account.
+    """
+    loaded = load(study, override, folder)
+    from adaptune import report
+    from online.switch_cost import measure_switching, switch_cost_in_words
+
+    with progress() as show:
+        rows, caption = measure_switching(loaded, seconds, show)
+    console.print(
+        report.table(
+            f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
+            rows,
+            caption,
+        )
+    )
+    say(switch_cost_in_words(loaded))
+    say(f"Kept in {loaded.folder / 'switching.json'}.")
+    say_next_online(loaded.config.test, study, override, folder)
+
+
+def compare(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+) -> None:
+    """Compare the replays: a table, CSV, JSON, and a picture for every sequence replayed.
+
+    *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
+    1, adapting is better. *estimated* is the error that a bank measured itself. Intervals come from
+    a block bootstrap over time: they hold for these recordings, not for other places.
+    """
+    loaded = load(study, override, folder)
+    from adaptune.study.driven import MIN_RECORDINGS
+    from offline.budget import TRIALS, more_trials
+    from online.comparison import compare as compare_replays
+    from online.comparison import remarks, tables
+
+    loaded.check()
+    begin_work()
+    rows = compare_replays(loaded)
+    for table in tables(rows, loaded.config.sub_trajectory):
+        console.print(table)
+    for said in remarks(rows):
+        say(said)
+    say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    if rows[0].yardstick == "baseline":
+        known = any(row.rte is not None for row in rows)
+        first = "" if known else "see that the training sequences have a reference; then "
+        say_next_of_study("look for better sets", "offline", study, override, folder, first)
+        return
+    say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
+    n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
+    if n < MIN_RECORDINGS and more is not None:
+        why = f"try {TRIALS} sets; {MIN_RECORDINGS} training recordings tell of other recordings"
+        say_next_of_study(why, "offline", study, more, folder)
+    elif n < MIN_RECORDINGS:
+        first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
+        why = "find out what adapting gains elsewhere"
+        say_next_of_study(why, "offline", study, override, folder, first)
+    else:
+        why = "what it has learned; docs/adapting-live.md brings it to the robot"
+        say_next(why, "model", "show", loaded.model_path)
