@@ -1,0 +1,1 @@
+"""References that are computed from the recording itself, without ground truth."""

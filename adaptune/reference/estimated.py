@@ -1,0 +1,112 @@
+"""An estimated reference: poses, where they can be trusted, and how accurate they are."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses
+from adaptune.metrics import sub_trajectory_rte, travelled
+from adaptune.trajectory import Trajectory
+
+BREAK = 1.0
+"""Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
+HALVES_TO_WHOLE = 0.5
+"""Error of the whole reference, as a share of the difference between its two halves."""
+
+
+class ReferenceError(AdaptuneError):
+    """A recording from which no reference can be estimated."""
+
+
+class Registrations(NamedTuple):
+    """Direct registrations of scans to scans some metres before.
+
+    Attributes
+    ----------
+    start, end : ndarray of shape (m,)
+        Numbers of the scans.
+    accepted : ndarray of shape (m,)
+        Whether the pose graph agrees with it.
+    residual : ndarray of shape (m,)
+        Metres by which it differs from the pose graph; NaN if the registration failed.
+    """
+
+    start: NDArray[np.intp]
+    end: NDArray[np.intp]
+    accepted: NDArray[np.bool_]
+    residual: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedReference:
+    """A reference that was computed from the recording.
+
+    Attributes
+    ----------
+    stamps : ndarray of shape (n,)
+        Of all scans, in nanoseconds.
+    T_world_sensor : ndarray of shape (n, 4, 4)
+        The pose of every scan; the first is the identity.
+    trusted : ndarray of shape (n - 1,)
+        Whether the motion from each scan to the next can be trusted.
+    halves : ndarray of shape (2, n, 4, 4)
+        The poses from either half of the registrations alone.
+    registrations : Registrations
+        All registrations.
+    """
+
+    stamps: NDArray[np.int64]
+    T_world_sensor: Poses
+    trusted: NDArray[np.bool_]
+    halves: Poses
+    registrations: Registrations
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which poses are given, of shape (n,).
+
+        A motion that is not to be trusted leaves a gap of more than `BREAK` seconds, and of one
+        pose at least. No sub-trajectory crosses it then, whoever reads the trajectory.
+        """
+        known = np.ones(len(self.stamps), bool)
+        for i in np.flatnonzero(~self.trusted):
+            end = np.searchsorted(self.stamps, self.stamps[i] + round(BREAK * 1e9), side="right")
+            known[i + 1 : max(int(end), i + 2)] = False
+        return known
+
+    def trajectory(self) -> Trajectory:
+        """The poses that are known."""
+        known = self.known
+        return Trajectory(self.stamps[known], self.T_world_sensor[known], BREAK)
+
+    def path(self) -> float:
+        """Metres travelled."""
+        return float(travelled(self.T_world_sensor)[-1])
+
+    def unknown_share(self) -> float:
+        """Share of the path on which the reference cannot be trusted."""
+        T = np.where(self.known[:, None, None], self.T_world_sensor, np.nan)
+        path = self.path()
+        return 1.0 - float(travelled(T)[-1]) / path if path else 0.0
+
+    def error(self, length: float) -> float:
+        """Estimated mean RTE of the reference itself.
+
+        Parameters
+        ----------
+        length
+            Metres of the sub-trajectories.
+
+        Returns
+        -------
+        float
+            Percent; NaN where no sub-trajectory is as long.
+        """
+        known = self.known[:, None, None]
+        one, other = (np.where(known, half, np.nan) for half in self.halves)
+        errors = sub_trajectory_rte(one, other, length)
+        errors = errors[np.isfinite(errors)]
+        return HALVES_TO_WHOLE * float(errors.mean()) if len(errors) else float("nan")

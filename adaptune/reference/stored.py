@@ -1,0 +1,112 @@
+"""Files of an estimated reference: its poses as TUM, and beside them what is known about them."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adaptune.files import write_text
+from adaptune.reference.estimated import EstimatedReference, ReferenceError
+from adaptune.trajectory import write_tum
+
+LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
+"""Metres over which the error of a reference is noted."""
+
+
+class StoredEstimate(NamedTuple):
+    """What is known about an estimated reference in a file.
+
+    Attributes
+    ----------
+    path : Path
+        Its TUM file.
+    about : dict
+        What it was estimated from, as plain data.
+    scans : int
+        Number of scans.
+    metres : float
+        Length of its path.
+    unknown_share : float
+        Share of the path on which it cannot be trusted.
+    errors : dict
+        Its estimated mean RTE in percent, by the length of sub-trajectories in metres.
+    """
+
+    path: Path
+    about: dict[str, Any]
+    scans: int
+    metres: float
+    unknown_share: float
+    errors: dict[float, float]
+
+    @classmethod
+    def of(cls, path: Path, found: EstimatedReference, about: dict[str, Any]) -> "StoredEstimate":
+        """What is known about an estimate that is to be written to `path`."""
+        by_length = {length: found.error(length) for length in LENGTHS}
+        errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
+        return cls(
+            path,
+            about,
+            len(found.stamps),
+            round(found.path(), 3),
+            round(found.unknown_share(), 4),
+            errors,
+        )
+
+    def error(self, length: float) -> float:
+        """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
+        if not self.errors:
+            return math.nan
+        lengths = sorted(self.errors)
+        values = np.log([max(self.errors[known], 1e-4) for known in lengths])
+        return float(np.exp(np.interp(np.log(length), np.log(lengths), values)))
+
+    @classmethod
+    def read(cls, path: Path) -> "StoredEstimate | None":
+        """What is known about the estimated reference in a TUM file; None if it is not one.
+
+        Raises
+        ------
+        ReferenceError
+            If the file beside it is damaged.
+        """
+        beside = path.with_suffix(".json")
+        try:
+            known = json.loads(beside.read_text(encoding="utf-8"))
+            errors = {float(length): float(e) for length, e in known["error_percent"].items()}
+            numbers = int(known["scans"]), float(known["metres"]), float(known["unknown_share"])
+            return cls(path, dict(known["about"]), *numbers, errors)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ReferenceError(
+                f"{beside}: is damaged ({error}); remove it and {path.name}, and estimate the "
+                f"reference again"
+            ) from error
+
+
+def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any]) -> StoredEstimate:
+    """Write ``.tum``, ``.png`` and, last, ``.json``.
+
+    Parameters
+    ----------
+    path
+        The TUM file.
+    found
+        The reference.
+    about
+        What it was estimated from, as plain data.
+    """
+    stored = StoredEstimate.of(path, found, about)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_tum(path, found.trajectory())
+    # It imports Matplotlib.
+    from adaptune.reference.picture import draw_estimate
+
+    draw_estimate(path.with_suffix(".png"), path.stem, found, stored)
+    known = stored._asdict() | {"error_percent": stored.errors}
+    del known["path"], known["errors"]
+    write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
+    return stored
