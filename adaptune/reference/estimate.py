@@ -26,7 +26,7 @@ def estimate_reference(
 
     Raises
     ------
-    ReferenceError
+    EstimateError
         If the recording does not allow it: the robot hardly moves, or nothing can be registered.
     """
     raise NotImplementedError

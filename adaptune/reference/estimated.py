@@ -17,7 +17,7 @@ HALVES_TO_WHOLE = 0.5
 """Error of the whole reference, as a share of the difference between its two halves."""
 
 
-class ReferenceError(AdaptuneError):
+class EstimateError(AdaptuneError):
     """A recording from which no reference can be estimated."""
 
 

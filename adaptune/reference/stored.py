@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune.files import write_text
-from adaptune.reference.estimated import EstimatedReference, ReferenceError
+from adaptune.reference.estimated import EstimatedReference, EstimateError
 from adaptune.trajectory import write_tum
 
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
@@ -69,7 +69,7 @@ class StoredEstimate(NamedTuple):
 
         Raises
         ------
-        ReferenceError
+        EstimateError
             If the file beside it is damaged.
         """
         beside = path.with_suffix(".json")
@@ -81,7 +81,7 @@ class StoredEstimate(NamedTuple):
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ReferenceError(
+            raise EstimateError(
                 f"{beside}: is damaged ({error}); remove it and {path.name}, and estimate the "
                 f"reference again"
             ) from error
