@@ -135,21 +135,24 @@ class _Registering:
         self._T_last, self._seconds = T, (scan.stamp - before.stamp) * 1e-9
 
     def end(self) -> None:
-        """Register the last scan."""
+        """Register the last scan, however near it is to the last one that was registered."""
         if self._newest is not None and self._newest[0]:
-            self._register(*self._newest, self._T_last, self._seconds)
+            self._register(*self._newest, self._T_last, self._seconds, last=True)
 
-    def _register(self, number: int, scan: Scan, T_current_next: Poses, seconds: float) -> None:
-        """Register a scan if it is far enough from the last one that was."""
+    def _register(
+        self, number: int, scan: Scan, T_current_next: Poses, seconds: float, last: bool = False
+    ) -> None:
+        """Register a scan if it is far enough from the one that was registered before, or last."""
         metres = 0.0
         if self._anchors:
-            last = self._anchors[-1]
+            before = self._anchors[-1]
             # The straight way: a robot that stands does not drive by jitter.
-            way = float(np.linalg.norm((invert(last.T_odom_sensor[0]) @ self._tracks[0])[:3, 3]))
+            way = float(np.linalg.norm((invert(before.T_odom_sensor[0]) @ self._tracks[0])[:3, 3]))
             least, most = SPACING
-            if way < least or (number - last.number < EVERY and way < most):
+            soon = way < least or (number - before.number < EVERY and way < most)
+            if soon and not last:
                 return
-            metres = last.metres + way
+            metres = before.metres + way
         end = _Anchor(number, metres, HopCloud(scan, T_current_next, seconds), self._tracks.copy())
         for start in self._starts(metres):
             self.guesses += self._tries(start, end)
