@@ -15,7 +15,7 @@ from adaptune.metrics import travelled
 from adaptune.reference.consensus import HALVES
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.reference.graph import Edge, optimised, positions
-from adaptune.reference.registering import Guess, Pass, pass_over
+from adaptune.reference.registering import LENGTHS, Guess, Pass, pass_over
 from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.trajectory import Trajectory
 
@@ -29,6 +29,8 @@ MOST_UNKNOWN = 0.5
 """Share of the path on which a reference may be unknown."""
 _AGREES = (0.1, 0.02)
 """A registration agrees with the graph within so many metres and this share of its length."""
+_LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]
+"""Metres from which on scans may have too little in common."""
 _NEAR = 0.1
 """Metres within which a member's motion from scan to scan counts for a half of the reference."""
 
@@ -89,7 +91,7 @@ def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> Estim
         T = optimised(T, revised.edges, positions(priors, found.stamps, T))
     registrations = _judged(found.guesses, revised.edges, T)
     reference = EstimatedReference(
-        found.stamps, T, _trusted(len(T), registrations), _halves(found, revised), registrations
+        found.stamps, T, _trusted(T, registrations), _halves(found, revised), registrations
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
         raise EstimateError(
@@ -142,11 +144,17 @@ def _edges(guesses: Iterable[Guess], member: int) -> list[Edge]:
     ]
 
 
-def _support(n: int, spans: Sequence[Edge]) -> NDArray[np.intp]:
-    """How many spans hold the motion from each of n scans to the next, of shape (n - 1,)."""
+def _support(n: int, edges: Sequence[Edge]) -> NDArray[np.intp]:
+    """How many registrations span the motion from each of n scans to the next."""
+    start, end = (np.array([edge[i] for edge in edges], np.intp) for i in (0, 1))
+    return _spanning(n, start, end)
+
+
+def _spanning(n: int, start: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.intp]:
+    """How many of the spans from `start` to `end` hold each of n - 1 motions."""
     changes = np.zeros(n, np.intp)
-    np.add.at(changes, [span.start for span in spans], 1)
-    np.add.at(changes, [span.end for span in spans], -1)
+    np.add.at(changes, start, 1)
+    np.add.at(changes, end, -1)
     return np.asarray(np.cumsum(changes)[:-1])
 
 
@@ -181,14 +189,20 @@ def _judged(guesses: Sequence[Guess], edges: Sequence[Edge], T: Poses) -> Regist
     return Registrations(starts, ends, accepted, residual)
 
 
-def _trusted(n: int, found: Registrations) -> NDArray[np.bool_]:
-    """Which motions from scan to scan can be trusted, of shape (n - 1,)."""
-    changes = np.zeros((2, n), np.intp)
-    for row, which in zip(changes, (found.accepted, ~found.accepted), strict=True):
-        np.add.at(row, found.start[which], 1)
-        np.add.at(row, found.end[which], -1)
-    accepted, rejected = np.cumsum(changes, axis=1)[:, :-1]
-    return np.asarray((accepted >= FEWEST) & ((rejected < FEWEST) | (accepted >= rejected)))
+def _trusted(T_world_sensor: Poses, found: Registrations) -> NDArray[np.bool_]:
+    """Which motions from scan to scan can be trusted, of shape (n - 1,).
+
+    Enough registrations must confirm a motion, and no more speak against it: those that differ, and
+    those over short ways that fail. Over the longest way, scans may have too little in common.
+    """
+    n = len(T_world_sensor)
+    way = (invert(T_world_sensor[found.start]) @ T_world_sensor[found.end])[:, :3, 3]
+    short = np.linalg.norm(way, axis=1) < _LITTLE_IN_COMMON
+    against = ~found.accepted & (short | np.isfinite(found.residual))
+    confirmed, doubted = (
+        _spanning(n, found.start[which], found.end[which]) for which in (found.accepted, against)
+    )
+    return (confirmed >= FEWEST) & ((doubted < FEWEST) | (confirmed >= doubted))
 
 
 def _halves(found: Pass, revised: _Revised) -> Poses:

@@ -22,6 +22,9 @@ SPACING = (0.2, 2.0)
 DEPARTURE = (0.2, 0.08)
 """A registration is rejected if it departs from the guess by more than so many metres, and by more
 than this share of the way."""
+MIN_INLIERS_OFFLINE = 0.3
+"""Least share of points near a point of the other scan. Many registrations check each other, so it
+may be lower than while driving."""
 _APART = 0.3
 """Metres between guesses that are worth a registration each."""
 
@@ -183,7 +186,7 @@ class _Registering:
 
 def _registered(start: _Anchor, end: _Anchor, T_start_end: Poses) -> Hop | None:
     """A registration that stays near its guess."""
-    hop = register(start.cloud, end.cloud, [T_start_end])
+    hop = register(start.cloud, end.cloud, [T_start_end], MIN_INLIERS_OFFLINE)
     if hop is None:
         return None
     metres, share = DEPARTURE
