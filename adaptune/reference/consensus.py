@@ -20,8 +20,8 @@ POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
     ("gicp", {"max_correspondence_distance": 2.2, "keyframe_interval": 1.3}),
     ("gicp", {"max_correspondence_distance": 1.3, "keyframe_interval": 3.1}),
     ("gicp", {"max_correspondence_distance": 4.5, "keyframe_interval": 5.3}),
-    ("ndt", {"resolution": 1.7, "keyframe_interval": 1.6}),
-    ("ndt", {"resolution": 3.1, "keyframe_interval": 3.3}),
+    ("vgicp", {"resolution": 0.9, "keyframe_interval": 1.7}),
+    ("vgicp", {"resolution": 1.8, "keyframe_interval": 3.7}),
 )
 """Odometries and their parameters. No study's trials are among them: the reference that judges an
 odometry is not made with it."""
@@ -29,7 +29,7 @@ HALVES = ((0, 1, 2), (3, 4))
 """Members of either half, which have no algorithm in common."""
 _SETTINGS: Mapping[str, Mapping[str, float]] = {
     "gicp": {"downsampling": 0.45},
-    "ndt": {"downsampling": 0.45},
+    "vgicp": {"downsampling": 0.45},
 }
 
 

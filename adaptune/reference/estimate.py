@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert, mean_motion, rectify, steps
+from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.metrics import travelled
+from adaptune.odometry.agreement import LEVER
 from adaptune.reference.consensus import HALVES
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.reference.graph import Edge, optimised, positions
@@ -88,10 +89,11 @@ def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> Estim
     revised = _revised(found)
     T = optimised(revised.T_odom_sensor, revised.edges)
     if priors is not None:
-        T = optimised(T, revised.edges, positions(priors, found.stamps, T))
+        places = positions(priors, found.stamps, T)
+        T = optimised(revised.T_odom_sensor, revised.edges, places, T)
     registrations = _judged(found.guesses, revised.edges, T)
     reference = EstimatedReference(
-        found.stamps, T, _trusted(T, registrations), _halves(found, revised), registrations
+        found.stamps, T, _trusted(T, registrations), _halves(found, revised, T), registrations
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
         raise EstimateError(
@@ -205,22 +207,24 @@ def _trusted(T_world_sensor: Poses, found: Registrations) -> NDArray[np.bool_]:
     return (confirmed >= FEWEST) & ((doubted < FEWEST) | (confirmed >= doubted))
 
 
-def _halves(found: Pass, revised: _Revised) -> Poses:
+def _halves(found: Pass, revised: _Revised, T_world_sensor: Poses) -> Poses:
     """The reference twice, each from half of the pool and half of the scans: (2, n, 4, 4)."""
     ends = {end: i % 2 for i, end in enumerate(sorted({edge.end for edge in revised.edges}))}
     halves = []
     for half, members in enumerate(HALVES):
-        T = _chained(revised.T_odom_sensor[0], _steps_of(found, revised, members))
-        halves.append(optimised(T, [edge for edge in revised.edges if ends[edge.end] == half]))
+        T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
+        edges = [edge for edge in revised.edges if ends[edge.end] == half]
+        halves.append(optimised(T, edges, T_first_guess=T_world_sensor))
     return np.array(halves)
 
 
-def _steps_of(found: Pass, revised: _Revised, members: Sequence[int]) -> Poses:
-    """Mean motions of some members, those left out that are far from the whole's."""
-    whole = steps(revised.T_odom_sensor)[:, None]
+def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Poses:
+    """Mean motions of some members; those far from the reference are left out."""
+    whole = steps(T_world_sensor)[:, None]
     theirs = found.T_previous_current[1:, list(members)]
     apart = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)
-    near = apart <= _NEAR + 0.05 * np.linalg.norm(whole[..., :3, 3], axis=-1)
+    apart += LEVER * rotation_angle(invert(whole) @ theirs)
+    near = apart <= _NEAR
     near |= ~near.any(axis=1, keepdims=True)
     theirs = np.where((near & np.isfinite(apart))[..., None, None], theirs, whole)
     return mean_motion(theirs, near.astype(np.float64))

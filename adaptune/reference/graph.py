@@ -9,12 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hop import Hop
 from adaptune.trajectory import Trajectory
 
-_OF_A_STEP = (0.01, 0.002)
-"""Metres and radians by which the motion from scan to scan is wrong, about."""
+_OF_A_STEP = (0.005, 0.002)
+"""Metres and radians by which the motion from scan to scan is wrong, about, if it is small."""
+_SHARE = (0.05, 0.02)
+"""What each metre adds to the metres, and each radian to the radians."""
 _OF_A_HOP = (0.02, 0.003)
 """Metres and radians by which a registration is wrong, about."""
 _UNKNOWN = 10.0
@@ -36,11 +38,14 @@ class Edge(NamedTuple):
 
 
 def optimised(
-    T_odom_sensor: Poses, edges: Sequence[Edge], places: "Positions | None" = None
+    T_odom_sensor: Poses,
+    edges: Sequence[Edge],
+    places: "Positions | None" = None,
+    T_first_guess: Poses | None = None,
 ) -> Poses:
     """The poses on which motions and registrations agree best.
 
-    Registrations have robust weights (Cauchy's): a wrong one hardly counts.
+    All have robust weights (Cauchy's): a wrong one hardly counts.
 
     Parameters
     ----------
@@ -50,6 +55,8 @@ def optimised(
         The registrations.
     places
         Where scans are by other means, in about the same frame.
+    T_first_guess
+        Where the search begins, of shape (n, 4, 4); `T_odom_sensor` when left out.
 
     Returns
     -------
@@ -59,18 +66,21 @@ def optimised(
     import gtsam
 
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    poses = [gtsam.Pose3(T) for T in T_odom_sensor]
-    step = _sigmas(*_OF_A_STEP)
-    for i, pose in enumerate(poses):
-        values.insert(i, pose)
-    for i in range(len(poses) - 1):
-        graph.add(gtsam.BetweenFactorPose3(i, i + 1, poses[i].between(poses[i + 1]), step))
+    for i, T in enumerate(T_odom_sensor if T_first_guess is None else T_first_guess):
+        values.insert(i, gtsam.Pose3(T))
+    motions = steps(T_odom_sensor)
+    metres, radians = np.linalg.norm(motions[:, :3, 3], axis=1), rotation_angle(motions)
+    for i, T in enumerate(motions):
+        noise = _sigmas(
+            _OF_A_STEP[0] + _SHARE[0] * metres[i], _OF_A_STEP[1] + _SHARE[1] * radians[i]
+        )
+        graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(T), _robust(noise)))
     for start, end, hop in edges:
         motion = gtsam.Pose3(hop.T_start_end)
         graph.add(gtsam.BetweenFactorPose3(start, end, motion, _robust(_noise(hop))))
     # Positions say themselves where the first pose is.
     first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6 if places is None else _UNKNOWN)
-    graph.add(gtsam.PriorFactorPose3(0, poses[0], first))
+    graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
     if places is not None:
         noise = _robust(gtsam.noiseModel.Isotropic.Sigma(3, _OF_A_PRIOR))
         for number, metres in zip(places.numbers.tolist(), places.metres, strict=True):
@@ -78,7 +88,7 @@ def optimised(
     options = gtsam.LevenbergMarquardtParams()
     options.setMaxIterations(_ITERATIONS)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
-    T = np.array([found.atPose3(i).matrix() for i in range(len(poses))])
+    T = np.array([found.atPose3(i).matrix() for i in range(len(T_odom_sensor))])
     return np.asarray(rectify(invert(T[0]) @ T))
 
 

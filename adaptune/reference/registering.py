@@ -15,10 +15,11 @@ from adaptune.sequence.scan import Scan
 
 LENGTHS = (2.0, 5.0, 10.0)
 """Metres over which scans are registered directly. Over 25 m, too little overlaps in caves."""
-EVERY = 3
-"""Scans from one that is registered to the next."""
+INTERVAL = 0.25
+"""Seconds from one scan that is registered to the next: three scans of a usual LiDAR."""
 SPACING = (0.2, 2.0)
-"""Metres from one to the next: at least, so that a robot that stands costs nothing, and at most."""
+"""Metres from one to the next: at least, so that a robot that stands costs nothing; and the way
+after which it comes sooner."""
 DEPARTURE = (0.2, 0.08)
 """A registration is rejected if it departs from the guess by more than so many metres, and by more
 than this share of the way."""
@@ -74,6 +75,7 @@ class _Anchor(NamedTuple):
     """A scan that is registered."""
 
     number: int
+    stamp: int
     metres: float  # driven until there
     cloud: HopCloud
     T_odom_sensor: Poses  # (1 + n_members, 4, 4): of the consensus, then of its members
@@ -119,6 +121,7 @@ class _Registering:
         self._anchors: deque[_Anchor] = deque()
         self._tracks = np.tile(np.eye(4), (1 + n_members, 1, 1))
         self._newest: tuple[int, Scan] | None = None
+        self._of_first = 0  # registrations to the first scan
 
     def add(self, scan: Scan, T_odom_sensor: Poses, T_previous_current: Poses) -> None:
         """Take the next scan, with the pose of the consensus and the motions of its members."""
@@ -152,11 +155,13 @@ class _Registering:
             # The straight way: a robot that stands does not drive by jitter.
             way = float(np.linalg.norm((invert(before.T_odom_sensor[0]) @ self._tracks[0])[:3, 3]))
             least, most = SPACING
-            soon = way < least or (number - before.number < EVERY and way < most)
+            elapsed = (scan.stamp - before.stamp) * 1e-9
+            soon = way < least or (elapsed < INTERVAL and way < most)
             if soon and not last:
                 return
             metres = before.metres + way
-        end = _Anchor(number, metres, HopCloud(scan, T_current_next, seconds), self._tracks.copy())
+        cloud = HopCloud(scan, T_current_next, seconds)
+        end = _Anchor(number, scan.stamp, metres, cloud, self._tracks.copy())
         for start in self._starts(metres):
             self.guesses += self._tries(start, end)
         self._anchors.append(end)
@@ -165,12 +170,14 @@ class _Registering:
 
     def _starts(self, metres: float) -> Iterator[_Anchor]:
         """The scans to which one is registered, each once."""
-        last = None
+        starts = []
         for length in LENGTHS:
-            found = (a for a in reversed(self._anchors) if metres - a.metres >= length)
-            if (start := next(found, None)) is not None and start is not last:
-                yield start
-            last = start
+            starts += [a for a in self._anchors if metres - a.metres >= length][-1:]
+            # The robot may stand at first: without these, nothing spans its first motions.
+            if self._of_first < len(LENGTHS) and metres >= LENGTHS[self._of_first]:
+                starts.append(self._anchors[0])
+                self._of_first += 1
+        yield from {start.number: start for start in starts}.values()
 
     def _tries(self, start: _Anchor, end: _Anchor) -> Iterator[Guess]:
         """Register two scans; where the consensus does not lead there, as its members moved."""
