@@ -60,6 +60,8 @@ def offline(
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
+    Training sequences without a reference get one that is estimated from their scans, before.
+
     The table shows the *baseline* (the odometry's own parameters), the *fixed* set (the best over
     all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
     """
