@@ -96,9 +96,7 @@ def train(
     cluster: str | None = None,
     again: bool = False,
 ) -> Training:
-    """Run all trials that are not in the archive yet, and fit the model.
-
-    Training sequences without a reference get an estimated one before.
+    """Estimate the references that are lacking, run the trials that are, and fit the model.
 
     Parameters
     ----------
@@ -138,10 +136,7 @@ def train(
         whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, verdicts, fixed)
-    finished = {
-        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
-        for name in study.training
-    }
+    finished = _finished(study, archive, verdicts)
     means = {
         name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
         for name, trials in finished.items()
@@ -155,6 +150,14 @@ def train(
     report.write_rows(study.folder, "training", rows)
     judged = estimates_in_words(study, study.training)
     return Training(model, means, fixed, rows, remark, judged)
+
+
+def _finished(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]) -> Finished:
+    """The judged trials by training sequence and number."""
+    return {
+        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
+        for name in study.training
+    }
 
 
 def _fixed(
@@ -305,7 +308,7 @@ def _training_rows(
                 "fixed, whole run": whole[name][fixed].mean_error,
                 "_own best trial": best,
                 "_reference": "given" if stored is None else "estimated",
-                "_reference error": stored and stored.error(study.config.sub_trajectory),
+                "_reference_error": stored and stored.error(study.config.sub_trajectory),
             }
             | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
         )

@@ -104,8 +104,7 @@ def measure_switching(
     study.open()
     warm_up, catch_up_scans = study.warm_up, study.config.online.switching.catch_up_scans
     mechanisms = _mechanisms(study.odometry, warm_up, catch_up_scans)
-    ratios: dict[str, list[float]] = {what: [] for what in mechanisms}
-    times: dict[str, list[float]] = {what: [] for what in mechanisms}
+    ratios, times = ({what: list[float]() for what in mechanisms} for _ in range(2))
     metres = 0.0
     for name in study.config.training:
         recording = _read(study, name, seconds)
