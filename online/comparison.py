@@ -131,10 +131,11 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
         unknown.add(LOST)
     if all(row.reference == "given" for row in rows):
         unknown.add(REFERENCE)
-    if any(row.reference == "estimated" for row in rows):
+    judged = any(row.reference == "estimated" for row in rows)
+    if judged:
         caption += (
-            f" An estimated reference errs, too, which pulls ratios towards 1; intervals reach as "
-            f"far as without up to {ERROR_FACTOR:g} times its estimated error."
+            f" The error of an estimated reference pulls ratios towards 1; intervals allow for up "
+            f"to {ERROR_FACTOR:g} times what it is estimated at."
         )
     columns = [{k: v for k, v in row.columns().items() if k not in unknown} for row in rows]
     where = " on test sequences" if rows[0].yardstick == "fixed" else ""
@@ -147,6 +148,8 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
         "Errors as evo and KITTI's benchmark define them" if kitti else "Errors as evo defines them"
     )
     caption = "APE after alignment, RPE from scan to scan: root mean squares."
+    if judged:
+        caption += " An estimated reference counts as if it were true."
     if kitti:
         caption += " KITTI: mean over the lengths in the last column; needs 100 m."
     if several:

@@ -77,6 +77,7 @@ def switching(
     """
     loaded = load(study, override, folder)
     from adaptune import report
+    from adaptune.study.references import estimates_in_words
     from online.switch_cost import measure_switching, switch_cost_in_words
 
     with progress() as show:
@@ -88,6 +89,8 @@ def switching(
             caption,
         )
     )
+    for sentence in estimates_in_words(loaded, loaded.config.training):
+        say(sentence)
     say(switch_cost_in_words(loaded))
     say(f"Kept in {loaded.folder / 'switching.json'}.")
     say_next_online(loaded.config.test, study, override, folder)

@@ -123,6 +123,7 @@ def trials(
     from adaptune import trials as table
     from adaptune.archive import Archive
     from adaptune.study.inputs import warn_of_stale
+    from adaptune.study.references import estimates_in_words
     from offline.budget import all_done
 
     warn_of_stale(loaded)
@@ -140,6 +141,8 @@ def trials(
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
+        for sentence in estimates_in_words(loaded, names):
+            say(sentence)
         if all_done(loaded.config.offline, loaded.folder, (row["trial"] for row in finished)):
             several = len(loaded.training) > 1
             say_next_of_trained(several, loaded.config.test, study, override, folder)

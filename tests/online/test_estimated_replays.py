@@ -39,6 +39,14 @@ def test_it_is_estimated_and_said_to_judge(load, monkeypatch):
     assert "estimated reference" in drawn
     assert "reference" not in drawn
     assert run_untrained(study) == 0
+    # As if it were long enough for intervals.
+    interval = (0.4, 0.6), (0.9, 1.1)
+    monkeypatch.setattr("online.statistics.bootstrap", lambda *_: interval)
+    rows = compare(study)
+    found = rows[1].rte_interval, rows[1].ratio_interval
+    assert found == without_error(*interval, rows[0].rte, 1.5 * rows[0].reference_error)
+    assert found[0][0] < 0.4
+    assert any(said.endswith("about 0.21 %, is in the intervals.") for said in remarks(rows))
 
 
 def test_another_estimate_replays_nothing(load, monkeypatch):
