@@ -155,7 +155,7 @@ def _inspect_bag(path: Path, found: Survey) -> Inspection:
         scan=summary,
         reference=reference,
         faults=tuple(problems),
-        missing=_missing(summary, reference, problems),
+        missing=_missing(summary, problems),
         entry=_entry(path, given, found),
     )
 
@@ -200,7 +200,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Show) -> Inspection:
         scan=summary,
         reference=reference,
         faults=tuple(problems),
-        missing=_missing(summary, reference, problems),
+        missing=_missing(summary, problems),
         entry=_entry(path, given),
     )
 
@@ -313,10 +313,8 @@ def _summary(scan: Scan, recorded: int) -> ScanSummary:
     return ScanSummary(scan, max(recorded, len(scan)), ranges, span, rings)
 
 
-def _missing(
-    scan: ScanSummary | None, reference: Trajectory | None, problems: Items[Fault]
-) -> dict[str, tuple[str, ...]]:
-    """What each stage needs and does not find."""
+def _missing(scan: ScanSummary | None, problems: Items[Fault]) -> dict[str, tuple[str, ...]]:
+    """What each stage needs and does not find; where there is no reference, one is estimated."""
     lacks = {
         of: tuple({f.lacks: None for f in problems if f.of == of and f.lacks})
         for of in ("points", "reference")
@@ -324,8 +322,6 @@ def _missing(
     clouds, truth = lacks["points"], lacks["reference"]
     if scan is None and not any(f.of == "points" for f in problems):
         clouds = ("point clouds that can be read",)
-    if reference is None and not any(f.of == "reference" for f in problems):
-        truth = ("a reference trajectory",)
     timeless = scan is not None and scan.scan.times is None
     times = ("a time for each point",) if timeless else ()
     return {
@@ -342,7 +338,7 @@ def _entry(path: Path, given: dict[str, Any], found: Survey | None = None) -> st
     if found is None:
         return text
     if found.reference is None:
-        text += "    # reference: its poses - a topic, or a TUM, KITTI or EuRoC file\n"
+        text += "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
     if found.first is not None and found.first[0].times is not None:
         text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
     return text

@@ -29,6 +29,8 @@ def render_inspection(inspection: Inspection) -> RenderableType:
     if inspection.reference is not None:
         text = _reference_text(inspection.reference, inspection.complete)
         parts.append(Text(f"reference: {text}"))
+    elif inspection.scan is not None and not any(f.of == "reference" for f in inspection.faults):
+        parts.append(Text("reference: none; adaptune estimates one from the scans"))
     parts.append(Text(_read_text(inspection)))
     parts += [Text(f"! {f.text}", "red" if f.lacks else "yellow") for f in inspection.faults]
     parts += [_stage_text(inspection, stage) for stage in inspection.missing]

@@ -49,6 +49,8 @@ def inspect(
 LENGTHS = {25.0: 8, 10.0: 8, 5.0: 1.4, 2.0: 2}
 """Metres of a sub-trajectory, and how many of them the path of the test must hold: over short ones,
 the noise of the reference counts too much."""
+UNKNOWN = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
+"""What is proposed where the path is not known, by the same rule."""
 TRAINING = 0.6
 """Share of a recording's duration that is proposed for training, before the test."""
 
@@ -60,20 +62,25 @@ def _begin_study(found: "Inspection") -> None:
     named = (yaml.Document(found.entry).data or {}).get("sequences")
     if not named:
         return
-    if found.reference is None or found.missing.get("offline"):
+    if found.missing.get("offline"):
         say(
-            "Next: mend what is lacking, see docs/your-bag.md; a recording without a reference can "
-            "only be a `test` sequence, or be replayed with `adaptune online --untrained`"
+            "Next: mend what is lacking, see docs/your-bag.md; where only the reference does not "
+            "serve, write `reference: estimated`"
         )
         return
     (name,), share = named, f"{100 * TRAINING:.0f}"
     say(
         f"training: [{name}: 0-{share}%]\ntest: [{name}: {share}-100%]\n"
-        f"sub_trajectory: {proposed_sub_trajectory(found.reference)}\n"
+        f"sub_trajectory: {_of_path(found)}\n"
         "odometry: {name: gicp}    # or another one, see docs/your-odometry.md\n"
     )
     first = f"put the lines from `sequences:` on in {name}.yaml; then "
     say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
+
+
+def _of_path(found: "Inspection") -> str:
+    """The length of sub-trajectories to propose, with a remark where the path is not known."""
+    return UNKNOWN if found.reference is None else str(proposed_sub_trajectory(found.reference))
 
 
 def proposed_sub_trajectory(reference: "Trajectory") -> float:

@@ -16,7 +16,14 @@ from adaptune.cores import available
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
 from adaptune.parameter_sets import ParameterSets
+from adaptune.sequence.names import origin
 from adaptune.study.inputs import InputNotes, digest, resume
+from adaptune.study.references import (
+    ensure_references,
+    estimates_as_data,
+    estimates_in_words,
+    estimates_of,
+)
 from offline.baseline import run_baseline
 from offline.budget import BUDGETS
 from offline.campaign import Progress, run_batches
@@ -52,6 +59,7 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     remark: str | None  # see `rivalry`
+    references: Sequence[str] = ()  # see `estimates_in_words`
 
     @property
     def words(self) -> list[str]:
@@ -65,8 +73,9 @@ class Training(NamedTuple):
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
         if self.fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [f"{beaten}; the fixed set is the baseline.", baseline]
+            return [*self.references, f"{beaten}; the fixed set is the baseline.", baseline]
         return [
+            *self.references,
             f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {_short(sets[self.fixed])}",
             baseline,
@@ -87,7 +96,7 @@ def train(
     cluster: str | None = None,
     again: bool = False,
 ) -> Training:
-    """Run all trials that are not in the archive yet, and fit the model.
+    """Estimate the references that are lacking, run the trials that are, and fit the model.
 
     Parameters
     ----------
@@ -105,9 +114,11 @@ def train(
     Raises
     ------
     AdaptuneError
-        If a sequence cannot be used, the odometry fails with its own parameters, no set keeps the
-        limits, or stored trials depend on something that has changed.
+        If a sequence cannot be used, its reference cannot be estimated, the odometry fails with its
+        own parameters, no set keeps the limits, or stored trials depend on something that has
+        changed.
     """
+    ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
     resume(study, again)
     config = study.config.offline
     if timed := sorted(config.metrics & set(TIMED)):
@@ -125,10 +136,7 @@ def train(
         whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, verdicts, fixed)
-    finished = {
-        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
-        for name in study.training
-    }
+    finished = _finished(study, archive, verdicts)
     means = {
         name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
         for name, trials in finished.items()
@@ -138,9 +146,18 @@ def train(
     report.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
-    rows = _training_rows(config, verdicts, finished, fixed, whole)
+    rows = _training_rows(study, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
-    return Training(model, means, fixed, rows, remark)
+    judged = estimates_in_words(study, study.training)
+    return Training(model, means, fixed, rows, remark, judged)
+
+
+def _finished(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]) -> Finished:
+    """The judged trials by training sequence and number."""
+    return {
+        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
+        for name in study.training
+    }
 
 
 def _fixed(
@@ -174,6 +191,8 @@ def _fitted(
     )
     provenance = {"versions": study.odometry.versions} | settings
     provenance |= {"inputs": digest(study)}
+    if judged := estimates_as_data(study, study.training):
+        provenance |= {"estimated_references": judged}
     provenance |= {"evidence": _evidence(study, archive, verdicts, fixed, provenance)}
     try:
         before = ErrorModel.load(study.model_path)
@@ -265,15 +284,17 @@ def _trial_rows(
 
 
 def _training_rows(
-    config: OfflineConfig,
+    study: OfflineStudy,
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
     whole: WholeRuns,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
-    rows = []
+    rows, config = [], study.config.offline
+    judged = estimates_of(study, finished)
     for name, runs in finished.items():
+        stored = judged.get(origin(name))
         best = best_by_trials(config, {n: judge(config, [run]) for n, run in runs.items()})
         rows.append(
             {
@@ -286,6 +307,8 @@ def _training_rows(
                 "baseline, whole run": whole[name][0].mean_error,
                 "fixed, whole run": whole[name][fixed].mean_error,
                 "_own best trial": best,
+                "_reference": "given" if stored is None else "estimated",
+                "_reference_error": stored and stored.error(study.config.sub_trajectory),
             }
             | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
         )

@@ -178,7 +178,8 @@ def _reference(key: str, scans: sequence.Sequence, settings: TrialSettings) -> T
     reference = scans.reference()
     if reference is None:
         raise AdaptuneError(
-            f"{key}: training needs a reference trajectory; name its topic or file (reference: ...)"
+            f"{key}: training needs a reference trajectory; name its topic or file (reference: "
+            f"...), or let adaptune estimate one (reference: estimated)"
         )
     T = reference.T_world_sensor[_during(scans, reference)]
     if len(T) and travelled(T)[-1] < settings.sub_trajectory:

@@ -14,6 +14,7 @@ from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.study.driven import Driven, driven
 from adaptune.study.inputs import check_model
+from adaptune.study.references import estimates_in_words
 from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, labelled_data
 from offline.leave_one_out import (
@@ -38,7 +39,8 @@ class Validated(NamedTuple):
     rows: list[dict[str, Any]]
     learning: list[dict[str, Any]]  # see `learning_curve`; empty if not asked for
     banks: list[dict[str, Any]]  # see `bank_curve`; empty if not asked for
-    verdicts: list[str]  # sentences: what `adaptune online` will drive, and its estimate
+    # Sentences: what `adaptune online` will drive, its estimate, and what reference judged it.
+    verdicts: list[str]
 
 
 def validate(
@@ -91,6 +93,7 @@ def validate(
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
     said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
+    said += estimates_in_words(study, study.training)
     return Validated(validation, rows, learning, banks, said)
 
 

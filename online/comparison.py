@@ -20,8 +20,10 @@ from online.replay_picture import Track, draw_replays
 from online.run_replays import shared_identity
 from online.statistics import (
     ALL,
+    ERROR_FACTOR,
     ESTIMATED,
     LOST,
+    REFERENCE,
     ComparisonRow,
     Reference,
     compare_modes,
@@ -68,7 +70,7 @@ def compare(study: Study) -> list[ComparisonRow]:
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
-        reference = Reference.read(folder, study.config.sub_trajectory)
+        reference = _reference(study, name)
         rows += compare_modes(name, replays, reference)
         draw_replays(
             study.folder / "comparison" / f"{name}.png",
@@ -77,11 +79,21 @@ def compare(study: Study) -> list[ComparisonRow]:
             {mode: _track(replay, reference) for mode, replay in replays.items()},
             None if reference.trajectory is None else _seen_from(reference.trajectory),
             logarithmic,
+            reference.estimated,
         )
     if len({row.sequence for row in rows if row.rte is not None}) > 1:
         rows += pooled(rows)
     report.write_rows(study.folder / "comparison", "comparison", [row.columns() for row in rows])
     return rows
+
+
+def _reference(study: Study, name: str) -> Reference:
+    """What judges the replays of a sequence.
+
+    An estimated one is computed with odometries of its own, never with the members of a bank.
+    """
+    folder, stored = study.folder / "replays" / name, study.sequences.estimate(name)
+    return Reference.read(folder, study.config.sub_trajectory, stored)
 
 
 def _replayed(study: Study, setup: ReplaySetup) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -117,6 +129,14 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
         caption += " Estimated: by the odometry itself while driving, without the reference."
     if not any(row.lost_seconds for row in rows):
         unknown.add(LOST)
+    if all(row.reference == "given" for row in rows):
+        unknown.add(REFERENCE)
+    judged = any(row.reference == "estimated" for row in rows)
+    if judged:
+        caption += (
+            f" The error of an estimated reference pulls ratios towards 1; intervals allow for up "
+            f"to {ERROR_FACTOR:g} times what it is estimated at."
+        )
     columns = [{k: v for k, v in row.columns().items() if k not in unknown} for row in rows]
     where = " on test sequences" if rows[0].yardstick == "fixed" else ""
     made = [report.table(f"RTE over {length:g} m{where}", columns, caption)]
@@ -128,6 +148,8 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
         "Errors as evo and KITTI's benchmark define them" if kitti else "Errors as evo defines them"
     )
     caption = "APE after alignment, RPE from scan to scan: root mean squares."
+    if judged:
+        caption += " An estimated reference counts as if it were true."
     if kitti:
         caption += " KITTI: mean over the lengths in the last column; needs 100 m."
     if several:
@@ -161,11 +183,28 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
             f"{rows[-1].sequence} is too short for intervals: whether {' or '.join(unknown)} "
             f"differs from the {_YARDSTICKS[rows[-1].yardstick]} is not known."
         )
-    return said + _estimates(rows) + _losses(rows) + _restarts(rows)
+    return said + _judges(rows) + _estimates(rows) + _losses(rows) + _restarts(rows)
 
 
 _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 """What a mode that others are compared with is called in a sentence."""
+
+
+def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence about every sequence that an estimated reference judges."""
+    judged = {row.sequence: row for row in rows if row.sequence != ALL}
+    said = []
+    for name, row in judged.items():
+        if row.reference != "estimated":
+            continue
+        if row.reference_error is None:
+            own = "its own error is not known, and not in the intervals"
+        elif row.rte_interval is None:
+            own = f"its own error is about {row.reference_error:.2g} %"
+        else:
+            own = f"its own error, about {row.reference_error:.2g} %, is in the intervals"
+        said.append(f"On {name} an estimated reference judged: {own}.")
+    return said
 
 
 def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -184,10 +223,15 @@ def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
         elif ends is not None and not ends[0] <= row.rte <= ends[1]:
             said.append(
                 f"On {row.sequence} `{row.mode}` estimates its own mean RTE at "
-                f"{row.estimated:.3f} %{interval}; by the reference it is {row.rte:.3f} %. One of "
-                f"the two is wrong over this length."
+                f"{row.estimated:.3f} %{interval}; by the {_called(row)} it is {row.rte:.3f} %. "
+                f"One of the two is wrong over this length."
             )
     return said
+
+
+def _called(row: ComparisonRow) -> str:
+    """What the reference of a row is called in a sentence."""
+    return "estimated reference" if row.reference == "estimated" else "reference"
 
 
 def _losses(rows: Sequence[ComparisonRow]) -> list[str]:

@@ -67,6 +67,7 @@ def draw_replays(
     tracks: Mapping[str, Track],
     reference: NDArray[np.float64] | None,
     logarithmic: Collection[str] = (),
+    estimated: bool = False,
 ) -> None:
     """Draw the trajectories of all modes from above, and errors and selections over time.
 
@@ -84,7 +85,11 @@ def draw_replays(
         Its positions like those of a track; None if there is none.
     logarithmic
         The parameters in log scale.
+    estimated
+        Whether the reference was computed from the recording.
     """
+    judge = "estimated reference" if estimated else "reference"
+    true = f"by the {judge}" if estimated else "true"
     panels: list[tuple[float, Callable[[Any], None]]] = []
     if any(np.isfinite(track.errors).any() for track in tracks.values()):
         panels.append((2.4, partial(_draw_errors, tracks=tracks, length=length)))
@@ -93,7 +98,8 @@ def draw_replays(
         panels.append((1.0, partial(_draw_parameter, tracks=tracks, name=name, log=log)))
     for mode, track in tracks.items():
         if np.isfinite(track.estimated[:, 0]).any() or track.lost.any():
-            panels.append((1.6, partial(_draw_estimated, mode=mode, track=track, length=length)))
+            known = partial(_draw_estimated, mode=mode, track=track, length=length, true=true)
+            panels.append((1.6, known))
         if track.weights:
             panels.append((1.2, partial(_draw_weights, mode=mode, track=track)))
     heights = [height for height, _ in panels]
@@ -101,7 +107,7 @@ def draw_replays(
         figure.suptitle(title, x=0.01, ha="left")
         left, right = figure.subfigures(1, 2, width_ratios=(2, 3))
         above = left.subplots()
-        _draw_above(above, tracks, reference)
+        _draw_above(above, tracks, reference, judge)
         shape: Any = {"sharex": True, "squeeze": False, "height_ratios": heights}
         over_time: Any = right.subplots(len(panels), 1, **shape)[:, 0] if panels else ()
         for axes, (_, draw) in zip(over_time, panels, strict=True):
@@ -113,7 +119,7 @@ def draw_replays(
 
 
 def _draw_above(
-    axes: Any, tracks: Mapping[str, Track], reference: NDArray[np.float64] | None
+    axes: Any, tracks: Mapping[str, Track], reference: NDArray[np.float64] | None, judge: str
 ) -> None:
     """Trajectories, and where odometries were restarted; the legend is that of the picture."""
     for mode, track in tracks.items():
@@ -123,7 +129,7 @@ def _draw_above(
     if reference is not None:
         some = reference[np.linspace(0, len(reference) - 1, 40).astype(int)]
         ring: Any = {"color": "#009e73", "mfc": "white", "ms": 4, "ls": ""}
-        axes.plot(*some.T, "o", label="reference", **ring)
+        axes.plot(*some.T, "o", label=judge, **ring)
     axes.plot(0.0, 0.0, "P", color="black", mec="white", ms=9, label="start")
     label = "restarted by the health check"
     for mode, track in tracks.items():
@@ -180,12 +186,12 @@ def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool
     axes.set_ylabel(name.replace("_", "\n"), fontsize="small")
 
 
-def _draw_estimated(axes: Any, mode: str, track: Track, length: float) -> None:
-    """What a bank has estimated of its own error, the true one, and when it was lost."""
+def _draw_estimated(axes: Any, mode: str, track: Track, length: float, true: str) -> None:
+    """What a bank has estimated of its own error, what `true` names, and when it was lost."""
     estimated, low, high = track.estimated.T
     if np.isfinite(track.errors_behind).any():
         wide = LINES[mode] | {"lw": 3.6}  # seen where the estimate lies on it
-        axes.plot(track.seconds, track.errors_behind, **wide, label="true")
+        axes.plot(track.seconds, track.errors_behind, **wide, label=true)
     # A logarithmic axis has no zero.
     low = np.maximum(low, 0.1 * estimated)
     seconds = track.choice_seconds

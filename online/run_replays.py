@@ -14,6 +14,7 @@ from adaptune.selection import Selection
 from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.study.config import StudyConfig
 from adaptune.study.inputs import check_model, odometry_inputs
+from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
 from online.modes import WITHOUT_MODEL, Mode, ReplaySetup, sequences_without_model
 from online.replay import Replay, replay
@@ -103,8 +104,12 @@ class _Modes(NamedTuple):
 def _replay_all(
     study: Study, sequences: Sequence[str], modes: _Modes, again: bool, progress: Progress
 ) -> int:
-    """Replay what was not replayed before; the number of replays that were made."""
+    """Replay what was not replayed before; the number of replays that were made.
+
+    Sequences without a reference get an estimated one before, where that is possible.
+    """
     study.open()
+    ensure_references(study, sequences, progress, required=False)
     digest = "" if modes.model is None else modes.model.digest
     made = 0
     for name in sequences:

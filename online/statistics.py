@@ -1,6 +1,7 @@
 """Statistics of stored replays: errors, intervals, and ratios to those of another mode."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from adaptune.metrics import (
     sub_trajectory_rte,
     window_ends,
 )
+from adaptune.reference.stored import StoredEstimate
 from adaptune.trajectory import Trajectory, read_tum
 from online.stored_replays import StoredReplay
 
@@ -27,6 +29,10 @@ ALL = "all"
 """In place of a sequence, all of them."""
 ESTIMATED, LOST = "estimated [%]", "lost [s]"
 """Columns of what a bank has measured of itself."""
+REFERENCE = "reference"
+"""Column of the kind of reference."""
+ERROR_FACTOR = 1.5
+"""By how much more than estimated an estimated reference may err."""
 Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
 
@@ -36,12 +42,33 @@ class Reference(NamedTuple):
 
     trajectory: Trajectory | None  # None where nothing is known
     length: float  # metres of a sub-trajectory
+    estimated: bool = False  # whether it was computed from the recording
+    error: float | None = None  # estimated mean RTE of an estimated one, percent
 
     @classmethod
-    def read(cls, folder: Path, length: float) -> "Reference":
-        """Read the reference of a replayed sequence, if it has one."""
+    def read(cls, folder: Path, length: float, stored: StoredEstimate | None = None) -> "Reference":
+        """Read the reference of a replayed sequence, if it has one.
+
+        Parameters
+        ----------
+        folder
+            Of its replays.
+        length
+            Metres of a sub-trajectory.
+        stored
+            What is known about the reference if it is an estimated one.
+        """
         path = folder / "reference.tum"
-        return cls(read_tum(path) if path.exists() else None, length)
+        trajectory = read_tum(path) if path.exists() else None
+        error = math.nan if stored is None else stored.error(length)
+        return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
+
+    @property
+    def kind(self) -> str:
+        """Where it comes from, in a word."""
+        if self.trajectory is None:
+            return "none"
+        return "estimated" if self.estimated else "given"
 
     @property
     def block(self) -> int:
@@ -125,6 +152,8 @@ class ComparisonRow:
     estimated: float | None = None
     estimated_interval: Interval = None
     lost_seconds: float = 0.0  # how long the bank was lost
+    reference: str = "given"  # `given`, `estimated` or `none`
+    reference_error: float | None = None  # percent, of an estimated one
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
@@ -141,6 +170,8 @@ class ComparisonRow:
             LOST: self.lost_seconds,
             "restarts": self.restarts,
             "switches": self.switches,
+            REFERENCE: self.reference,
+            "_reference_error": self.reference_error,
             "_poor_scans": self.poor_scans,
             "_x_real_time": self.x_real_time,
             "_rte_low": rte_low,
@@ -200,6 +231,9 @@ def compare_modes(
         mine, others = errors[mode][known], errors[yardstick][known]
         summary = replay.summary
         intervals = bootstrap(mine, others, block) if len(mine) else None
+        if intervals is not None and reference.error is not None:
+            judge = ERROR_FACTOR * reference.error
+            intervals = without_error(*intervals, float(others.mean()), judge)
         rte_interval, ratio_interval = intervals or (None, None)
         rte = float(mine.mean()) if len(mine) else None
         estimated, estimated_interval = _estimated(replay)
@@ -224,9 +258,43 @@ def compare_modes(
                 estimated,
                 estimated_interval,
                 summary.lost_seconds,
+                reference.kind,
+                reference.error,
             )
         )
     return rows
+
+
+def without_error(
+    rte: tuple[float, float], ratio: tuple[float, float], other: float, error: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Intervals that hold, too, what would be measured by a reference without error.
+
+    What a reference errs adds to the error of every mode, in quadrature: taken out, errors become
+    smaller, and ratios lie further from 1.
+
+    Parameters
+    ----------
+    rte, ratio
+        Intervals of a mean error in percent, and of its ratio to that of another mode.
+    other
+        Mean error of that mode in percent, as measured.
+    error
+        Of the reference, percent: any from 0 on up to this is possible.
+    """
+
+    def true(mean: float) -> float:
+        return math.sqrt(max(mean**2 - error**2, 0.0))
+
+    def further(end: float) -> float:
+        if end == 1.0:
+            return end
+        if true(other) == 0.0:  # nothing of it may be the mode's own
+            return 0.0 if end < 1.0 else math.inf
+        return true(end * other) / true(other)
+
+    (rte_low, rte_high), (low, high) = rte, ratio
+    return (true(rte_low), rte_high), (min(low, further(low)), max(high, further(high)))
 
 
 def _estimated(replay: StoredReplay) -> tuple[float | None, Interval]:
@@ -274,6 +342,7 @@ def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
                 yardstick=mine[0].yardstick,
                 estimated=float(np.mean(estimated)) if estimated else None,
                 lost_seconds=sum(row.lost_seconds for row in mine),
+                reference=" and ".join(sorted({row.reference for row in mine})),
             )
         )
     return made

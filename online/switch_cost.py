@@ -22,6 +22,7 @@ from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 from adaptune.study.driven import driven
 from adaptune.study.inputs import check_inputs
+from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
 from online.replay import replay
 
@@ -98,12 +99,12 @@ def measure_switching(
     AdaptuneError
         If a sequence is too short, or its reference unknown.
     """
+    ensure_references(study, study.config.training, progress)
     check_inputs(study)
     study.open()
     warm_up, catch_up_scans = study.warm_up, study.config.online.switching.catch_up_scans
     mechanisms = _mechanisms(study.odometry, warm_up, catch_up_scans)
-    ratios: dict[str, list[float]] = {what: [] for what in mechanisms}
-    times: dict[str, list[float]] = {what: [] for what in mechanisms}
+    ratios, times = ({what: list[float]() for what in mechanisms} for _ in range(2))
     metres = 0.0
     for name in study.config.training:
         recording = _read(study, name, seconds)
@@ -171,7 +172,7 @@ def _read(study: Study, name: str, seconds: float) -> Recording:
         scans.append(scan)
     reference = sequence.reference()
     if reference is None:
-        help_ = "name its topic or file (reference: ...)"
+        help_ = "name its topic or file, or let adaptune estimate it (reference: estimated)"
         raise AdaptuneError(
             f"sequences.{name}: has no reference to measure errors against; {help_}"
         )

@@ -49,6 +49,8 @@ SLOW = [
     "adaptune/model/test_knn.py",
     "online/test_untrained.py",
     "online/test_switch_cost.py",
+    "offline/test_estimated_training.py",
+    "online/test_estimated_replays.py",
     "offline/test_storage.py",
     "adaptune/test_hosting.py",
     "offline/samplers/test_hosted.py",

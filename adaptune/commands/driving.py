@@ -30,7 +30,7 @@ def online(
 
     Once a second, an adaptive replay describes the newest scan and selects a parameter set with the
     error model. Each replay writes its trajectory (TUM), every selection with its predicted error,
-    and the time of each scan (CSV).
+    and the time of each scan (CSV). Before, it estimates the reference of sequences that have none.
 
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
@@ -77,6 +77,7 @@ def switching(
     """
     loaded = load(study, override, folder)
     from adaptune import report
+    from adaptune.study.references import estimates_in_words
     from online.switch_cost import measure_switching, switch_cost_in_words
 
     with progress() as show:
@@ -88,6 +89,8 @@ def switching(
             caption,
         )
     )
+    for sentence in estimates_in_words(loaded, loaded.config.training):
+        say(sentence)
     say(switch_cost_in_words(loaded))
     say(f"Kept in {loaded.folder / 'switching.json'}.")
     say_next_online(loaded.config.test, study, override, folder)
@@ -102,7 +105,8 @@ def compare(
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
     1, adapting is better. *estimated* is the error that a bank measured itself. Intervals come from
-    a block bootstrap over time: they hold for these recordings, not for other places.
+    a block bootstrap over time: they hold for these recordings, not for other places. Where an
+    estimated reference judged, they include its own error.
     """
     loaded = load(study, override, folder)
     from adaptune.study.driven import MIN_RECORDINGS
@@ -119,9 +123,7 @@ def compare(
         say(said)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
     if rows[0].yardstick == "baseline":
-        known = any(row.rte is not None for row in rows)
-        first = "" if known else "see that the training sequences have a reference; then "
-        say_next_of_study("look for better sets", "offline", study, override, folder, first)
+        say_next_of_study("look for better sets", "offline", study, override, folder)
         return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
     n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)

@@ -60,6 +60,8 @@ def offline(
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
+    Training sequences without a reference get one that is estimated from their scans, before.
+
     The table shows the *baseline* (the odometry's own parameters), the *fixed* set (the best over
     all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
     """
@@ -121,6 +123,7 @@ def trials(
     from adaptune import trials as table
     from adaptune.archive import Archive
     from adaptune.study.inputs import warn_of_stale
+    from adaptune.study.references import estimates_in_words
     from offline.budget import all_done
 
     warn_of_stale(loaded)
@@ -138,6 +141,8 @@ def trials(
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
+        for sentence in estimates_in_words(loaded, names):
+            say(sentence)
         if all_done(loaded.config.offline, loaded.folder, (row["trial"] for row in finished)):
             several = len(loaded.training) > 1
             say_next_of_trained(several, loaded.config.test, study, override, folder)

@@ -27,6 +27,8 @@ from adaptune.strict import StrictModel
 MOST_VIEWS = 16
 """Views of one sequence, and views to train on; each costs time with every scan."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
+ESTIMATED, NO_REFERENCE = "estimated", "none"
+"""In place of a `reference`: it is estimated from the scans, or there is none."""
 _SOURCES = ("bag", "kitti", "folder", "evalio")
 
 
@@ -221,7 +223,11 @@ class SequenceConfig(_Part):
     stride: int = Field(1, ge=1, le=10_000)  # use every stride-th scan
     part: Part | None = None  # of the time from `start` to `stop`
     # Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
+    # `estimated` from the scans, also where there are poses; `none`. Left out, the recording's own
+    # poses, and where it has none, estimated.
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
+    # Poses like those of a `reference`, right over long distances only, that an estimate joins.
+    position_prior: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
     # Seconds to add to the reference's stamps, as far as those of other clocks lie.
@@ -249,12 +255,17 @@ class SequenceConfig(_Part):
             raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
         if self.compensate == "gyro" and self.imu is None:
             raise ValueError("`compensate: gyro` needs `imu`")
+        if self.position_prior is not None and self.reference not in (None, ESTIMATED):
+            raise ValueError(
+                f"`position_prior` joins an estimated reference: write `reference: {ESTIMATED}`, "
+                f"or leave `position_prior` out"
+            )
         return self
 
     def paths(self) -> list[Path]:
         """Files and folders that it is read from; a SequenceError if there is no such bag."""
         paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
         paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
-        if self.reference is not None and self.reference.endswith(REFERENCE_FILES):
-            paths.append(Path(self.reference))
+        of_poses = (self.reference, self.position_prior)
+        paths += [Path(file) for file in of_poses if file and file.endswith(REFERENCE_FILES)]
         return paths

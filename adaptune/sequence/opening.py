@@ -9,7 +9,14 @@ from typing import Any, NamedTuple
 from adaptune.sequence import cache, views
 from adaptune.sequence.bag import IMU_TYPES, BagSource
 from adaptune.sequence.bag_files import bag_paths, files_of
-from adaptune.sequence.config import REFERENCE_FILES, ImuConfig, SequenceConfig, to_pose
+from adaptune.sequence.config import (
+    ESTIMATED,
+    NO_REFERENCE,
+    REFERENCE_FILES,
+    ImuConfig,
+    SequenceConfig,
+    to_pose,
+)
 from adaptune.sequence.folder import kitti, scan_folder
 from adaptune.sequence.imu import ImuNoise
 from adaptune.sequence.recorded import ImuSettings, RecordedSequence, ReferenceSettings
@@ -17,6 +24,7 @@ from adaptune.sequence.sequence import Sequence, SequenceError
 from adaptune.sequence.source import Section, Source
 from adaptune.sequence.timing import Timing
 from adaptune.sequence.views import Reversible
+from adaptune.trajectory import Trajectory
 
 # Livox IMUs measure acceleration in multiples of this.
 _STANDARD_GRAVITY = 9.80665
@@ -54,6 +62,44 @@ def check_sequence(config: SequenceConfig) -> None:
     reference is of another time.
     """
     _recorded(config).check()
+    if config.position_prior is None:
+        return
+    if not wants_estimate(config):
+        raise SequenceError(
+            f"position_prior: joins an estimated reference, and the recording has poses of its "
+            f"own; write `reference: {ESTIMATED}`, or leave `position_prior` out"
+        )
+    _recorded(_of_prior(config)).check()
+
+
+def wants_estimate(config: SequenceConfig) -> bool:
+    """Whether the reference of a sequence is to be estimated; a SequenceError if it cannot tell."""
+    if config.reference is not None or config.bag is not None:
+        return config.reference in (None, ESTIMATED)
+    source, _ = _source(config)
+    if config.evalio is not None:
+        return source.poses(None, None) is None
+    return not source.pose_files
+
+
+def open_unseen(config: SequenceConfig) -> RecordedSequence:
+    """The scans of a sequence as they were recorded, without views and without compensation."""
+    return _recorded(config)
+
+
+def position_prior(config: SequenceConfig) -> Trajectory | None:
+    """Poses of the LiDAR that are right over long distances only, if the sequence names any."""
+    return None if config.position_prior is None else _recorded(_of_prior(config)).reference()
+
+
+def prior_files(config: SequenceConfig) -> Items[Path]:
+    """The files of these poses, where they are not in the recording."""
+    return () if config.position_prior is None else sequence_files(_of_prior(config)).reference
+
+
+def _of_prior(config: SequenceConfig) -> SequenceConfig:
+    """The sequence with the poses of its prior as its reference."""
+    return config.model_copy(update={"reference": config.position_prior, "position_prior": None})
 
 
 class SequenceFiles(NamedTuple):
@@ -67,6 +113,8 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
     """The files that a sequence is read from; a SequenceError if it cannot be opened."""
     reference = config.reference or ""
     own = [Path(reference)] if reference.endswith(REFERENCE_FILES) else None
+    if reference in (ESTIMATED, NO_REFERENCE):
+        own = []
     if config.bag is not None:
         bags = bag_paths((config.bag,) if isinstance(config.bag, str) else config.bag)
         return SequenceFiles(files_of(bags), own or ())
@@ -89,7 +137,8 @@ def interval_of(config: SequenceConfig) -> tuple[float, float]:
 
 
 def _recorded(config: SequenceConfig) -> RecordedSequence:
-    reference: str | Path | None = config.reference
+    given = config.reference not in (ESTIMATED, NO_REFERENCE)
+    reference: str | Path | None = config.reference if given else None
     if isinstance(reference, str) and reference.endswith(REFERENCE_FILES):
         reference = Path(reference)
         if not reference.is_file():
@@ -102,7 +151,7 @@ def _recorded(config: SequenceConfig) -> RecordedSequence:
             source.topic(config.imu.topic, IMU_TYPES, "an IMU's measurements")
     T = None if config.extrinsic is None else to_pose(config.extrinsic)
     settings = ReferenceSettings(
-        reference, config.child_frame, T, config.clock_offset, config.max_gap
+        reference, config.child_frame, T, config.clock_offset, config.max_gap, given
     )
     section = _section(config)
     if config.part is not None and (span := source.span()) is not None:

@@ -40,6 +40,7 @@ class ReferenceSettings:
     T_reference_sensor: Poses | None = None
     clock_offset: float = 0.0  # seconds to add to the poses' stamps
     max_gap: float = 1.0  # seconds. Between poses further apart the reference is unknown.
+    given: bool = True  # whether there is one; if not, not even the recording's own poses count
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +162,8 @@ class RecordedSequence:
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR, if they are known."""
         settings = self._reference
+        if not settings.given:
+            return None
         if isinstance(settings.source, Path):
             trajectory: Trajectory | None = self._from_file(settings.source)
         else:

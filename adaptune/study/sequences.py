@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.program_input import ProgramInput, program_input
+from adaptune.reference.estimated import BREAK
+from adaptune.reference.stored import StoredEstimate
 from adaptune.sequence.config import SequenceConfig, ViewConfig
 from adaptune.sequence.export import Layout
 from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.names import OF_VIEW, origin
-from adaptune.sequence.opening import SequenceFiles, open_sequence, sequence_files
+from adaptune.sequence.opening import (
+    SequenceFiles,
+    open_sequence,
+    sequence_files,
+    wants_estimate,
+)
 from adaptune.sequence.part import part_name
 from adaptune.sequence.sequence import Sequence
 from adaptune.sequence.views import WithImu
@@ -21,6 +28,13 @@ from adaptune.study.mistakes import ConfigurationError
 _PATHS = ("bag", "kitti", "folder", "evalio")
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
 """Keys of a sequence that change its reference only."""
+_AS_ESTIMATED = {
+    **{key: SequenceConfig.model_fields[key].default for key in _OF_POSES},
+    "position_prior": None,
+    # A gap as long says where the estimate is not to be trusted.
+    "max_gap": BREAK,
+}
+"""Values of these keys where the poses are the LiDAR's own, estimated at its scans."""
 
 _inputs: dict[tuple[str, str], ProgramInput] = {}
 """What programs read, by folder and everything that it depends on."""
@@ -33,7 +47,8 @@ class StudySequences:
     recordings: Mapping[str, SequenceConfig]
     courses: Mapping[str, Course]
     views: Mapping[str, ViewConfig]  # views that may be had of every sequence
-    folder: Path  # the study's folder, which keeps recorded courses and what programs read
+    # The study's folder: it keeps recorded courses, estimated references and what programs read.
+    folder: Path
     with_imu: bool = False  # whether scans bring along the IMU's measurements
     layout: Layout = "bag"  # the format that a program reads
 
@@ -48,10 +63,29 @@ class StudySequences:
             config = self.config(name)
             return config.model_copy(update={"views": (*config.views, self.views[view])})
         if name in self.recordings:
-            return self.recordings[name]
+            given = self.recordings[name]
+            if not self.is_estimated(name):
+                return given
+            reference = str(self.estimate_path(name).absolute())
+            return given.model_copy(update=_AS_ESTIMATED | {"reference": reference})
         from adaptune.simulation.rig import as_sequence
 
         return as_sequence(self.courses[name], self.recording(name))
+
+    def estimate_path(self, name: str) -> Path:
+        """The TUM file of an estimated reference; the views of a sequence share it."""
+        return self.folder / "references" / f"{origin(name)}.tum"
+
+    def is_estimated(self, name: str) -> bool:
+        """Whether the reference of a sequence, or a view, is one that was estimated."""
+        given, path = self.recordings.get(origin(name)), self.estimate_path(name)
+        # The file beside it is written last.
+        there = given is not None and path.exists() and path.with_suffix(".json").exists()
+        return there and wants_estimate(self.recordings[origin(name)])
+
+    def estimate(self, name: str) -> StoredEstimate | None:
+        """What is known about an estimated reference; None if it is not one."""
+        return StoredEstimate.read(self.estimate_path(name)) if self.is_estimated(name) else None
 
     def key(self, name: str) -> str:
         """The key under which the user finds a sequence: a part has none of its own."""
@@ -99,7 +133,8 @@ class StudySequences:
         A recording is known by its content, not by its path.
         """
         course = self.courses.get(origin(name))
-        config = self.config(name).model_dump(mode="json", exclude={*_PATHS, *_OF_POSES, "cache"})
+        others = {*_PATHS, *_AS_ESTIMATED, "cache"}
+        config = self.config(name).model_dump(mode="json", exclude=others)
         return {
             "sequence": config,
             "course": None if course is None else course.model_dump(mode="json"),

@@ -92,12 +92,27 @@ def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
     assert tools.proposed_sub_trajectory(Trajectory(stamps, T)) == length
 
 
-def test_inspect_says_what_to_do_without_a_reference(tmp_path):
+def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):
+    folder = tmp_path / "scans"
+    folder.mkdir()
     for i, (_, points, _) in enumerate(drives.scans(n_scans=3)):
-        np.save(tmp_path / f"{i}.npy", points)
-    done = CliRunner().invoke(app, ["inspect", str(tmp_path)])
+        np.save(folder / f"{i}.npy", points)
+    done = CliRunner().invoke(app, ["inspect", str(folder)])
     assert done.exit_code == 0, done.output
-    assert "can only be a `test` sequence" in done.stdout.splitlines()[-1]
+    assert "reference: none; adaptune estimates one from the scans" in done.stdout
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    study = load_study(tmp_path / "one.yaml", [], tmp_path / "run")
+    assert study.training == ["scans_0-60"]
+    assert study.config.sub_trajectory == 5.0
+
+
+def test_inspect_says_what_to_do_where_the_reference_does_not_serve(tmp_path):
+    still = [(stamp, points, np.eye(4)) for stamp, points, _ in drives.scans(n_scans=3)]
+    bag = drives.write_bag(tmp_path / "still.bag", still)
+    done = CliRunner().invoke(app, ["inspect", str(bag)])
+    assert done.exit_code == 0, done.output
+    assert "write `reference: estimated`" in done.stdout.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,6 @@ def test_faults_are_reported_with_what_to_do(
         ([(0, 2), (0.1, 2)], "a reference that moves"),
         ([(0, 0)], "a reference that moves"),
         ([(50, 0), (60, 9)], "a reference of the same time"),
-        ([], "a reference trajectory"),
     ],
 )
 def test_a_reference_that_does_not_serve_is_missing(
@@ -99,6 +98,15 @@ def test_a_reference_that_does_not_serve_is_missing(
     text = inspection_text(inspection)
     assert f"offline: lacks {lacking}" in text
     assert "online: has all it needs" in text
+
+
+def test_without_a_reference_nothing_is_missing(tmp_path: Path) -> None:
+    inspection = inspect(drive(tmp_path / "a.bag", [0, 0.1], []))
+    assert not inspection.missing["offline"]
+    text = inspection_text(inspection, width=1000)
+    assert "reference: none; adaptune estimates one from the scans" in text
+    assert "offline: has all it needs" in text
+    assert "# reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out" in text
 
 
 @pytest.mark.parametrize("of", ["NaN", "zero", "far", "few"])

@@ -209,7 +209,7 @@ def test_replays_are_made_once(replayed, study_file):
 
 
 def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_file):
-    study = load_study(study_file, ["sequences.three.reference="], trained.folder)
+    study = load_study(study_file, ["sequences.three.reference=none"], trained.folder)
     run_replays(study, trained.folder / "model.safetensors")
     rows = compare(study)
     assert [row.rte for row in rows] == [None] * 4

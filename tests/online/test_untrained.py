@@ -21,7 +21,7 @@ from online.run_replays import run_replays, run_untrained
 from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "untrained"]
-BLIND = "sequences.three.reference="
+BLIND = "sequences.three.reference=none"
 WHOLE = (
     "odometry={name: command, settings: {command: [sh, '{input}', '{output}', '{size}']}, "
     "parameters: {size: {type: float, low: 0.1, high: 3, baseline: 1}}}"

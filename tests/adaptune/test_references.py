@@ -1,0 +1,238 @@
+"""Estimated references of the sequences of a study."""
+
+import os
+
+import drives
+import estimates
+import numpy as np
+import pytest
+
+from adaptune.reference.estimated import EstimateError
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import open_sequence, wants_estimate
+from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.references import (
+    ensure_references,
+    estimates_as_data,
+    estimates_in_words,
+)
+from adaptune.trajectory import Trajectory, write_tum
+from offline.offline_study import load_study
+
+LEFT_OUT = "sequences.one.reference="
+EXTRINSIC = "sequences.one.extrinsic=[0, 2, 0, 0, 0, 0, 1]"
+
+
+@pytest.fixture
+def estimator(monkeypatch):
+    return estimates.install(monkeypatch)
+
+
+@pytest.fixture
+def load(study_file, tmp_path, caplog):
+    caplog.set_level("INFO")
+    return lambda *overrides: load_study(study_file, overrides, tmp_path / "run")
+
+
+def test_only_what_has_no_reference_is_estimated_and_once(estimator, load, caplog):
+    study = load(LEFT_OUT, "sequences.three.reference=none")
+    shown = []
+    names = ["one", "one+back", "two", "three"]
+    ensure_references(study, names, lambda *given: shown.append(given))
+    assert estimator.names == ["one.bag"]
+    assert shown == [("one, estimating its reference", 40, 40)]
+    (said,) = caplog.messages
+    assert said.startswith(
+        "one: its reference is estimated, 12 m; its own error is 0.21 % over 3 m, unknown on 0 % "
+    )
+    made = {path.name for path in (study.folder / "references").iterdir()}
+    assert {"one.json", "one.tum"} <= made <= {"one.json", "one.tum", "one.png"}
+    ensure_references(study, names)
+    assert len(estimator.asked) == 1
+    assert [study.sequences.is_estimated(name) for name in names] == [True, True, False, False]
+    reference = study.sequences.open("one").reference()
+    np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.3003 * np.arange(40), atol=1e-8)
+    assert study.sequences.open("three").reference() is None
+    # It is a file like another.
+    assert study.sequences.reference("one")["poses"]["reference"] == "a file"
+    assert len(study.sequences.files("one").reference) == 1
+
+
+def test_a_view_shares_it(estimator, load):
+    study = load(LEFT_OUT, "offline.augment=[{reverse: true}]")
+    view = study.training[1]
+    ensure_references(study, study.training)
+    assert len(estimator.asked) == 1
+    backward = study.sequences.open(view).reference().T_world_sensor[:, 0, 3]
+    assert backward[0] - backward[-1] == pytest.approx(39 * 0.3003)
+    assert study.sequences.config(view).reference == study.sequences.config("one").reference
+
+
+def test_a_view_of_the_sequence_itself_is_left_out(estimator, load):
+    study = load(LEFT_OUT, "sequences.one.views=[{drop: {share: 0.5}}]")
+    ensure_references(study, ["one"])
+    known = len(study.sequences.open("one").reference())
+    assert known == 40
+    ensure_references(load(LEFT_OUT, "sequences.one.compensate=constant_velocity"), ["one"])
+    assert len(estimator.asked) == 1
+
+
+@pytest.mark.usefixtures("estimator")
+def test_it_is_asked_for_where_there_are_poses(load):
+    # What is said of the recorded poses is not of the estimated ones.
+    study = load("sequences.one.reference=estimated", EXTRINSIC, "sequences.one.max_gap=9")
+    assert study.sequences.open("one").reference() is None
+    ensure_references(study, ["one"])
+    found = study.sequences.open("one").reference()
+    np.testing.assert_allclose(found.T_world_sensor[0], np.eye(4), atol=1e-9)
+    assert found.max_gap == 1.0
+    given = load()
+    assert given.sequences.open("one").reference().T_world_sensor[-1, 0, 3] == pytest.approx(11.7)
+    assert not given.sequences.is_estimated("one")
+
+
+def test_where_it_is_not_trusted_there_is_a_gap(estimator, load, caplog):
+    estimator.untrusted = [20]
+    study = load(LEFT_OUT)
+    ensure_references(study, ["one"])
+    reference = study.sequences.open("one").reference()
+    assert len(reference) == 30
+    at = reference.at(np.array([drives.FIRST_STAMP + 25 * 10**8]))
+    assert np.isnan(at).all()
+    assert "unknown on 28 % of the path" in caplog.text
+    assert estimates_as_data(study, ["one", "two"]) == {
+        "one": {"error_percent": 0.2073, "unknown_share": pytest.approx(0.28, abs=0.01)}
+    }
+
+
+def test_what_judged_is_said(estimator, load):
+    study = load(LEFT_OUT, "sequences.two.reference=")
+    assert estimates_in_words(study, study.training) == []
+    estimator.halves = (1.0, 1.004)
+    ensure_references(study, study.training)
+    (said,) = estimates_in_words(study, [*study.training, "three"])
+    assert said == (
+        "Judged by an estimated reference: one (its own error is 0.21 % over 3 m, unknown on 0 % "
+        "of the path); two (its own error is 0.21 % over 3 m, unknown on 0 % of the path)."
+    )
+
+
+def test_it_is_estimated_again_when_something_has_changed(
+    estimator, load, tmp_path, monkeypatch, caplog
+):
+    ensure_references(load(LEFT_OUT), ["one"])
+    prior = tmp_path / "gps.tum"
+    with_prior = (LEFT_OUT, f"sequences.one.position_prior={prior}")
+    for overrides, change in (
+        ((LEFT_OUT, "sequences.one.stop=3"), "its scans are others"),
+        (with_prior, "its scans are others; its position prior is another"),
+        (with_prior, "its position prior is another"),
+    ):
+        caplog.clear()
+        write_tum(prior, truth(len(estimator.asked)))
+        ensure_references(load(*overrides), ["one"])
+        assert caplog.messages[0] == f"one: its reference is estimated again: {change}"
+        ensure_references(load(*overrides), ["one"])
+    assert len(estimator.asked) == 4
+    monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
+    ensure_references(load(*with_prior), ["one"])
+    assert "again: adaptune estimates it in another way" in caplog.text
+
+
+def truth(aside=0.0):
+    stamps = drives.FIRST_STAMP + np.arange(40) * 10**8
+    T = np.tile(np.eye(4), (40, 1, 1))
+    T[:, 0, 3], T[:, 1, 3] = 0.3 * np.arange(40), aside
+    return Trajectory(stamps, T)
+
+
+def test_a_prior_is_seen_from_the_lidar(estimator, load):
+    ensure_references(load(LEFT_OUT, "sequences.one.position_prior=/truth", EXTRINSIC), ["one"])
+    ((_, prior),) = estimator.asked
+    assert len(prior) == 40
+    np.testing.assert_allclose(prior.T_world_sensor[:, 1, 3], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("reference=none", "`position_prior` joins an estimated reference: write `reference: e"),
+        ("reference=/truth", "`position_prior` joins an estimated reference: write `reference: e"),
+        ("position_prior=/points", "/points is"),
+        ("position_prior=no.tum", "no.tum"),
+    ],
+)
+def test_a_prior_that_cannot_be_joined_is_refused(load, given, words):
+    overrides = ["sequences.one.reference=", "sequences.one.position_prior=/truth"]
+    with pytest.raises(ConfigurationError, match=r"sequences\.one") as caught:
+        load(*overrides, f"sequences.one.{given}")
+    assert words in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path, study_file):
+    kitti = tmp_path / "kitti"
+    (kitti / "velodyne").mkdir(parents=True)
+    for i in range(3):
+        np.full((30, 4), i + 1.0, "<f4").tofile(kitti / f"velodyne/{i:06}.bin")
+    (kitti / "times.txt").write_text("0\n0.1\n0.2\n")
+    (kitti / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    plain = SequenceConfig(kitti=str(kitti))
+    assert wants_estimate(plain)
+    (kitti / "poses.txt").write_text("".join(f"1 0 0 {i} 0 1 0 0 0 0 1 0\n" for i in range(3)))
+    assert not wants_estimate(plain)
+    assert open_sequence(plain).reference() is not None
+    for word, wanted in (("none", False), ("estimated", True)):
+        config = SequenceConfig(kitti=str(kitti), reference=word)
+        assert wants_estimate(config) == wanted
+        assert open_sequence(config).reference() is None
+    entry = f"sequences.three={{kitti: {kitti}, position_prior: gps.tum}}"
+    with pytest.raises(ConfigurationError, match=r"position_prior: .* has poses of its own; write"):
+        load_study(study_file, [entry], tmp_path / "run")
+
+
+def test_a_recording_that_allows_none_is_named(estimator, load, caplog):
+    study = load(LEFT_OUT)
+    ensure_references(study, ["one"])
+    estimator.refusal = EstimateError("the robot hardly moves")
+    other = load(LEFT_OUT, "sequences.one.stop=3")
+    with pytest.raises(EstimateError, match=r"^sequences\.one: .*one\.bag: the robot hardly moves"):
+        ensure_references(other, ["one"])
+    # What was estimated of something else is gone.
+    assert not study.sequences.is_estimated("one")
+    caplog.clear()
+    ensure_references(other, ["one"], required=False)
+    (said,) = caplog.messages
+    assert said.endswith(
+        "the robot hardly moves; it is replayed without a reference, and not judged"
+    )
+    assert other.sequences.open("one").reference() is None
+
+
+def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch):
+    study = load(LEFT_OUT, "sequences.two.reference=")
+    before = os.sched_getaffinity(0)
+    cores = []
+
+    def interrupted(scans, *given):
+        cores.append(len(os.sched_getaffinity(0)))
+        if "two" in scans.name:
+            raise KeyboardInterrupt
+        return estimator(scans, *given)
+
+    monkeypatch.setattr("adaptune.reference.estimate.estimate_reference", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ensure_references(study, study.training)
+    assert cores == [1, 1]
+    assert os.sched_getaffinity(0) == before
+    assert study.sequences.is_estimated("one")
+    assert not study.sequences.is_estimated("two")
+
+
+@pytest.mark.usefixtures("estimator")
+def test_a_damaged_note_is_told(load):
+    study = load(LEFT_OUT)
+    ensure_references(study, ["one"])
+    (study.folder / "references/one.json").write_text("{")
+    with pytest.raises(EstimateError, match=r"one\.json: is damaged .* remove it and one\.tum"):
+        ensure_references(study, ["one"])

@@ -1,0 +1,66 @@
+"""Training on sequences whose references are estimated."""
+
+import io
+
+import estimates
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from adaptune.cli import app
+from adaptune.model import ErrorModel
+from adaptune.model.show import render
+from adaptune.reference.estimated import EstimateError
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
+from offline.train import train
+from offline.validate import validate
+
+BLIND = ("sequences.one.reference=", "sequences.two.reference=estimated", "offline.trials=4")
+
+
+@pytest.fixture
+def load(study_file, tmp_path):
+    return lambda *given: load_study(study_file, [*BLIND, *given], tmp_path / "run")
+
+
+def test_trials_model_and_validation_say_what_judged(load, monkeypatch):
+    estimator = estimates.install(monkeypatch, untrusted=[38])
+    training = train(load())
+    assert estimator.names == ["one.bag", "two.bag"]
+    assert training.words[0].startswith("Judged by an estimated reference: one (its own error is ")
+    assert training.rows[1]["_reference"] == "estimated"
+    assert training.rows[1]["_reference_error"] == pytest.approx(0.21, abs=0.01)
+    model = ErrorModel.load(load().model_path)
+    assert list(model.provenance["estimated_references"]) == ["one", "two"]
+    shown = io.StringIO()
+    Console(width=200, file=shown).print(render(model, load().model_path))
+    assert "estimated_references.two.error_percent" in shown.getvalue()
+    said = validate(load()).verdicts
+    assert said[-1] == training.words[0]
+    # Nothing is left to do: the model keeps its validation.
+    assert train(load()).model.validation
+    assert len(estimator.asked) == 2
+    # Another estimate is another reference.
+    estimator.factor = 1.01
+    monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
+    with pytest.raises(ConfigurationError, match=r"one\.tum has other content .* --again"):
+        train(load())
+    assert len(estimator.asked) == 4
+    train(load(), again=True)
+    assert len(estimator.asked) == 4
+
+
+def test_a_training_sequence_without_is_an_error_before_the_first_trial(
+    study_file, tmp_path, monkeypatch
+):
+    estimator = estimates.install(monkeypatch)
+    estimator.refusal = EstimateError("the robot hardly moves")
+    words = [word for text in BLIND for word in ("-o", text)]
+    done = CliRunner().invoke(
+        app, ["offline", str(study_file), *words, "--folder", str(tmp_path / "run")]
+    )
+    assert done.exit_code == 2
+    assert "error: sequences.one: " in done.stderr
+    assert "one.bag: the robot hardly moves" in done.stderr
+    assert not (tmp_path / "run/trials").exists()

@@ -1,0 +1,99 @@
+"""Replays that an estimated reference judges."""
+
+import json
+
+import estimates
+import pytest
+from pictures import texts
+
+from adaptune.reference.estimated import EstimateError
+from offline.offline_study import load_study
+from online.comparison import compare, remarks, tables
+from online.run_replays import run_untrained
+from online.statistics import without_error
+
+BOTH = ["baseline", "untrained"]
+
+
+@pytest.fixture
+def load(study_file, tmp_path):
+    return lambda *given: load_study(study_file, ["sequences.three.reference=", *given], tmp_path)
+
+
+def test_it_is_estimated_and_said_to_judge(load, monkeypatch):
+    estimates.install(monkeypatch)
+    study = load()
+    assert run_untrained(study) == 2
+    rows = compare(study)
+    assert [(row.reference, row.mode) for row in rows] == [("estimated", mode) for mode in BOTH]
+    assert rows[0].rte is not None
+    assert rows[0].reference_error == pytest.approx(0.207, abs=1e-3)
+    written = json.loads((study.folder / "comparison/comparison.json").read_text())
+    assert written[1]["reference"] == "estimated"
+    assert written[1]["reference_error"] == rows[1].reference_error
+    (table, *_) = tables(rows, 3.0)
+    assert "reference" in [str(column.header) for column in table.columns]
+    assert "pulls ratios towards 1" in str(table.caption)
+    assert "On three an estimated reference judged: its own error is about 0.21 %." in remarks(rows)
+    drawn = set(texts(study.folder / "comparison/three.png"))
+    assert "estimated reference" in drawn
+    assert "reference" not in drawn
+    assert run_untrained(study) == 0
+    # As if it were long enough for intervals.
+    interval = (0.4, 0.6), (0.9, 1.1)
+    monkeypatch.setattr("online.statistics.bootstrap", lambda *_: interval)
+    rows = compare(study)
+    found = rows[1].rte_interval, rows[1].ratio_interval
+    assert found == without_error(*interval, rows[0].rte, 1.5 * rows[0].reference_error)
+    assert found[0][0] < 0.4
+    assert any(said.endswith("about 0.21 %, is in the intervals.") for said in remarks(rows))
+
+
+def test_another_estimate_replays_nothing(load, monkeypatch):
+    study = load()
+    estimator = estimates.install(monkeypatch)
+    run_untrained(study)
+    before = compare(study)[0].rte
+    estimator.factor = 1.1
+    monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
+    assert run_untrained(study) == 0
+    assert abs(compare(study)[0].rte - before) > 1.0
+
+
+def test_where_none_can_be_estimated_it_is_replayed_all_the_same(load, monkeypatch, caplog):
+    estimator = estimates.install(monkeypatch)
+    estimator.refusal = EstimateError("nothing can be registered")
+    study = load()
+    assert run_untrained(study) == 2
+    assert "sequences.three: " in caplog.text
+    assert "nothing can be registered; it is replayed without a reference" in caplog.text
+    rows = compare(study)
+    assert [(row.reference, row.rte, row.reference_error) for row in rows] == [
+        ("none", None, None)
+    ] * 2
+    (table, *_) = tables(rows, 3.0)
+    assert "reference" in [str(column.header) for column in table.columns]
+    assert "pulls ratios" not in str(table.caption)
+
+
+INF = float("inf")
+
+
+@pytest.mark.parametrize(
+    ("ratio", "other", "error", "expected"),
+    [
+        ((0.7, 0.9), 1.0, 0.0, (0.7, 0.9)),
+        # sqrt(0.8^2 - 0.6^2) / sqrt(1 - 0.6^2)
+        ((0.8, 1.0), 1.0, 0.6, (0.5291502622 / 0.8, 1.0)),
+        ((0.9, 1.25), 1.0, 0.6, (0.6708203932 / 0.8, 1.0965856099 / 0.8)),
+        ((1.25, 1.5), 2.0, 1.2, (1.25, 2.7495454169 / 1.6)),
+        ((0.5, 0.9), 1.0, 0.6, (0.0, 0.9)),
+        ((0.9, 1.1), 0.5, 0.6, (0.0, INF)),
+        ((1.0, 1.0), 0.5, 0.6, (1.0, 1.0)),
+    ],
+)
+def test_what_the_reference_errs_is_in_the_intervals(ratio, other, error, expected):
+    rte, found = without_error((1.3, 2.0), ratio, other, error)
+    assert found == pytest.approx(expected)
+    assert rte == pytest.approx(((1.69 - error**2) ** 0.5, 2.0))
+    assert without_error((0.1, 0.2), (1.0, 1.0), 0.2, 0.3)[0] == (0.0, 0.2)
