@@ -34,6 +34,8 @@ class Known(NamedTuple):
         Trial numbers of the bank's members, if there is a bank, driven or not.
     expected : dict
         By way to adapt, see `ErrorModel.expected`.
+    n_sets : int
+        Number of parameter sets that were compared.
     """
 
     fixed: int
@@ -41,13 +43,15 @@ class Known(NamedTuple):
     way: str | None
     members: list[int]
     expected: Mapping[str, Mapping[str, float]]
+    n_sets: int = 0
 
     @classmethod
     def of(cls, study: OfflineStudy, model: ErrorModel) -> Self:
         """What is known with a model of the study."""
         mechanism = driven(study, model).mechanism
         way = None if mechanism is None else BANK if mechanism == "bank" else ONE_SET
-        return cls(model.fixed, model.sets[model.fixed], way, model.bank, model.expected)
+        of_model = model.bank, model.expected, len(model.sets)
+        return cls(model.fixed, model.sets[model.fixed], way, *of_model)
 
 
 class Lesson(NamedTuple):
@@ -141,7 +145,14 @@ def runs_in_words(before: Collection[tuple[str, str]], after: Collection[tuple[s
 
 def changes(before: Known | None, after: Known) -> list[str]:
     """What is another one than before, a sentence each: fixed set, what is driven, its gain."""
-    return [_fixed_set(before, after), _what_is_driven(before, after), *_gains(before, after)]
+    said = [_fixed_set(before, after), _what_is_driven(before, after), *_gains(before, after)]
+    if before is not None and after.n_sets < before.n_sets:
+        # As `offline.hours` does: it counts the trials on the drive.
+        said.append(
+            f"{after.n_sets} parameter sets were compared, and {before.n_sets} before: the search "
+            f"ended earlier, by a budget that counts the new trials, too; raise it (offline)"
+        )
+    return said
 
 
 def _fixed_set(before: Known | None, after: Known) -> str:
@@ -200,7 +211,11 @@ def _gains(before: Known | None, after: Known) -> list[str]:
     if before is None:
         return [f"Expected: {now}."]
     was = _gain(before)
-    return [f"Expected: still {now}."] if was == now else [f"Expected: was {was}.", f"Now: {now}."]
+    return (
+        [f"Expected: still {now}."]
+        if was == now
+        else [f"Expected before: {was}.", f"Expected now: {now}."]
+    )
 
 
 def _gain(known: Known) -> str:
@@ -212,5 +227,5 @@ def _gain(known: Known) -> str:
     words = expected_in_words(expected[best])
     if known.way is not None:
         return words
-    name = "a bank" if best == BANK else best
+    name = "a bank" if best == BANK else "one set at a time"
     return f"no gain, the fixed set is driven (the best alternative is {name}: {words})"

@@ -50,7 +50,7 @@ def test_all_has_changed():
     assert (
         "no gain, the fixed set is driven (the best alternative is a bank: expected gain 1 %" in was
     )
-    assert now.startswith("Now: expected gain 20 %")
+    assert now.startswith("Expected now: expected gain 20 %")
 
 
 def test_other_members():
@@ -59,6 +59,13 @@ def test_other_members():
         "Driven: was the bank of trials 0, 1, 2, is the bank of trials 0, 2, 5; new: 5; no longer "
         "a member: 1."
     )
+
+
+def test_fewer_sets_than_before_are_told_of():
+    before = known(3, BANK, [3, 1], bank=0.8)._replace(n_sets=24)
+    *_, last = changes(before, before._replace(n_sets=16))
+    assert last.startswith("16 parameter sets were compared, and 24 before: ")
+    assert len(changes(before, before._replace(n_sets=32))) == 3
 
 
 def test_what_is_new_without_a_model_before():
@@ -98,7 +105,7 @@ def test_a_new_bag_is_learned_and_only_what_is_missing_runs(trained):
     done = commands.call("learn", "small.yaml", "my drive.bag")
     assert done.exit_code == 0, done.stderr
     assert "my_drive becomes a training sequence: points /points, reference /truth." in done.stdout
-    for said in ("Fixed set: ", "Driven: ", "Expected: ", "Run: ", "10 trials and ", "Next: "):
+    for said in ("Fixed set: ", "Driven: ", "Expected", "Run: ", "10 trials and ", "Next: "):
         assert said in done.stdout
     assert (trained / "small.yaml").read_text() == study
     # No set is proposed, and no trial on another sequence is run again.
