@@ -90,10 +90,9 @@ def learn(
         It says why nothing was learned.
     """
     before = _known_before(study)
-    stored = stored_runs(study.folder)
-    learned = LearnedDrives.read(study.folder)
-    # Only one process may write the file.
+    # From here on, no other process writes to the folder.
     study.open()
+    stored, learned = stored_runs(study.folder), LearnedDrives.read(study.folder)
     if drive.begun:
         earlier = learned.without(drive.name)
     else:
@@ -104,13 +103,13 @@ def learn(
         if drive.name not in with_drive.config.training:
             raise LearnError("-o training=...: names all training sequences; leave it out")
         training = train(with_drive, progress)
-        after = Known.of(with_drive, training.model)
     except (AdaptuneError, OSError) as error:
         earlier.write()
         raise LearnError(
             f"{error}\nNothing was learned from {drive.name}, and the study is as it was; finished "
             f"trials are kept"
         ) from error
+    after = Known.of(with_drive, training.model)
     words = [*changes(before, after), runs_in_words(stored, stored_runs(study.folder))]
     return Lesson(with_drive, training, words)
 
