@@ -28,6 +28,7 @@ SLOW = [
     "adaptune/odometry/test_protocol.py",
     "adaptune/test_survey.py",
     "adaptune/test_inspect.py",
+    "offline/test_learn.py",
     "offline/test_resume.py",
     "adaptune/odometry/test_command.py",
     "offline/test_objective.py",

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from adaptune import yaml
 from adaptune.errors import AdaptuneError
@@ -16,6 +16,7 @@ from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
+from adaptune.study.learned import Added, LearnedDrives
 from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
 from adaptune.study.overlaps import overlaps
 from adaptune.study.roles import settle_roles
@@ -39,7 +40,7 @@ def read_study(
     folder: Path | None = None,
     runs: Path = Path("runs"),
 ) -> Study[C]:
-    """Read and check the YAML of a study.
+    """Read and check the YAML of a study, with the drives that it has learned from.
 
     Parameters
     ----------
@@ -62,15 +63,38 @@ def read_study(
     # A wrong variable is no mistake of the study.
     cache.folder()
     cache.cap()
-    document = _read(path)
+    document, folder = _read(path), folder or runs / path.stem
     data: Any = document.data
+    # Before the overrides: they have the last word on these drives, too.
+    added = LearnedDrives.read(folder).merge(data, path)
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, path.parent.resolve())
     if mistakes or config is None:
-        mistakes.sort(key=lambda mistake: document.line(mistake.key) or 0)
-        lines = [_say(mistake, path, document, overridden) for mistake in mistakes]
+        lines = _lines(mistakes, _Sources(path, document, added), overridden)
         raise ConfigurationError("\n".join(dict.fromkeys(lines)))
-    return Study(config, folder or runs / path.stem)
+    return Study(config, folder)
+
+
+class _Sources(NamedTuple):
+    """The files of a study's data."""
+
+    path: Path
+    document: yaml.Document
+    added: Added
+
+    def find(self, key: Key) -> tuple[bool, int, Key]:
+        """Whether a key stands in the file of what was learned, its line (0: none), and its key."""
+        learned, own = self.added.place(key)
+        line = self.added.learned.line(own) if learned else self.document.line(own)
+        return learned, line or 0, own
+
+
+def _lines(
+    mistakes: Iterable[Mistake], sources: _Sources, overridden: Sequence[Key]
+) -> Iterable[str]:
+    """A line for every mistake, in the order of the files."""
+    for mistake in sorted(mistakes, key=lambda mistake: sources.find(mistake.key)[:2]):
+        yield _say(mistake, sources, overridden)
 
 
 def _read(path: Path) -> yaml.Document:
@@ -108,13 +132,14 @@ def _override(data: dict[str, Any], text: str) -> Key:
     return path
 
 
-def _say(mistake: Mistake, path: Path, document: yaml.Document, overridden: Sequence[Key]) -> str:
+def _say(mistake: Mistake, sources: _Sources, overridden: Sequence[Key]) -> str:
     key = mistake.key
     # The mistake of a whole section may be the mistake of a value in it.
     if any(key[: len(o)] == o[: len(key)] for o in overridden):
         where = "-o"
     else:
-        line = document.line(key)
+        learned, line, key = sources.find(key)
+        path = sources.added.learned.path if learned else sources.path
         where = f"{path}, line {line}" if line else str(path)
     dotted = ".".join(map(str, key))
     return f"{where}: {dotted + ': ' if dotted else ''}{mistake.message}"

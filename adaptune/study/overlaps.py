@@ -33,7 +33,18 @@ def _overlap(config: StudyConfig, one: str, other: str) -> bool:
     if one in config.courses and other in config.courses:
         return config.courses[one] == config.courses[other]
     a, b = config.sequences.get(one), config.sequences.get(other)
-    return a is not None and b is not None and _same_files(a, b) and _same_time(a, b)
+    return a is not None and b is not None and share_scans(a, b)
+
+
+def share_scans(a: SequenceConfig, b: SequenceConfig) -> bool:
+    """Whether two sequences hold the same scans, by the content of their files.
+
+    Raises
+    ------
+    SequenceError
+        If one of them cannot be opened.
+    """
+    return _same_files(a, b) and _same_time(a, b)
 
 
 def _same_files(a: SequenceConfig, b: SequenceConfig) -> bool:

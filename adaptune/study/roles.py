@@ -61,6 +61,17 @@ def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Mistake]]:
     return origins, mistakes
 
 
+def role_name(entry: Any) -> str | None:
+    """Name of the sequence that an entry of `training` or `test` becomes; None if it is none."""
+    if isinstance(entry, str):
+        return entry
+    try:
+        ((name, part),) = entry.items()
+        return part_name(str(name), read_part(part))
+    except (AttributeError, ValueError):
+        return None
+
+
 def _entries(data: dict[str, Any]) -> Iterator[tuple[str, Key, Any]]:
     for role in ROLES:
         if isinstance(data.get(role), list):

@@ -89,11 +89,19 @@ class StudySequences:
 
     def key(self, name: str) -> str:
         """The key under which the user finds a sequence: a part has none of its own."""
-        part = self.config(origin(name)).part
-        whole = origin(name) if part is None else origin(name).removesuffix(part_name("", part))
-        if part is None or whole == origin(name):
+        entry = self.entry(origin(name))
+        if isinstance(entry, str):
             return f"sequences.{name}"
-        return f"training: [{whole}: {100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%]"
+        ((whole, part),) = entry.items()
+        return f"training: [{whole}: {part}]"
+
+    def entry(self, name: str) -> str | dict[str, str]:
+        """How `training` or `test` names a sequence: ``{hall: 0-60%}`` for a part."""
+        part = self.config(name).part
+        whole = name if part is None else name.removesuffix(part_name("", part))
+        if part is None or whole == name:
+            return name
+        return {whole: f"{100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%"}
 
     def recorded_in(self, name: str) -> str:
         """What a sequence was recorded in: parts of a recording, and views, share it."""
