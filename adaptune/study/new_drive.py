@@ -9,7 +9,7 @@ from adaptune import yaml
 from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
 from adaptune.inspect import inspect
-from adaptune.sequence.config import REFERENCE_FILES, SequenceConfig
+from adaptune.sequence.config import ESTIMATED, REFERENCE_FILES, SequenceConfig
 from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.opening import sequence_files
 from adaptune.space import nearest
@@ -20,8 +20,6 @@ from adaptune.study.overlaps import share_scans
 from adaptune.study.roles import role_name
 from adaptune.study.study import Study
 
-ESTIMATED = "estimated"
-"""In the place of a reference: it is computed from the recording itself."""
 _KINDS = ("bag", "kitti", "folder")
 _OF_DRIVE = {*_KINDS, "evalio", "start", "stop", "part", "views"}
 """Keys that tell one drive of a robot from another."""
