@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from adaptune import terminal, tools
+from adaptune import terminal
 from adaptune.archive import Archive
 from adaptune.cli import app
+from adaptune.reference.proposal import proposed_sub_trajectory
 from adaptune.trajectory import Trajectory
 from offline.offline_study import load_study
 
@@ -89,7 +90,7 @@ def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
     stamps = np.arange(101) * 10**9
     T = np.tile(np.eye(4), (101, 1, 1))
     T[:, 0, 3] = np.concatenate([np.linspace(0, 5e3, 61), 5e3 + np.linspace(0, tested, 41)[1:]])
-    assert tools.proposed_sub_trajectory(Trajectory(stamps, T)) == length
+    assert proposed_sub_trajectory(Trajectory(stamps, T)) == length
 
 
 def test_inspect_says_what_to_do_without_a_reference(tmp_path):
