@@ -54,7 +54,7 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     assert (tmp_path / "refs/one_reference.json").exists()
 
 
-def test_a_recording_without_reference_is_not_compared(adaptune, tmp_path, bag):
+def test_a_recording_without_reference_is_not_compared(adaptune, tmp_path):
     folder = tmp_path / "scans"
     folder.mkdir()
     for i, (_, points, _) in enumerate(drives.scans(0, 40)):
