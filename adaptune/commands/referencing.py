@@ -238,4 +238,22 @@ def _without_reference(study: "OfflineStudy") -> list[str]:
 
 def _check(study: "OfflineStudy") -> None:
     """Compare given references with estimated ones by the study's trials."""
-    console.print(study.name)
+    from adaptune import report
+    from adaptune.study.inputs import warn_of_stale
+    from offline.check_reference import check_reference
+
+    study.open()
+    warn_of_stale(study)
+    with progress() as show:
+        rows = check_reference(study, show)
+    report.write_rows(study.folder, "reference_check", rows)
+    console.print(
+        report.table(
+            f"Estimated beside given references, over {study.config.sub_trajectory:g} m",
+            rows,
+            "Errors of the estimate by the given reference and by its own halves; of the given one "
+            "by registrations of scans. Rank correlation of the sets' mean errors by both. Errors "
+            "by the given reference: of the set that the estimate picks, and of the best.",
+        )
+    )
+    say(f"Table: {study.folder / 'reference_check'}.*, estimates: {study.folder / 'references'}/")
