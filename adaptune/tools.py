@@ -69,8 +69,8 @@ def _measured(found: "Inspection", show: Show) -> "tuple[MeasuredReference | Non
         return None, f"its error cannot be measured: {error}"
     length = proposed_sub_trajectory(reference, measured)
     usual = proposed_sub_trajectory(reference)
-    words = [accuracy_words(measured, of) for of in dict.fromkeys((usual, length))]
-    return measured, "; ".join(filter(None, [*words, advice(measured, reference)]))
+    words = accuracy_words(measured, usual, length), advice(measured, reference)
+    return measured, "; ".join(filter(None, words))
 
 
 def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> None:
@@ -79,11 +79,11 @@ def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> N
 
     if not (name := found.name):
         return
-    if found.reference is None or found.missing.get("offline"):
-        say(
-            "Next: mend what is lacking, see docs/your-bag.md; a recording without a reference can "
-            "only be a `test` sequence, or be replayed with `adaptune online --untrained`"
-        )
+    if found.missing["online"] or (found.reference is not None and found.missing["offline"]):
+        say("Next: mend what is lacking, see docs/your-bag.md")
+        return
+    if found.reference is None:
+        say_next("estimate a reference from its scans", "reference", found.path)
         return
     share, length = f"{100 * TRAINING:.0f}", proposed_sub_trajectory(found.reference, measured)
     say(

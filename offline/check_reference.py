@@ -46,7 +46,7 @@ class Judged(NamedTuple):
     estimated: NDArray[np.float64]
 
 
-class Choice(NamedTuple):
+class SetChoice(NamedTuple):
     """What the trials' errors by two references have in common."""
 
     rank: float  # Spearman's correlation; NaN with few sets, or sets that are all alike
@@ -99,16 +99,16 @@ def judge_by_both(
     return Judged(*np.array(found).reshape(len(found), 2, -1).mean(axis=2).T)
 
 
-def choose(judged: Judged) -> Choice:
+def choose(judged: Judged) -> SetChoice:
     """Compare what two references choose.
 
     Of sets that are equally good, the first one counts.
     """
     given, estimated = judged
     if not len(given) or not np.isfinite(given).all():
-        return Choice(np.nan, np.nan, np.nan)
+        return SetChoice(np.nan, np.nan, np.nan)
     picked = float(given[np.argmin(estimated)])
-    return Choice(rank_correlation(given, estimated), picked, float(given.min()))
+    return SetChoice(rank_correlation(given, estimated), picked, float(given.min()))
 
 
 def rank_correlation(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:

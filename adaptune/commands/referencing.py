@@ -17,7 +17,7 @@ from adaptune.terminal import Show, console, progress, say
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from adaptune.reference.recording import Comparison
+    from adaptune.reference.of_recording import Comparison
     from adaptune.reference.stored import StoredEstimate
     from adaptune.sequence.config import SequenceConfig
     from offline.offline_study import OfflineStudy
@@ -25,53 +25,67 @@ if TYPE_CHECKING:
 _STUDIES = (".yaml", ".yml")
 
 
+Target = Annotated[
+    Path,
+    typer.Argument(metavar="TARGET", help="A recording, or a study's YAML.", show_default=False),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--folder",
+        "--out",
+        help="Where to write; of a study, its folder.",
+        show_default="here; of a study, the YAML's name, under runs/",
+        file_okay=False,
+    ),
+]
+Points = Annotated[
+    str | None,
+    typer.Option(metavar="TOPIC", help="Topic of the scans.", show_default="as `inspect` proposes"),
+]
+Given = Annotated[
+    str | None,
+    typer.Option(
+        "--reference",
+        metavar="TOPIC|FILE",
+        help="A given reference to compare with.",
+        show_default="as `inspect` proposes",
+    ),
+]
+Priors = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC|FILE",
+        help="Positions to join that are right over long distances, as those of a GPS.",
+        show_default="none",
+    ),
+]
+Length = Annotated[
+    float | None,
+    typer.Option(
+        metavar="METRES",
+        help="Length of the sub-trajectories over which errors are told.",
+        min=0.01,
+        show_default="25, or what fits",
+    ),
+]
+Check = Annotated[
+    bool,
+    typer.Option(
+        "--check", help="Compare a study's given references with estimated ones, by its trials."
+    ),
+]
+
+
 def reference(
-    target: Annotated[
-        Path,
-        typer.Argument(
-            metavar="TARGET", help="A recording, or a study's YAML.", show_default=False
-        ),
-    ],
+    target: Target,
     override: Override = [],  # noqa: B006
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--folder",
-            "--out",
-            help="Where to write; the study's folder.",
-            show_default="here; of a study, the YAML's name, under runs/",
-            file_okay=False,
-        ),
-    ] = None,
-    points: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="Topic of the scans, if there are several.")
-    ] = None,
-    given: Annotated[
-        str | None,
-        typer.Option(
-            "--reference",
-            metavar="TOPIC|FILE",
-            help="A given reference to compare with.",
-            show_default="the one that `inspect` finds",
-        ),
-    ] = None,
-    priors: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC|FILE",
-            help="Positions that are right over long distances, as a GPS's: join them.",
-        ),
-    ] = None,
-    length: Annotated[
-        float | None,
-        typer.Option(
-            help="Metres over which to tell its error.", min=0.01, show_default="25, or what fits"
-        ),
-    ] = None,
-    check: Annotated[
-        bool,
-        typer.Option("--check", help="Compare with the study's given references and trials."),
-    ] = False,
+    folder: Out = None,
+    points: Points = None,
+    given: Given = None,
+    priors: Priors = None,
+    length: Length = None,
+    check: Check = False,
 ) -> None:
     """Estimate the reference of a recording from its scans, without ground truth.
 
@@ -128,16 +142,16 @@ def _of_recording(
 ) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.inspect import inspect
-    from adaptune.reference import estimate, recording
+    from adaptune.reference import estimate, of_recording
     from adaptune.reference.proposal import proposed_sub_trajectory
     from adaptune.reference.stored import write_estimate
     from adaptune.sequence.opening import open_sequence
 
     points, given, priors = topics
-    config = recording.recording_config(inspect(target), points, given)
+    config = of_recording.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
-    joined = None if priors is None else recording.read_priors(config, priors)
-    path = out / f"{recording.estimated_name(target)}.tum"
+    joined = None if priors is None else of_recording.read_priors(config, priors)
+    path = out / f"{of_recording.estimated_name(target)}.tum"
     with progress() as show:
         found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
         about = {"recording": str(target.resolve()), "points": config.points, "priors": priors}
@@ -146,8 +160,8 @@ def _of_recording(
         there, why = scans.reference(), ""
         if there is not None:
             advance = _advance(show, "given reference")
-            comparison = recording.beside_given(scans, there, found, metres, advance)
-    _say_estimate(stored, recording.unknown_spans(found), metres)
+            comparison = of_recording.beside_given(scans, there, found, metres, advance)
+    _say_estimate(stored, of_recording.unknown_spans(found), metres)
     if there is not None:
         _say_comparison(comparison, config, metres)
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")

@@ -69,26 +69,28 @@ def is_noisy(error: OwnError | None) -> bool:
     return error is not None and error.low > NOISY
 
 
-def accuracy_words(measured: MeasuredReference, length: float) -> str:
+def accuracy_words(measured: MeasuredReference, *lengths: float) -> str:
     """How wrong a reference is over some metres, in words."""
+    told = [_error_words(measured, length) for length in dict.fromkeys(lengths)]
+    if not (known := [words for words in told if words]):
+        return f"its error over {lengths[0]:g} m cannot be measured: too few scans agree"
+    return f"wrong by {', '.join(known)}, as registrations of scans tell"
+
+
+def _error_words(measured: MeasuredReference, length: float) -> str:
     error = measured.error(length)
     if error is None:
-        return f"its error over {length:g} m cannot be measured: too few scans could be registered"
+        return ""
     most = "at most " if length < HOPS[0] else ""
-    return (
-        f"wrong by {most}{error.mean:.2g} % ({error.low:.2g}-{error.high:.2g}) over {length:g} m, "
-        f"as registrations of scans tell"
-    )
+    return f"{most}{error.mean:.2g} % ({error.low:.2g}-{error.high:.2g}) over {length:g} m"
 
 
 def advice(measured: MeasuredReference, reference: Trajectory) -> str:
     """What to do about a reference that is too noisy for the usual length; empty if it is not."""
-    usual = proposed_sub_trajectory(reference)
-    if not is_noisy(measured.error(usual)):
+    if not is_noisy(measured.error(proposed_sub_trajectory(reference))):
         return ""
     length = proposed_sub_trajectory(reference, measured)
     less = "sets that differ by less cannot be told apart"
-    if not is_noisy(measured.error(length)):
-        return f"{less}: use a sub_trajectory of {length:g} m, or `reference: estimated`"
-    why = "a longer sub_trajectory does not help enough here"
-    return f"{less}: use `reference: estimated`; {why}"
+    if is_noisy(measured.error(length)):
+        return f"{less}, at no length that fits: use `reference: estimated`"
+    return f"{less}: use a sub_trajectory of {length:g} m, or `reference: estimated`"

@@ -30,10 +30,10 @@ class Measured:
     [
         (600.0, 0.01, 25.0, ""),
         (600.0, 0.2, 50.0, "use a sub_trajectory of 50 m, or `reference: estimated`"),
-        (600.0, 1.0, 25.0, "use `reference: estimated`; a longer sub_trajectory does not help"),
+        (600.0, 1.0, 25.0, "at no length that fits: use `reference: estimated`"),
         (60.0, 0.02, 5.0, ""),
         (60.0, 0.05, 10.0, "use a sub_trajectory of 10 m"),
-        (60.0, 0.2, 10.0, "does not help"),
+        (60.0, 0.2, 10.0, "at no length that fits"),
         (4.0, 0.2, 2.0, ""),
     ],
 )
@@ -62,4 +62,7 @@ def test_the_error_in_words():
         "wrong by 1 % (0.8-1.2) over 25 m, as registrations of scans tell"
     )
     assert "wrong by at most 5 % (4-6.2) over 5 m" in accuracy_words(measured, 5.0)
+    assert "1 % (0.8-1.2) over 25 m, 0.5 % (0.4-0.62) over 50 m" in accuracy_words(
+        measured, 25.0, 50.0, 25.0, 100.0
+    )
     assert "cannot be measured" in accuracy_words(measured, 100.0)

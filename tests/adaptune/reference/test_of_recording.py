@@ -5,7 +5,7 @@ from rooms import moved
 
 from adaptune.inspect import inspect
 from adaptune.reference.estimated import EstimateError
-from adaptune.reference.recording import estimated_name, recording_config, unknown_spans
+from adaptune.reference.of_recording import estimated_name, recording_config, unknown_spans
 
 
 def straight(n):
