@@ -113,7 +113,9 @@ def _prepare(scan: Scan, T_previous_current: Poses, seconds: float) -> Any:
     return (cloud, tree) if cloud.size() >= _FEWEST else None
 
 
-def register(start: HopCloud, end: HopCloud, guesses: Iterable[Poses]) -> Hop | None:
+def register(
+    start: HopCloud, end: HopCloud, guesses: Iterable[Poses], min_inliers: float = MIN_INLIERS
+) -> Hop | None:
     """Register two scans; the first guess that leads to a sound registration wins.
 
     Parameters
@@ -122,6 +124,8 @@ def register(start: HopCloud, end: HopCloud, guesses: Iterable[Poses]) -> Hop | 
         The scans.
     guesses
         Of ``T_start_end``, each of shape (4, 4).
+    min_inliers
+        Least share of points near a point of the other scan.
 
     Returns
     -------
@@ -134,7 +138,7 @@ def register(start: HopCloud, end: HopCloud, guesses: Iterable[Poses]) -> Hop | 
     for guess in guesses:
         result = _align(target, source, tree, guess)
         T = rectify(result.T_target_source)
-        if np.isfinite(T).all() and result.num_inliers >= MIN_INLIERS * source.size():
+        if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
             return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)
     return None
 

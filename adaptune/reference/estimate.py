@@ -1,19 +1,50 @@
-"""Estimate a reference from a recording alone."""
+"""Estimate a reference from a recording alone.
 
-from collections.abc import Callable
+Several odometries run side by side; their consensus gives the motion from scan to scan. Scans are
+also registered directly to scans some metres before. A pose graph brings both to agree.
+"""
 
-from adaptune.reference.estimated import EstimatedReference
-from adaptune.sequence.sequence import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert, mean_motion, rectify, steps
+from adaptune.metrics import travelled
+from adaptune.reference.consensus import HALVES
+from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
+from adaptune.reference.graph import Edge, optimised, positions
+from adaptune.reference.registering import LENGTHS, Guess, Pass, pass_over
+from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.trajectory import Trajectory
+
+VERSION = 1
+"""Counts changes after which the same recording has another estimate."""
+SHORTEST = 10.0
+"""Metres. On a shorter path, nothing is known about any odometry."""
+FEWEST = 2
+"""Registrations that must span a motion, so that it can be trusted."""
+MOST_UNKNOWN = 0.5
+"""Share of the path on which a reference may be unknown."""
+_AGREES = (0.1, 0.02)
+"""A registration agrees with the graph within so many metres and this share of its length."""
+_LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]
+"""Metres from which on scans may have too little in common."""
+_NEAR = 0.1
+"""Metres within which a member's motion from scan to scan counts for a half of the reference."""
 
 Advance = Callable[[int, int], None]
 """Called with how many scans are done, and about how many there are."""
 
 
 def estimate_reference(
-    scans: Sequence, advance: Advance = lambda *_: None, priors: Trajectory | None = None
+    scans: Recording, advance: Advance = lambda *_: None, priors: Trajectory | None = None
 ) -> EstimatedReference:
     """Estimate the reference of a recording.
+
+    Neither a reference nor the trials of a study are used: what judges an odometry is made by a
+    pool of others. Only the scans of the last metres are kept in memory.
 
     Parameters
     ----------
@@ -29,4 +60,167 @@ def estimate_reference(
     EstimateError
         If the recording does not allow it: the robot hardly moves, or nothing can be registered.
     """
-    raise NotImplementedError
+    done, n = 0, scans.n_messages
+
+    def one() -> None:
+        nonlocal done
+        done += 1
+        advance(done, max(n, done))
+
+    return estimated(scans.name, pass_over(scans, one), priors)
+
+
+def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> EstimatedReference:
+    """The reference that follows from a pass over a recording; `name` is for messages.
+
+    Raises
+    ------
+    EstimateError
+        See `estimate_reference`.
+    """
+    metres = float(travelled(found.T_odom_sensor)[-1]) if len(found.stamps) else 0.0
+    reach = _reach(found.T_odom_sensor)
+    if reach < SHORTEST:
+        raise EstimateError(
+            f"{name}: the robot comes {reach:.1f} m far, and a reference needs {SHORTEST:g} m: "
+            f"record a longer drive"
+        )
+    revised = _revised(found)
+    T = optimised(revised.T_odom_sensor, revised.edges)
+    if priors is not None:
+        T = optimised(T, revised.edges, positions(priors, found.stamps, T))
+    registrations = _judged(found.guesses, revised.edges, T)
+    reference = EstimatedReference(
+        found.stamps, T, _trusted(T, registrations), _halves(found, revised), registrations
+    )
+    if (share := reference.unknown_share()) > MOST_UNKNOWN:
+        raise EstimateError(
+            f"{name}: on {100 * share:.0f} % of its {metres:.0f} m, scans cannot be registered to "
+            f"scans some metres before, so no reference can be estimated: the scene may be too "
+            f"bare (open water, a long corridor), or too much may move in it"
+        )
+    return reference
+
+
+class _Revised(NamedTuple):
+    """What goes into the pose graph."""
+
+    T_odom_sensor: Poses  # (n, 4, 4)
+    edges: list[Edge]
+
+
+def _reach(T_odom_sensor: Poses) -> float:
+    """Metres from the first pose to the one farthest from it."""
+    if not len(T_odom_sensor):
+        return 0.0
+    away = T_odom_sensor[:, :3, 3] - T_odom_sensor[0, :3, 3]
+    return float(np.linalg.norm(away, axis=1).max())
+
+
+def _revised(found: Pass) -> _Revised:
+    """Replace the consensus by a member where registrations confirm that one, and not the other."""
+    edges = _edges(found.guesses, -1)
+    motions = steps(found.T_odom_sensor)
+    weak = _support(len(found.stamps), edges) < FEWEST
+    of_members = [_edges(found.guesses, m) for m in range(found.T_previous_current.shape[1])]
+    for first, stop in _runs(weak):
+        near = [[e for e in of if e.start < stop and e.end > first] for of in of_members]
+        best = max(range(len(near)), key=lambda m: len(near[m]))
+        supported = _support(len(found.stamps), near[best])[first:stop]
+        theirs = found.T_previous_current[first + 1 : stop + 1, best]
+        if supported.min() < FEWEST or not np.isfinite(theirs).all():
+            continue
+        motions[first:stop] = theirs
+        edges += near[best]
+    return _Revised(_chained(found.T_odom_sensor[0], motions), edges)
+
+
+def _edges(guesses: Iterable[Guess], member: int) -> list[Edge]:
+    """Registrations that began at the motion of a member; of the consensus for -1."""
+    return [
+        Edge(guess.start, guess.end, guess.hop)
+        for guess in guesses
+        if guess.member == member and guess.hop is not None
+    ]
+
+
+def _support(n: int, edges: Sequence[Edge]) -> NDArray[np.intp]:
+    """How many registrations span the motion from each of n scans to the next."""
+    start, end = (np.array([edge[i] for edge in edges], np.intp) for i in (0, 1))
+    return _spanning(n, start, end)
+
+
+def _spanning(n: int, start: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.intp]:
+    """How many of the spans from `start` to `end` hold each of n - 1 motions."""
+    changes = np.zeros(n, np.intp)
+    np.add.at(changes, start, 1)
+    np.add.at(changes, end, -1)
+    return np.asarray(np.cumsum(changes)[:-1])
+
+
+def _runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """First number, and number after the last one, of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+def _chained(first: Poses, motions: Poses) -> Poses:
+    """Poses of shape (n, 4, 4) from the first one and n - 1 motions."""
+    poses = [first]
+    for T in motions:
+        poses.append(rectify(poses[-1] @ T))
+    return np.array(poses)
+
+
+def _judged(guesses: Sequence[Guess], edges: Sequence[Edge], T: Poses) -> Registrations:
+    """Which registrations the graph agrees with; one that failed is rejected, too."""
+    by_pair = {(edge.start, edge.end): edge.hop for edge in edges}
+    pairs = list(dict.fromkeys((guess.start, guess.end) for guess in guesses))
+    residual, accepted = np.full(len(pairs), np.nan), np.zeros(len(pairs), bool)
+    for i, pair in enumerate(pairs):
+        if (hop := by_pair.get(pair)) is None:
+            continue
+        start, end = pair
+        way = (invert(T[start]) @ T[end])[:3, 3]
+        residual[i] = np.linalg.norm(hop.projection @ (hop.T_start_end[:3, 3] - way))
+        metres, share = _AGREES
+        accepted[i] = residual[i] <= metres + share * np.linalg.norm(way)
+    starts, ends = np.array(pairs, np.intp).reshape(-1, 2).T
+    return Registrations(starts, ends, accepted, residual)
+
+
+def _trusted(T_world_sensor: Poses, found: Registrations) -> NDArray[np.bool_]:
+    """Which motions from scan to scan can be trusted, of shape (n - 1,).
+
+    Enough registrations must confirm a motion, and no more speak against it: those that differ, and
+    those over short ways that fail. Over the longest way, scans may have too little in common.
+    """
+    n = len(T_world_sensor)
+    way = (invert(T_world_sensor[found.start]) @ T_world_sensor[found.end])[:, :3, 3]
+    short = np.linalg.norm(way, axis=1) < _LITTLE_IN_COMMON
+    against = ~found.accepted & (short | np.isfinite(found.residual))
+    confirmed, doubted = (
+        _spanning(n, found.start[which], found.end[which]) for which in (found.accepted, against)
+    )
+    return (confirmed >= FEWEST) & ((doubted < FEWEST) | (confirmed >= doubted))
+
+
+def _halves(found: Pass, revised: _Revised) -> Poses:
+    """The reference twice, each from half of the pool and half of the scans: (2, n, 4, 4)."""
+    ends = {end: i % 2 for i, end in enumerate(sorted({edge.end for edge in revised.edges}))}
+    halves = []
+    for half, members in enumerate(HALVES):
+        T = _chained(revised.T_odom_sensor[0], _steps_of(found, revised, members))
+        halves.append(optimised(T, [edge for edge in revised.edges if ends[edge.end] == half]))
+    return np.array(halves)
+
+
+def _steps_of(found: Pass, revised: _Revised, members: Sequence[int]) -> Poses:
+    """Mean motions of some members, those left out that are far from the whole's."""
+    whole = steps(revised.T_odom_sensor)[:, None]
+    theirs = found.T_previous_current[1:, list(members)]
+    apart = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)
+    near = apart <= _NEAR + 0.05 * np.linalg.norm(whole[..., :3, 3], axis=-1)
+    near |= ~near.any(axis=1, keepdims=True)
+    theirs = np.where((near & np.isfinite(apart))[..., None, None], theirs, whole)
+    return mean_motion(theirs, near.astype(np.float64))

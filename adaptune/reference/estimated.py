@@ -77,6 +77,16 @@ class EstimatedReference:
             known[i + 1 : max(int(end), i + 2)] = False
         return known
 
+    def gaps(self) -> list[tuple[float, float]]:
+        """Seconds since the first scan from which to which the reference is unknown."""
+        seconds = (self.stamps - self.stamps[0]) * 1e-9
+        edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
+        last = len(seconds) - 1
+        return [
+            (float(seconds[max(first - 1, 0)]), float(seconds[min(stop, last)]))
+            for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        ]
+
     def trajectory(self) -> Trajectory:
         """The poses that are known."""
         known = self.known

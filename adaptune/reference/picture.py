@@ -1,12 +1,76 @@
 """Picture of an estimated reference."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from adaptune.drawing import log_scale, picture
 from adaptune.reference.estimated import EstimatedReference
 from adaptune.reference.stored import StoredEstimate
+
+_KNOWN, _UNKNOWN = "#0072b2", "#d55e00"
+_LENGTHS = (25.0, 10.0, 5.0)
+"""Metres over which the title tells the error; the first that is known."""
 
 
 def draw_estimate(
     path: Path, title: str, found: EstimatedReference, stored: StoredEstimate
 ) -> None:
-    """Draw the path, its residuals, and where it is not to be trusted."""
+    """Draw the path, the residuals of the registrations, and where it is not to be trusted.
+
+    Parameters
+    ----------
+    path
+        PNG or SVG.
+    title
+        First line.
+    found, stored
+        The reference, and what is known about it.
+    """
+    with picture((path,), 11.0, 4.6) as figure:
+        of_path, of_residuals = figure.subplots(1, 2, width_ratios=(1.0, 1.4))
+        figure.suptitle(f"{title}: {_in_words(stored)}", x=0.01, ha="left")
+        _draw_path(of_path, found)
+        _draw_residuals(of_residuals, found)
+
+
+def _in_words(stored: StoredEstimate) -> str:
+    length = next((m for m in _LENGTHS if m in stored.errors), None)
+    error = "" if length is None else f", wrong by {stored.error(length):.2f} % over {length:g} m"
+    share = 100.0 * stored.unknown_share
+    unknown = f", unknown on {max(share, 0.1):.1f} %" if share else ""
+    return f"{stored.metres:.0f} m{error}{unknown}"
+
+
+def _draw_path(axes: Any, found: EstimatedReference) -> None:
+    x, y = found.T_world_sensor[:, :2, 3].T
+    known = found.known
+    axes.plot(x, y, color=_UNKNOWN, lw=1.0, ls=":")
+    axes.plot(*(np.where(known, a, np.nan) for a in (x, y)), color=_KNOWN, lw=1.8)
+    axes.plot(x[:1], y[:1], "o", color="black", ms=5)
+    axes.annotate("start", (x[0], y[0]), textcoords="offset points", xytext=(5, 5))
+    axes.set_aspect("equal", "datalim")
+    axes.set(title="path", xlabel="x [m]", ylabel="y [m]")
+
+
+def _draw_residuals(axes: Any, found: EstimatedReference) -> None:
+    seconds = (found.stamps - found.stamps[0]) * 1e-9
+    of = found.registrations
+    at, differs = seconds[of.end], 100.0 * of.residual
+    failed = np.isnan(differs)
+    top = 2.0 * float(np.max(differs[~failed], initial=1.0))
+    for which, label, style in (
+        (of.accepted, "agree", {"marker": ".", "color": _KNOWN, "ms": 3}),
+        (~of.accepted & ~failed, "differ", {"marker": "x", "color": _UNKNOWN, "ms": 5}),
+        (failed, "failed", {"marker": "|", "color": "#999999", "ms": 6}),
+    ):
+        if which.any():
+            y = np.where(failed, top, np.maximum(differs, 0.01))[which]
+            axes.plot(at[which], y, ls="none", label=f"{int(which.sum())} {label}", **style)
+    for first, stop in found.gaps():
+        axes.axvspan(first, stop, color=_UNKNOWN, alpha=0.15, lw=0)
+    log_scale(axes)
+    title = "registrations over 2, 5 and 10 m"
+    axes.set(title=title, xlabel="time [s]", ylabel="differ from the reference by [cm]")
+    axes.legend(loc="upper right", ncols=3)

@@ -1,0 +1,99 @@
+"""The consensus: several odometries side by side, and the motion on which they agree."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from adaptune.geometry import Poses
+from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import Odometry, WarmUp
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.in_process import InProcess
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.tracker import Tracker
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
+from adaptune.space import ParameterSet
+
+POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
+    ("gicp", {"max_correspondence_distance": 2.2, "keyframe_interval": 1.3}),
+    ("gicp", {"max_correspondence_distance": 1.3, "keyframe_interval": 3.1}),
+    ("gicp", {"max_correspondence_distance": 4.5, "keyframe_interval": 5.3}),
+    ("ndt", {"resolution": 1.7, "keyframe_interval": 1.6}),
+    ("ndt", {"resolution": 3.1, "keyframe_interval": 3.3}),
+)
+"""Odometries and their parameters. No study's trials are among them: the reference that judges an
+odometry is not made with it."""
+HALVES = ((0, 1, 2), (3, 4))
+"""Members of either half, which have no algorithm in common."""
+_SETTINGS: Mapping[str, Mapping[str, float]] = {
+    "gicp": {"downsampling": 0.45},
+    "ndt": {"downsampling": 0.45},
+}
+
+
+class _Member(InProcess):
+    """A member of the pool; every scan is prepared once for each kind of odometry."""
+
+    def __init__(self, kinds: Mapping[str, Odometry], kind: str, odometry: Odometry):
+        super().__init__(odometry)
+        self._kinds, self._kind = kinds, kind
+
+    def prepare(self, scan: Scan) -> Any:
+        return {kind: odometry.prepare(scan) for kind, odometry in self._kinds.items()}
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        super().start(prepared[self._kind], T_odom_sensor, T_previous_current)
+
+    def submit(self, prepared: Any) -> None:
+        super().submit(prepared[self._kind])
+
+
+class Consensus:
+    """Runs the pool scan after scan.
+
+    A bank of even weights: members that agree move it by their mean, others are warmed up on the
+    last scans at its pose.
+
+    Attributes
+    ----------
+    n_members : int
+        Size of the pool.
+    """
+
+    n_members = len(POOL)
+
+    def __init__(self) -> None:
+        def adapter(kind: str, parameters: Mapping[str, float]) -> Odometry:
+            cls: Any = odometry_class(kind)
+            made: Odometry = cls(dict(parameters), cls.settings_type(**_SETTINGS[kind]))
+            return made
+
+        kinds = {kind: adapter(kind, {}) for kind, _ in POOL}
+
+        def make(parameters: Mapping[str, Any]) -> _Member:
+            kind, of = POOL[int(parameters["number"])]
+            return _Member(kinds, kind, adapter(kind, of))
+
+        sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
+        self._bank = Bank(make, sets, WarmUp())
+        even = dict.fromkeys(sets, 1.0)
+        self._bank.apply(Selection(trial=0, parameters={}, weights=even))
+        self._tracker = Tracker(self._bank, HealthCheck())
+
+    def register(self, scan: Scan) -> tuple[Poses, Poses]:
+        """Register the next scan.
+
+        Returns
+        -------
+        T_odom_sensor : ndarray of shape (4, 4)
+            Of the consensus.
+        T_previous_current : ndarray of shape (n_members, 4, 4)
+            Motions of the members; NaN where one has none.
+        """
+        found = self._tracker.register(scan)
+        members = self._bank.motions.members
+        return found.T_odom_sensor, np.array([members[i] for i in range(self.n_members)])

@@ -1,0 +1,155 @@
+"""The pose graph: motions from scan to scan, and registrations over metres, made to agree.
+
+Solved by GTSAM (Dellaert and Kaess, *Factor Graphs for Robot Perception*, 2017).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert, rectify
+from adaptune.live.hop import Hop
+from adaptune.trajectory import Trajectory
+
+_OF_A_STEP = (0.01, 0.002)
+"""Metres and radians by which the motion from scan to scan is wrong, about."""
+_OF_A_HOP = (0.02, 0.003)
+"""Metres and radians by which a registration is wrong, about."""
+_UNKNOWN = 10.0
+"""Metres by which a registration is wrong along a direction that it does not tell."""
+_OF_A_PRIOR = 1.0
+"""Metres by which a given position is wrong, about."""
+_PRIORS_EVERY = 1_000_000_000
+"""Nanoseconds from one position that counts to the next: their errors are alike."""
+_FEWEST_PRIORS = 3
+_ITERATIONS = 50
+
+
+class Edge(NamedTuple):
+    """A registration between two scans, by their numbers."""
+
+    start: int
+    end: int
+    hop: Hop
+
+
+def optimised(
+    T_odom_sensor: Poses, edges: Sequence[Edge], places: "Positions | None" = None
+) -> Poses:
+    """The poses on which motions and registrations agree best.
+
+    Registrations have robust weights (Cauchy's): a wrong one hardly counts.
+
+    Parameters
+    ----------
+    T_odom_sensor
+        Poses of shape (n, 4, 4) whose motions from scan to scan count.
+    edges
+        The registrations.
+    places
+        Where scans are by other means, in about the same frame.
+
+    Returns
+    -------
+    ndarray of shape (n, 4, 4)
+        The first is the identity.
+    """
+    import gtsam
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    poses = [gtsam.Pose3(T) for T in T_odom_sensor]
+    step = _sigmas(*_OF_A_STEP)
+    for i, pose in enumerate(poses):
+        values.insert(i, pose)
+    for i in range(len(poses) - 1):
+        graph.add(gtsam.BetweenFactorPose3(i, i + 1, poses[i].between(poses[i + 1]), step))
+    for start, end, hop in edges:
+        motion = gtsam.Pose3(hop.T_start_end)
+        graph.add(gtsam.BetweenFactorPose3(start, end, motion, _robust(_noise(hop))))
+    # Positions say themselves where the first pose is.
+    first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6 if places is None else _UNKNOWN)
+    graph.add(gtsam.PriorFactorPose3(0, poses[0], first))
+    if places is not None:
+        noise = _robust(gtsam.noiseModel.Isotropic.Sigma(3, _OF_A_PRIOR))
+        for number, metres in zip(places.numbers.tolist(), places.metres, strict=True):
+            graph.add(gtsam.GPSFactor(number, metres, noise))
+    options = gtsam.LevenbergMarquardtParams()
+    options.setMaxIterations(_ITERATIONS)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
+    T = np.array([found.atPose3(i).matrix() for i in range(len(poses))])
+    return np.asarray(rectify(invert(T[0]) @ T))
+
+
+class Positions(NamedTuple):
+    """Where some of the scans are, of shape (m, 3), by their numbers."""
+
+    numbers: NDArray[np.intp]
+    metres: NDArray[np.float64]
+
+
+def positions(
+    priors: Trajectory, stamps: NDArray[np.int64], T_world_sensor: Poses
+) -> Positions | None:
+    """Positions of scans once a second, such as those of a GPS, brought near to their poses.
+
+    Parameters
+    ----------
+    priors
+        Poses of the LiDAR in any frame; only their positions count.
+    stamps
+        Of the scans, of shape (n,), in nanoseconds.
+    T_world_sensor
+        Where the scans are without them, of shape (n, 4, 4).
+
+    Returns
+    -------
+    Positions or None
+        None if there are too few.
+    """
+    at = priors.at(stamps)[:, :3, 3]
+    due = np.diff((stamps - stamps[0]) // _PRIORS_EVERY, prepend=-1) > 0
+    numbers = np.flatnonzero(due & np.isfinite(at).all(axis=1))
+    if len(numbers) < _FEWEST_PRIORS:
+        return None
+    T = _aligned(at[numbers], T_world_sensor[numbers, :3, 3])
+    return Positions(numbers, at[numbers] @ T[:3, :3].T + T[:3, 3])
+
+
+def _aligned(of: NDArray[np.float64], to: NDArray[np.float64]) -> Poses:
+    """The rigid motion that brings positions of shape (n, 3) nearest to others."""
+    from scipy.spatial.transform import Rotation
+
+    T = np.eye(4)
+    if len(of) > 2:
+        R, _ = Rotation.align_vectors(to - to.mean(axis=0), of - of.mean(axis=0))
+        T[:3, :3] = R.as_matrix()
+        T[:3, 3] = to.mean(axis=0) - T[:3, :3] @ of.mean(axis=0)
+    return T
+
+
+def _sigmas(metres: float, radians: float) -> Any:
+    import gtsam
+
+    return gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3))
+
+
+def _noise(hop: Hop) -> Any:
+    """Noise of a registration: rotation, then translation in the frame of its end."""
+    import gtsam
+
+    metres, radians = _OF_A_HOP
+    known = np.eye(3) - hop.projection
+    if np.abs(known).max() < 1e-6:
+        return _sigmas(metres, radians)
+    R = hop.T_start_end[:3, :3]
+    covariance = np.diag(np.repeat([radians**2, metres**2], 3))
+    covariance[3:, 3:] += _UNKNOWN**2 * R.T @ known @ R
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+def _robust(noise: Any) -> Any:
+    import gtsam
+
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy(1.0), noise)
