@@ -79,11 +79,11 @@ def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> N
 
     if not (name := found.name):
         return
-    if found.missing["online"] or (found.reference is not None and found.missing["offline"]):
-        say("Next: mend what is lacking, see docs/your-bag.md")
-        return
-    if found.reference is None:
-        say_next("estimate a reference from its scans", "reference", found.path)
+    if found.reference is None or found.missing.get("offline"):
+        say(
+            "Next: mend what is lacking, see docs/your-bag.md; a recording without a reference can "
+            "only be a `test` sequence, or be replayed with `adaptune online --untrained`"
+        )
         return
     share, length = f"{100 * TRAINING:.0f}", proposed_sub_trajectory(found.reference, measured)
     say(

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import __version__
 from adaptune.archive import Archive, Frames
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
@@ -16,6 +15,7 @@ from adaptune.metrics import cap, sub_trajectory_rte, window_ends
 from adaptune.reference import estimate
 from adaptune.reference.given import MeasuredReference, common_poses, mean_difference
 from adaptune.reference.stored import CHECK, StoredEstimate, write_estimate
+from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import read_tum
 from offline.offline_study import OfflineStudy
@@ -24,8 +24,8 @@ from offline.trial import episodes
 Show = Callable[[str, int, int], None]
 """Called with a sequence, how many of its scans are done, and about how many there are."""
 
-ESTIMATED = "estimated"
-"""What a sequence names as its reference where it is to be estimated."""
+NOT_GIVEN = ("estimated", "none")
+"""What a sequence names as its reference where it is to be estimated, or left out."""
 FEWEST = 3
 """Sets between which a rank correlation says something."""
 
@@ -179,14 +179,16 @@ def check_reference(study: OfflineStudy, show: Show = lambda *_: None) -> list[d
 
 def _given_names(study: OfflineStudy, archive: Archive) -> list[str]:
     """The training sequences that have a given reference and finished trials."""
-    sequences, names = study.sequences, []
-    for name in dict.fromkeys(study.config.training):
-        config = sequences.config(name)
-        if not archive.finished(name) or config.reference == ESTIMATED:
-            continue
-        if config.reference is not None or open_sequence(config).reference() is not None:
-            names.append(name)
-    return names
+    found = [n for n in dict.fromkeys(study.config.training) if archive.finished(n)]
+    # A simulated course is none of the recordings, and its reference is the truth.
+    recorded = {name: study.sequences.recordings.get(name) for name in found}
+    return [name for name, config in recorded.items() if config is None or _is_given(config)]
+
+
+def _is_given(config: SequenceConfig) -> bool:
+    if config.reference is not None:
+        return config.reference not in NOT_GIVEN
+    return open_sequence(config).reference() is not None
 
 
 def _estimate(study: OfflineStudy, name: str, show: Show) -> StoredEstimate:
@@ -206,7 +208,7 @@ def _estimate(study: OfflineStudy, name: str, show: Show) -> StoredEstimate:
 
 
 def _about(study: OfflineStudy, name: str) -> dict[str, Any]:
-    about = {"adaptune": __version__} | study.sequences.identity(name)
+    about = {"estimator": estimate.VERSION} | study.sequences.identity(name)
     plain: dict[str, Any] = json.loads(json.dumps(about))
     return plain
 

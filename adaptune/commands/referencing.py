@@ -161,7 +161,7 @@ def _of_recording(
         if there is not None:
             advance = _advance(show, "given reference")
             comparison = of_recording.beside_given(scans, there, found, metres, advance)
-    _say_estimate(stored, of_recording.unknown_spans(found), metres)
+    _say_estimate(stored, found.gaps(), metres)
     if there is not None:
         _say_comparison(comparison, config, metres)
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
@@ -237,16 +237,13 @@ def _without_reference(study: "OfflineStudy") -> list[str]:
     from adaptune.sequence.names import origin
     from adaptune.sequence.opening import open_sequence
 
-    names, config = study.sequences, study.config
-    recorded = dict.fromkeys(map(origin, (*config.training, *config.test)))
+    names = dict.fromkeys(map(origin, (*study.config.training, *study.config.test)))
+    given = {name: of for name in names if (of := study.sequences.recordings.get(name))}
     return [
         name
-        for name in recorded
-        if name not in config.courses
-        and (
-            (of := names.config(name)).reference == "estimated"
-            or (of.reference is None and open_sequence(of).reference() is None)
-        )
+        for name, of in given.items()
+        if of.reference == "estimated"
+        or (of.reference is None and open_sequence(of).reference() is None)
     ]
 
 

@@ -97,21 +97,6 @@ def beside_given(
     return Comparison(mean_difference(given.at(found.stamps), T, length), measured)
 
 
-def unknown_spans(found: EstimatedReference) -> list[tuple[float, float]]:
-    """Where the reference cannot be trusted: seconds since the first scan, from and to.
-
-    From the last pose that is known before to the first one after.
-    """
-    seconds = (found.stamps - found.stamps[0]) * 1e-9
-    unknown = np.concatenate([[False], ~found.known, [False]])
-    edges = np.flatnonzero(np.diff(unknown.astype(np.int8)))
-    last = len(seconds) - 1
-    return [
-        (float(seconds[max(first - 1, 0)]), float(seconds[min(stop, last)]))
-        for first, stop in edges.reshape(-1, 2)
-    ]
-
-
 def estimated_name(recording: Path) -> str:
     """Name of the file of its reference, without suffix."""
     return f"{recording.resolve().stem}_reference"

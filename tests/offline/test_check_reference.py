@@ -2,7 +2,7 @@ import re
 import shutil
 
 import commands
-import estimates
+import made_references
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -134,7 +134,7 @@ def counted(study_file, monkeypatch):
     def made(scans, advance=lambda *_: None, priors=None):
         asked.append(scans.name)
         name = re.search(r"one|two", scans.name)[0]
-        of = estimates.of_truth(study_file.parent / f"{name}.bag", scale=0.001)
+        of = made_references.of_truth(study_file.parent / f"{name}.bag", scale=0.001)
         return of(scans, advance, priors)
 
     monkeypatch.setattr(estimate, "estimate_reference", made)

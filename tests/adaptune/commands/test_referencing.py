@@ -4,7 +4,7 @@ from types import ModuleType
 
 import commands
 import drives
-import estimates
+import made_references
 import numpy as np
 import pytest
 
@@ -25,7 +25,7 @@ def adaptune(tmp_path, monkeypatch, bag):
     """Call the command line; estimates are made of the truth."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(terminal.console, "width", 100)
-    monkeypatch.setattr(estimate, "estimate_reference", estimates.of_truth(bag))
+    monkeypatch.setattr(estimate, "estimate_reference", made_references.of_truth(bag))
     return lambda *words: commands.call("reference", *words)
 
 
@@ -44,7 +44,7 @@ def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
 
 
 def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
-    monkeypatch.setattr(estimate, "estimate_reference", estimates.of_truth(bag, lost=[9]))
+    monkeypatch.setattr(estimate, "estimate_reference", made_references.of_truth(bag, lost=[9]))
     done = adaptune(bag, "--out", "refs", "--length", "1.5")
     assert done.exit_code == 0, done.stderr
     assert re.search(
@@ -62,7 +62,7 @@ def test_a_recording_without_reference_is_not_compared(adaptune, tmp_path):
 
     def made(scans, *_):
         stamps = np.array([scan.stamp for scan in scans])
-        return estimates.made_of(stamps, np.array([T for *_, T in drives.scans(0, 40)]))
+        return made_references.made_of(stamps, np.array([T for *_, T in drives.scans(0, 40)]))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(estimate, "estimate_reference", made)
@@ -120,7 +120,7 @@ def test_of_a_study_those_that_it_lacks_are_estimated(adaptune, study_file, tmp_
         asked.append(names)
         for name in names:
             scans = study.sequences.open(name)
-            found = estimates.of_truth(study_file.parent / f"{name}.bag")(scans)
+            found = made_references.of_truth(study_file.parent / f"{name}.bag")(scans)
             write_estimate(study.folder / "references" / f"{name}.tum", found, {})
             progress(name, 1, 1)
 

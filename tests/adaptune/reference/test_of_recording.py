@@ -1,30 +1,8 @@
-import estimates
-import numpy as np
 import pytest
-from rooms import moved
 
 from adaptune.inspect import inspect
 from adaptune.reference.estimated import EstimateError
-from adaptune.reference.of_recording import estimated_name, recording_config, unknown_spans
-
-
-def straight(n):
-    return np.array([moved(0.5 * i) for i in range(n)])
-
-
-@pytest.mark.parametrize(
-    ("lost", "spans"),
-    [
-        ([], []),
-        ([9], [(0.9, 2.0)]),
-        ([9, 10], [(0.9, 2.1)]),
-        ([0, 38], [(0.0, 1.1), (3.8, 3.9)]),
-    ],
-)
-def test_where_it_is_unknown(lost, spans):
-    stamps = 10**12 + 10**8 * np.arange(40, dtype=np.int64)
-    found = unknown_spans(estimates.made_of(stamps, straight(40), lost=lost))
-    np.testing.assert_allclose(np.array(found).reshape(-1, 2), np.reshape(spans, (-1, 2)))
+from adaptune.reference.of_recording import estimated_name, recording_config
 
 
 def test_the_sequence_is_the_one_that_inspect_proposes(study_file, tmp_path):
