@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from adaptune import tools
-from adaptune.commands import driving, learning, training
+from adaptune.commands import driving, learning, referencing, training
 from adaptune.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -24,6 +24,7 @@ app = typer.Typer(
         "Its folder keeps all results. Run the same command again to resume it.\n\n"
         "    adaptune inspect  my.bag               # what is in a recording\n\n"
         "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
+        "    adaptune reference my.bag              # a reference without ground truth\n\n"
         "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
         "    adaptune learn    configs/demo.yaml my.bag    # learn from another drive\n\n"
         "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
@@ -39,7 +40,8 @@ models.command()(tools.show)
 app.add_typer(models, name="model")
 for _command in (
     *(tools.inspect, tools.cache, tools.serve),
-    *(training.simulate, training.offline, learning.learn, training.trials, training.validate),
+    *(training.simulate, referencing.reference),
+    *(training.offline, learning.learn, training.trials, training.validate),
     *(driving.online, driving.switching, driving.compare),
 ):
     app.command()(_command)

@@ -75,6 +75,17 @@ class Inspection:
         """How many messages, scans or poses there are."""
         return sum(topic.count for topic in self.topics)
 
+    @property
+    def name(self) -> str:
+        """Name of the sequence that is proposed; empty if there is none, as for a file of poses."""
+        document: Any = yaml.Document(self.entry).data or {}
+        return next(iter(document.get("sequences", {})), "")
+
+    def config(self) -> SequenceConfig:
+        """The sequence that is proposed."""
+        document: Any = yaml.Document(self.entry).data
+        return SequenceConfig(**document["sequences"][self.name])
+
     def doubts(self, stage: str) -> bool:
         """Whether a fault concerns a stage that can run."""
         return any(fault.of in _INPUTS[stage] for fault in self.faults)

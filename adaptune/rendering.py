@@ -18,8 +18,16 @@ from adaptune.sequence.timing import TIME_FIELDS
 from adaptune.trajectory import Trajectory
 
 
-def render_inspection(inspection: Inspection) -> RenderableType:
-    """The inspection for a terminal."""
+def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableType:
+    """The inspection for a terminal.
+
+    Parameters
+    ----------
+    inspection
+        What was found.
+    accuracy
+        How wrong its reference is, or how to find out.
+    """
     parts: list[RenderableType] = [Text(str(inspection.path), style="bold")]
     parts.append(_topic_table(inspection))
     if inspection.layout:
@@ -29,6 +37,8 @@ def render_inspection(inspection: Inspection) -> RenderableType:
     if inspection.reference is not None:
         text = _reference_text(inspection.reference, inspection.complete)
         parts.append(Text(f"reference: {text}"))
+        if accuracy and inspection.name and not inspection.missing["offline"]:
+            parts.append(Text(f"reference: {accuracy}"))
     elif inspection.scan is not None and not any(f.of == "reference" for f in inspection.faults):
         parts.append(Text("reference: none; adaptune estimates one from the scans"))
     parts.append(Text(_read_text(inspection)))

@@ -3,6 +3,7 @@
 import os
 import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,11 +11,11 @@ import typer
 
 from adaptune.errors import AdaptuneError
 from adaptune.next_command import say_next
-from adaptune.terminal import begin_work, console, progress, say
+from adaptune.terminal import Show, begin_work, console, progress, say
 
 if TYPE_CHECKING:
     from adaptune.inspect import Inspection
-    from adaptune.trajectory import Trajectory
+    from adaptune.reference.given import MeasuredReference
 
 
 def inspect(
@@ -34,33 +35,53 @@ def inspect(
     from adaptune.rendering import draw_inspection, render_inspection
 
     begin_work()
+    measured, accuracy = None, "`--deep` also measures how wrong it is"
     if deep:
         with progress() as show:
             found = inspect_file(file, deep, show)
+            measured, accuracy = _measured(found, show)
     else:
         found = inspect_file(file)
-    console.print(render_inspection(found))
-    _begin_study(found)
+    console.print(render_inspection(found, accuracy))
+    _begin_study(found, measured)
     if png is not None:  # last: the lines of the study are to be copied in one piece
         draw_inspection(found, png)
         say(f"First scan: {png}")
 
 
-LENGTHS = {25.0: 8, 10.0: 8, 5.0: 1.4, 2.0: 2}
-"""Metres of a sub-trajectory, and how many of them the path of the test must hold: over short ones,
-the noise of the reference counts too much."""
 UNKNOWN = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
-"""What is proposed where the path is not known, by the same rule."""
-TRAINING = 0.6
-"""Share of a recording's duration that is proposed for training, before the test."""
+"""The length of sub-trajectories to propose where the path is not known."""
 
 
-def _begin_study(found: "Inspection") -> None:
+def _measured(found: "Inspection", show: Show) -> "tuple[MeasuredReference | None, str]":
+    """Registrations along the reference, and what they tell; None where there is none to measure.
+
+    Only what can be used to train is measured.
+    """
+    if found.reference is None or not found.name or found.missing.get("offline"):
+        return None, ""
+    from adaptune.reference.given import measure_reference
+    from adaptune.reference.proposal import accuracy_words, advice, proposed_sub_trajectory
+    from adaptune.sequence.opening import open_sequence
+
+    try:
+        scans = open_sequence(found.config())
+        if (reference := scans.reference()) is None:
+            return None, ""
+        measured = measure_reference(scans, reference, partial(show, "registering"))
+    except AdaptuneError as error:
+        return None, f"its error cannot be measured: {error}"
+    length = proposed_sub_trajectory(reference, measured)
+    usual = proposed_sub_trajectory(reference)
+    words = accuracy_words(measured, usual, length), advice(measured, reference)
+    return measured, "; ".join(filter(None, words))
+
+
+def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> None:
     """Print the rest of a study of this recording alone, and the command that begins it."""
-    from adaptune import yaml
+    from adaptune.reference.proposal import TRAINING, proposed_sub_trajectory
 
-    named = (yaml.Document(found.entry).data or {}).get("sequences")
-    if not named:
+    if not (name := found.name):
         return
     if found.missing.get("offline"):
         say(
@@ -68,29 +89,16 @@ def _begin_study(found: "Inspection") -> None:
             "serve, write `reference: estimated`"
         )
         return
-    (name,), share = named, f"{100 * TRAINING:.0f}"
+    share, length = f"{100 * TRAINING:.0f}", UNKNOWN
+    if found.reference is not None:
+        length = str(proposed_sub_trajectory(found.reference, measured))
     say(
         f"training: [{name}: 0-{share}%]\ntest: [{name}: {share}-100%]\n"
-        f"sub_trajectory: {_of_path(found)}\n"
+        f"sub_trajectory: {length}\n"
         "odometry: {name: gicp}    # or another one, see docs/your-odometry.md\n"
     )
     first = f"put the lines from `sequences:` on in {name}.yaml; then "
     say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
-
-
-def _of_path(found: "Inspection") -> str:
-    """The length of sub-trajectories to propose, with a remark where the path is not known."""
-    return UNKNOWN if found.reference is None else str(proposed_sub_trajectory(found.reference))
-
-
-def proposed_sub_trajectory(reference: "Trajectory") -> float:
-    """The first of `LENGTHS` for which the test's part of the path is long enough; 1 m if none."""
-    from adaptune.metrics import travelled
-
-    first, last = reference.stamps[[0, -1]]
-    tested = reference.T_world_sensor[reference.stamps >= first + TRAINING * (last - first)]
-    path = travelled(tested)[-1]
-    return next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)
 
 
 class CacheAction(StrEnum):

@@ -48,6 +48,10 @@ class Hops(NamedTuple):
     T_start_end: Poses  # (n, 4, 4)
     projection: NDArray[np.float64]  # (n, 3, 3): see `Hop`
 
+    def hop(self, i: int) -> Hop:
+        """One of them."""
+        return Hop(self.T_start_end[i], self.projection[i])
+
     def part(self, first: int, stop: int) -> "Hops":
         """Those between the frames from `first` to before `stop`, whose numbers begin anew."""
         inside = (self.start >= first) & (self.end < stop)

@@ -62,10 +62,12 @@ class OwnErrors:
     ----------
     length
         Metres of the sub-trajectories whose mean error is estimated.
+    whole
+        Whether to keep the chains of a whole recording, not only the last ones.
     """
 
-    def __init__(self, length: float):
-        self._length = length
+    def __init__(self, length: float, whole: bool = False):
+        self._length, self._whole = length, whole
         self._links: deque[Link] = deque()
         self._chains: deque[_Chain] = deque()
 
@@ -75,9 +77,15 @@ class OwnErrors:
         while link.end - self._links[0].end > self._length + LENGTHS[0] / COVERED:
             self._links.popleft()
         self._chains.append(_chain(self._links, self._length))
+        if self._whole:
+            return
         until, behind = link.seconds - SECONDS, link.end - max(METRES, self._length)
         while self._chains[0].seconds < until and self._chains[0].start < behind:
             self._chains.popleft()
+
+    def interrupt(self) -> None:
+        """Let no later chain begin at a hop so far: in between, the poses are unknown."""
+        self._links.clear()
 
     def clear(self) -> None:
         """Forget the hops so far."""
@@ -95,7 +103,9 @@ class OwnErrors:
             return None
         start, end, _, error = np.array(self._chains).T
         reach = end - start
-        long = reach >= NEARLY * min(self._length, float(reach[-1]))
+        # Of a whole recording, the last chain may be a short one.
+        usual = float(reach.max() if self._whole else reach[-1])
+        long = reach >= NEARLY * min(self._length, usual)
         start, end, reach, error = start[long], end[long], reach[long], error[long]
         times = max(1.0, self._length / float(reach.mean()))
         mean = times**GROWTH * float((100.0 * error / reach).mean())

@@ -14,6 +14,10 @@ from adaptune.trajectory import write_tum
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 """Metres over which the error of a reference is noted."""
 
+CHECK = ".check"
+"""Ends the name of an estimate that is compared with a given reference, and used for nothing
+else."""
+
 
 class StoredEstimate(NamedTuple):
     """What is known about an estimated reference in a file.
@@ -110,3 +114,9 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     del known["path"], known["errors"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
     return stored
+
+
+def stored_estimates(folder: Path) -> list[StoredEstimate]:
+    """All estimated references of a folder by name, without those that only check a given one."""
+    paths = (path for path in sorted(folder.glob("*.tum")) if not path.stem.endswith(CHECK))
+    return [stored for path in paths if (stored := StoredEstimate.read(path)) is not None]

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from adaptune import terminal, tools
+from adaptune import terminal
 from adaptune.archive import Archive
 from adaptune.cli import app
+from adaptune.reference.proposal import proposed_sub_trajectory
 from adaptune.trajectory import Trajectory
 from offline.offline_study import load_study
 
@@ -89,7 +90,7 @@ def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
     stamps = np.arange(101) * 10**9
     T = np.tile(np.eye(4), (101, 1, 1))
     T[:, 0, 3] = np.concatenate([np.linspace(0, 5e3, 61), 5e3 + np.linspace(0, tested, 41)[1:]])
-    assert tools.proposed_sub_trajectory(Trajectory(stamps, T)) == length
+    assert proposed_sub_trajectory(Trajectory(stamps, T)) == length
 
 
 def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):
@@ -273,3 +274,22 @@ def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
     finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
     assert adaptune("offline", study_file).exit_code == 0
     assert {p: p.stat().st_mtime_ns for p in finished} == finished
+
+
+def test_a_deep_inspection_measures_the_reference(adaptune, study_file, tmp_path):
+    bag = study_file.parent / "one.bag"
+    shallow, deep = adaptune("inspect", bag), adaptune("inspect", bag, "--deep")
+    assert deep.exit_code == 0, deep.stderr
+    assert "reference: `--deep` also measures how wrong it is" in shallow.stdout
+    assert "reference: wrong by at most" in deep.stdout
+    # Wrong by a fifth.
+    drive = [
+        (stamp, points, T * np.array([[1, 1, 1, 0.8]] + [[1] * 4] * 3))
+        for stamp, points, T in drives.scans(0, 60)
+    ]
+    done = adaptune("inspect", drives.write_bag(tmp_path / "wrong.bag", drive), "--deep")
+    assert done.exit_code == 0, done.stderr
+    assert re.search(r"sets that\s+differ by less cannot be told apart", done.stdout)
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "wrong.yaml").write_text(done.stdout[begin:end])
+    assert load_study(tmp_path / "wrong.yaml").training == ["wrong_0-60"]

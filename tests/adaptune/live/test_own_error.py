@@ -135,3 +135,24 @@ def test_after_a_gap_the_newest_hop_counts():
     own.add(far)
     assert before.mean == pytest.approx(0.0, abs=1e-9)
     assert own.estimate().mean > 1.0
+
+
+def test_of_a_whole_recording_every_chain_counts():
+    def believed(metres):
+        return moved(1.04 * min(metres, 200.0) + max(metres - 200.0, 0.0))
+
+    last, whole = OwnErrors(10.0), OwnErrors(10.0, whole=True)
+    for start in range(390):
+        for own in (last, whole):
+            own.add(link(start, start + 10.0, believed))
+    assert last.estimate().mean == pytest.approx(0.0, abs=1e-6)
+    assert whole.estimate().mean == pytest.approx(2.0, rel=0.05)
+
+
+def test_no_chain_leads_over_an_interruption():
+    own = OwnErrors(20.0, whole=True)
+    for start in (0.0, 10.0, 20.0):
+        if start == 10.0:
+            own.interrupt()
+        own.add(link(start, start + 10.0, moved))
+    assert [chain.end - chain.start for chain in own._chains] == [10.0, 10.0, 20.0]

@@ -1,0 +1,270 @@
+"""The command that estimates references."""
+
+import math
+import os
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from adaptune.commands.options import Override, load
+from adaptune.errors import AdaptuneError
+from adaptune.next_command import say_next, say_next_of_study
+from adaptune.terminal import Show, console, progress, say
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from adaptune.reference.of_recording import Comparison
+    from adaptune.reference.stored import StoredEstimate
+    from adaptune.sequence.config import SequenceConfig
+    from offline.offline_study import OfflineStudy
+
+_STUDIES = (".yaml", ".yml")
+
+
+Target = Annotated[
+    Path,
+    typer.Argument(metavar="TARGET", help="A recording, or a study's YAML.", show_default=False),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--folder",
+        "--out",
+        help="Where to write; of a study, its folder.",
+        show_default="here; of a study, the YAML's name, under runs/",
+        file_okay=False,
+    ),
+]
+Points = Annotated[
+    str | None,
+    typer.Option(metavar="TOPIC", help="Topic of the scans.", show_default="as `inspect` proposes"),
+]
+Given = Annotated[
+    str | None,
+    typer.Option(
+        "--reference",
+        metavar="TOPIC|FILE",
+        help="A given reference to compare with.",
+        show_default="as `inspect` proposes",
+    ),
+]
+Priors = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC|FILE",
+        help="Positions to join that are right over long distances, as those of a GPS.",
+        show_default="none",
+    ),
+]
+Length = Annotated[
+    float | None,
+    typer.Option(
+        metavar="METRES",
+        help="Length of the sub-trajectories over which errors are told.",
+        min=0.01,
+        show_default="25, or what fits",
+    ),
+]
+Check = Annotated[
+    bool,
+    typer.Option(
+        "--check", help="Compare a study's given references with estimated ones, by its trials."
+    ),
+]
+
+
+def reference(
+    target: Target,
+    override: Override = [],  # noqa: B006
+    folder: Out = None,
+    points: Points = None,
+    given: Given = None,
+    priors: Priors = None,
+    length: Length = None,
+    check: Check = False,
+) -> None:
+    """Estimate the reference of a recording from its scans, without ground truth.
+
+    It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study, it
+    estimates the references of all sequences that have none, or `reference: estimated`.
+
+    With `--check`, it estimates those of the training sequences that have a given reference, and
+    shows whether the trials would have been judged alike.
+    """
+    if target.suffix not in _STUDIES:
+        if check or override:
+            raise AdaptuneError(f"{target}: --check and -o are for studies; give a study's YAML")
+        with _on_one_core():
+            _of_recording(target, folder or Path(), (points, given, priors), length)
+        return
+    options = {"--points": points, "--reference": given, "--priors": priors, "--length": length}
+    if wrong := [name for name, value in options.items() if value is not None]:
+        raise AdaptuneError(
+            f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
+            f"docs/reference-study.md"
+        )
+    loaded = load(target, override, folder)
+    with _on_one_core():
+        if check:
+            _check(loaded)
+        else:
+            _of_study(loaded)
+    following = "trials" if check else "offline"
+    why = "the trials themselves" if check else "run trials, fit the error model"
+    say_next_of_study(why, following, target, override, folder)
+
+
+@contextmanager
+def _on_one_core() -> "Iterator[None]":
+    """So that results repeat bit by bit, see `pin`."""
+    from adaptune.cores import pin
+
+    unpin = pin(os.getpid())
+    try:
+        yield
+    finally:
+        unpin()
+
+
+def _advance(show: Show, what: str) -> Callable[[int, int], None]:
+    return lambda done, total: show(what, done, total)
+
+
+def _of_recording(
+    target: Path,
+    out: Path,
+    topics: tuple[str | None, str | None, str | None],
+    length: float | None,
+) -> None:
+    """Estimate the reference of a recording, write it, and say what it is worth."""
+    from adaptune.inspect import inspect
+    from adaptune.reference import estimate, of_recording
+    from adaptune.reference.proposal import proposed_sub_trajectory
+    from adaptune.reference.stored import write_estimate
+    from adaptune.sequence.opening import open_sequence
+
+    points, given, priors = topics
+    config = of_recording.recording_config(inspect(target), points, given)
+    scans = open_sequence(config)
+    joined = None if priors is None else of_recording.read_priors(config, priors)
+    path = out / f"{of_recording.estimated_name(target)}.tum"
+    with progress() as show:
+        found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
+        about = {"recording": str(target.resolve()), "points": config.points, "priors": priors}
+        stored = write_estimate(path, found, about)
+        metres = length or proposed_sub_trajectory(found.trajectory())
+        there, why = scans.reference(), ""
+        if there is not None:
+            advance = _advance(show, "given reference")
+            comparison = of_recording.beside_given(scans, there, found, metres, advance)
+    _say_estimate(stored, found.gaps(), metres)
+    if there is not None:
+        _say_comparison(comparison, config, metres)
+    say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
+    first = f"write `reference: {path}` under this sequence in a study; then "
+    why = "train with it, as with a given one"
+    say_next(why, "offline", "STUDY.yaml", first=first)
+
+
+def _say_estimate(
+    stored: "StoredEstimate", unknown: list[tuple[float, float]], length: float
+) -> None:
+    """What the estimated reference is worth."""
+    say(f"Estimated reference: {stored.metres:.1f} m, {stored.scans:,} scans.")
+    error = stored.error(length)
+    if math.isnan(error):
+        say(f"Its error is not known: the path holds no {length:g} m without interruption.")
+    else:
+        say(f"It is wrong by about {error:.2g} % over {length:g} m, as its two halves tell.")
+    if not unknown:
+        say("It can be trusted everywhere.")
+        return
+    where = ", ".join(f"{start:.1f}-{stop:.1f}" for start, stop in unknown)
+    share = f"{100.0 * stored.unknown_share:.1f} % of the path"
+    say(f"It cannot be trusted on {share}, and has no poses there: {where} s after the first scan.")
+
+
+def _say_comparison(comparison: "Comparison", config: "SequenceConfig", length: float) -> None:
+    """What the given reference is worth, and how far the two differ."""
+    from adaptune.reference.proposal import accuracy_words
+
+    of = "" if config.reference is None else f" ({config.reference})"
+    say(f"Given reference{of}: {accuracy_words(comparison.measured, length)}.")
+    if math.isnan(comparison.difference):
+        say(f"The two share no stretch of {length:g} m.")
+    else:
+        say(f"The two differ by {comparison.difference:.2g} % over {length:g} m.")
+
+
+def _of_study(study: "OfflineStudy") -> None:
+    """Estimate the references that a study lacks, and say what each is worth."""
+    from adaptune import report
+    from adaptune.reference.stored import stored_estimates
+
+    names = _without_reference(study)
+    if not names:
+        raise AdaptuneError(
+            f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
+            f"is to be estimated, or compare with --check"
+        )
+    from adaptune.study.references import ensure_references
+
+    study.open()
+    with progress() as show:
+        ensure_references(study, names, show)
+    folder, length = study.folder / "references", study.config.sub_trajectory
+    rows = [
+        {
+            "reference": stored.path.stem,
+            "scans": stored.scans,
+            "metres": stored.metres,
+            "its error [%]": stored.error(length),
+            "not trusted [% of the path]": 100.0 * stored.unknown_share,
+        }
+        for stored in stored_estimates(folder)
+    ]
+    caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
+    console.print(report.table("Estimated references", rows, caption))
+    say(f"Files: {folder}/")
+
+
+def _without_reference(study: "OfflineStudy") -> list[str]:
+    """The recordings of a study that have no reference, or are to have an estimated one."""
+    from adaptune.sequence.names import origin
+    from adaptune.sequence.opening import open_sequence
+
+    names = dict.fromkeys(map(origin, (*study.config.training, *study.config.test)))
+    given = {name: of for name in names if (of := study.sequences.recordings.get(name))}
+    return [
+        name
+        for name, of in given.items()
+        if of.reference == "estimated"
+        or (of.reference is None and open_sequence(of).reference() is None)
+    ]
+
+
+def _check(study: "OfflineStudy") -> None:
+    """Compare given references with estimated ones by the study's trials."""
+    from adaptune import report
+    from adaptune.study.inputs import warn_of_stale
+    from offline.check_reference import check_reference
+
+    study.open()
+    warn_of_stale(study)
+    with progress() as show:
+        rows = check_reference(study, show)
+    report.write_rows(study.folder, "reference_check", rows)
+    console.print(
+        report.table(
+            f"Estimated beside given references, over {study.config.sub_trajectory:g} m",
+            rows,
+            "Errors of the estimate by the given reference and by its own halves; of the given one "
+            "by registrations of scans. Rank correlation of the sets' mean errors by both. Errors "
+            "by the given reference: of the set that the estimate picks, and of the best.",
+        )
+    )
+    say(f"Table: {study.folder / 'reference_check'}.*, estimates: {study.folder / 'references'}/")

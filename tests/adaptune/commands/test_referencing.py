@@ -1,0 +1,139 @@
+import re
+import sys
+from types import ModuleType
+
+import commands
+import drives
+import made_references
+import numpy as np
+import pytest
+
+from adaptune import terminal
+from adaptune.reference import estimate
+from adaptune.reference.estimated import EstimateError
+from adaptune.reference.stored import StoredEstimate, write_estimate
+from adaptune.trajectory import read_tum
+
+
+@pytest.fixture
+def bag(study_file):
+    return study_file.parent / "one.bag"
+
+
+@pytest.fixture
+def adaptune(tmp_path, monkeypatch, bag):
+    """Call the command line; estimates are made of the truth."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(terminal.console, "width", 100)
+    monkeypatch.setattr(estimate, "estimate_reference", made_references.of_truth(bag))
+    return lambda *words: commands.call("reference", *words)
+
+
+def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
+    done = adaptune(bag)
+    assert done.exit_code == 0, done.stderr
+    assert "Estimated reference: 11.7 m, 40 scans." in done.stdout
+    assert re.search(r"It is wrong by about \d.* % over 2 m, as its two halves tell", done.stdout)
+    assert "It can be trusted everywhere." in done.stdout
+    assert "Given reference (/truth): wrong by at most" in done.stdout
+    assert re.search(r"The two differ by \d.* % over 2 m", done.stdout)
+    assert "write `reference: one_reference.tum` under" in done.stdout.splitlines()[-1]
+    assert len(read_tum(tmp_path / "one_reference.tum")) == 40
+    stored = StoredEstimate.read(tmp_path / "one_reference.tum")
+    assert stored.about == {"recording": str(bag), "points": "/points", "priors": None}
+
+
+def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
+    monkeypatch.setattr(estimate, "estimate_reference", made_references.of_truth(bag, lost=[9]))
+    done = adaptune(bag, "--out", "refs", "--length", "1.5")
+    assert done.exit_code == 0, done.stderr
+    assert re.search(
+        r"cannot be trusted on \d.* of the path, and has no poses there: 0.9-2.0 s", done.stdout
+    )
+    assert "over 1.5 m" in done.stdout
+    assert (tmp_path / "refs/one_reference.json").exists()
+
+
+def test_a_recording_without_reference_is_not_compared(adaptune, tmp_path):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for i, (_, points, _) in enumerate(drives.scans(0, 40)):
+        np.save(folder / f"{i:03d}.npy", points)
+
+    def made(scans, *_):
+        stamps = np.array([scan.stamp for scan in scans])
+        return made_references.made_of(stamps, np.array([T for *_, T in drives.scans(0, 40)]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimate, "estimate_reference", made)
+        done = adaptune(folder)
+    assert done.exit_code == 0, done.stderr
+    assert "Given reference" not in done.stdout
+    assert (tmp_path / "scans_reference.tum").exists()
+
+
+def test_priors_are_a_topic_or_a_file(adaptune, bag, tmp_path):
+    assert adaptune(bag).exit_code == 0
+    for priors in ("/truth", "one_reference.tum"):
+        done = adaptune(bag, "--priors", priors, "--out", "with")
+        assert done.exit_code == 0, done.stderr
+        assert StoredEstimate.read(tmp_path / "with/one_reference.tum").about["priors"] == priors
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["none.bag"], "there is no such file"),
+        (["BAG", "--points", "/none"], "/none"),
+        (["BAG", "--reference", "/none"], "/none"),
+        (["BAG", "--priors", "/none"], "/none"),
+        (["BAG", "--check"], "are for studies"),
+        (["BAG", "-o", "training=[one]"], "are for studies"),
+        (["STUDY", "--length", "3"], "--length is for a single recording"),
+        (["STUDY", "--priors", "/gps"], "--priors is for a single recording"),
+        (["STUDY"], "every sequence has a reference"),
+        (["poses.tum"], "is a file of poses"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, words, expected):
+    (tmp_path / "poses.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    named = {"BAG": bag, "STUDY": study_file}
+    done = adaptune(*(named.get(word, word) for word in words))
+    assert done.exit_code == 2
+    assert expected in done.stderr
+
+
+def test_a_recording_that_cannot_be_estimated_is_told(adaptune, bag, monkeypatch):
+    def refuse(*_):
+        raise EstimateError("one.bag: the robot moves 0.1 m only")
+
+    monkeypatch.setattr(estimate, "estimate_reference", refuse)
+    done = adaptune(bag)
+    assert done.exit_code == 2
+    assert "moves 0.1 m only" in done.stderr
+
+
+def test_of_a_study_those_that_it_lacks_are_estimated(adaptune, study_file, tmp_path, monkeypatch):
+    asked = []
+
+    def ensure(study, names, progress):
+        asked.append(names)
+        for name in names:
+            scans = study.sequences.open(name)
+            found = made_references.of_truth(study_file.parent / f"{name}.bag")(scans)
+            write_estimate(study.folder / "references" / f"{name}.tum", found, {})
+            progress(name, 1, 1)
+
+    module = ModuleType("adaptune.study.references")
+    module.ensure_references = ensure
+    monkeypatch.setitem(sys.modules, "adaptune.study.references", module)
+    (tmp_path / "study.yaml").write_text(
+        study_file.read_text()
+        .replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
+        .replace("bag: ", f"bag: {study_file.parent}/")
+    )
+    done = adaptune("study.yaml", "--folder", "run")
+    assert done.exit_code == 0, done.stderr
+    assert asked == [["one"]]
+    assert re.search(r"one +40 +11\.\d", done.stdout)
+    assert "adaptune offline study.yaml --folder run" in done.stdout.splitlines()[-1]

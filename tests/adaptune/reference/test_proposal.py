@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from adaptune.live.own_error import OwnError
+from adaptune.reference.proposal import accuracy_words, advice, proposed_sub_trajectory
+from adaptune.trajectory import Trajectory
+
+
+def path(metres, seconds=1000):
+    """A reference along a straight line; the last 40 % of the time are for the test."""
+    stamps = np.linspace(0, seconds * 10**9, 101).astype(np.int64)
+    T = np.tile(np.eye(4), (101, 1, 1))
+    T[:, 0, 3] = np.linspace(0.0, metres, 101)
+    return Trajectory(stamps, T)
+
+
+class Measured:
+    """Errors that are known: metres that do not grow with the length."""
+
+    def __init__(self, metres):
+        self.metres = metres
+
+    def error(self, length):
+        mean = 100.0 * self.metres / length
+        return OwnError(mean, 0.8 * mean, 1.25 * mean) if length < 80.0 else None
+
+
+@pytest.mark.parametrize(
+    ("metres", "wrong", "length", "sentence"),
+    [
+        (600.0, 0.01, 25.0, ""),
+        (600.0, 0.2, 50.0, "use a sub_trajectory of 50 m, or `reference: estimated`"),
+        (600.0, 1.0, 25.0, "at no length that fits: use `reference: estimated`"),
+        (60.0, 0.02, 5.0, ""),
+        (60.0, 0.05, 10.0, "use a sub_trajectory of 10 m"),
+        (60.0, 0.2, 10.0, "at no length that fits"),
+        (4.0, 0.2, 2.0, ""),
+    ],
+)
+def test_a_noisy_reference_needs_longer_sub_trajectories(metres, wrong, length, sentence):
+    reference, measured = path(metres), Measured(wrong)
+    if metres < 5.0:
+        measured.error = lambda _: None
+    proposed = proposed_sub_trajectory(reference, measured)
+    assert proposed == {4.0: 1.0}.get(metres, length)
+    said = advice(measured, reference)
+    assert sentence in said
+    assert bool(said) == bool(sentence)
+
+
+@pytest.mark.parametrize(
+    ("metres", "seconds", "length"),
+    [(215.0, 215, 10.0), (215.0, 38, 25.0), (107.0, 11, 25.0), (60.0, 6, 10.0), (900.0, 30, 25.0)],
+)
+def test_who_is_fast_gets_longer_ones(metres, seconds, length):
+    assert proposed_sub_trajectory(path(metres, seconds)) == length
+
+
+def test_the_error_in_words():
+    measured = Measured(0.25)
+    assert accuracy_words(measured, 25.0) == (
+        "wrong by 1 % (0.8-1.2) over 25 m, as registrations of scans tell"
+    )
+    assert "wrong by at most 5 % (4-6.2) over 5 m" in accuracy_words(measured, 5.0)
+    assert "1 % (0.8-1.2) over 25 m, 0.5 % (0.4-0.62) over 50 m" in accuracy_words(
+        measured, 25.0, 50.0, 25.0, 100.0
+    )
+    assert "cannot be measured" in accuracy_words(measured, 100.0)
