@@ -15,7 +15,7 @@ from adaptune.metrics import cap, sub_trajectory_rte, window_ends
 from adaptune.reference import estimate
 from adaptune.reference.given import MeasuredReference, common_poses, mean_difference
 from adaptune.reference.stored import CHECK, StoredEstimate, write_estimate
-from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.config import ESTIMATED, NO_REFERENCE, SequenceConfig
 from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import read_tum
 from offline.offline_study import OfflineStudy
@@ -24,8 +24,6 @@ from offline.trial import episodes
 Show = Callable[[str, int, int], None]
 """Called with a sequence, how many of its scans are done, and about how many there are."""
 
-NOT_GIVEN = ("estimated", "none")
-"""What a sequence names as its reference where it is to be estimated, or left out."""
 FEWEST = 3
 """Sets between which a rank correlation says something."""
 
@@ -187,7 +185,7 @@ def _given_names(study: OfflineStudy, archive: Archive) -> list[str]:
 
 def _is_given(config: SequenceConfig) -> bool:
     if config.reference is not None:
-        return config.reference not in NOT_GIVEN
+        return config.reference not in (ESTIMATED, NO_REFERENCE)
     return open_sequence(config).reference() is not None
 
 

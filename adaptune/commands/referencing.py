@@ -184,7 +184,7 @@ def _say_estimate(
         say("It can be trusted everywhere.")
         return
     where = ", ".join(f"{start:.1f}-{stop:.1f}" for start, stop in unknown)
-    share = f"{100.0 * stored.unknown_share:.1f} % of the path"
+    share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
     say(f"It cannot be trusted on {share}, and has no poses there: {where} s after the first scan.")
 
 
@@ -223,7 +223,7 @@ def _of_study(study: "OfflineStudy") -> None:
             "scans": stored.scans,
             "metres": stored.metres,
             "its error [%]": stored.error(length),
-            "not trusted [% of the path]": 100.0 * stored.unknown_share,
+            "unknown [% of the scans]": 100.0 * stored.unknown_share,
         }
         for stored in stored_estimates(folder)
     ]
@@ -235,16 +235,11 @@ def _of_study(study: "OfflineStudy") -> None:
 def _without_reference(study: "OfflineStudy") -> list[str]:
     """The recordings of a study that have no reference, or are to have an estimated one."""
     from adaptune.sequence.names import origin
-    from adaptune.sequence.opening import open_sequence
+    from adaptune.sequence.opening import wants_estimate
 
     names = dict.fromkeys(map(origin, (*study.config.training, *study.config.test)))
     given = {name: of for name in names if (of := study.sequences.recordings.get(name))}
-    return [
-        name
-        for name, of in given.items()
-        if of.reference == "estimated"
-        or (of.reference is None and open_sequence(of).reference() is None)
-    ]
+    return [name for name, of in given.items() if wants_estimate(of)]
 
 
 def _check(study: "OfflineStudy") -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
-from adaptune.metrics import travelled
 from adaptune.odometry.agreement import LEVER
 from adaptune.reference.consensus import HALVES
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
@@ -27,7 +26,7 @@ SHORTEST = 10.0
 FEWEST = 2
 """Registrations that must span a motion, so that it can be trusted."""
 MOST_UNKNOWN = 0.5
-"""Share of the path on which a reference may be unknown."""
+"""Share of the scans whose pose may be unknown."""
 _AGREES = (0.1, 0.02)
 """A registration agrees with the graph within so many metres and this share of its length."""
 _LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]
@@ -79,7 +78,6 @@ def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> Estim
     EstimateError
         See `estimate_reference`.
     """
-    metres = float(travelled(found.T_odom_sensor)[-1]) if len(found.stamps) else 0.0
     reach = _reach(found.T_odom_sensor)
     if reach < SHORTEST:
         raise EstimateError(
@@ -97,9 +95,9 @@ def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> Estim
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
         raise EstimateError(
-            f"{name}: on {100 * share:.0f} % of its {metres:.0f} m, scans cannot be registered to "
-            f"scans some metres before, so no reference can be estimated: the scene may be too "
-            f"bare (open water, a long corridor), or too much may move in it"
+            f"{name}: {100 * share:.0f} % of its scans cannot be registered to scans some metres "
+            f"before, so no reference can be estimated: the scene may be too bare (open water, a "
+            f"long corridor), or too much may move in it"
         )
     return reference
 

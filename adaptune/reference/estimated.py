@@ -93,14 +93,13 @@ class EstimatedReference:
         return Trajectory(self.stamps[known], self.T_world_sensor[known], BREAK)
 
     def path(self) -> float:
-        """Metres travelled."""
-        return float(travelled(self.T_world_sensor)[-1])
+        """Metres travelled, as far as it is known."""
+        T = np.where(self.known[:, None, None], self.T_world_sensor, np.nan)
+        return float(travelled(T)[-1])
 
     def unknown_share(self) -> float:
-        """Share of the path on which the reference cannot be trusted."""
-        T = np.where(self.known[:, None, None], self.T_world_sensor, np.nan)
-        path = self.path()
-        return 1.0 - float(travelled(T)[-1]) / path if path else 0.0
+        """Share of the scans whose pose is unknown."""
+        return 1.0 - float(self.known.mean())
 
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference itself.

@@ -39,7 +39,7 @@ def _in_words(stored: StoredEstimate) -> str:
     length = next((m for m in _LENGTHS if m in stored.errors), None)
     error = "" if length is None else f", wrong by {stored.error(length):.2f} % over {length:g} m"
     share = 100.0 * stored.unknown_share
-    unknown = f", unknown on {max(share, 0.1):.1f} %" if share else ""
+    unknown = f", unknown for {max(share, 0.1):.1f} % of the scans" if share else ""
     return f"{stored.metres:.0f} m{error}{unknown}"
 
 

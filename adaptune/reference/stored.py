@@ -33,7 +33,7 @@ class StoredEstimate(NamedTuple):
     metres : float
         Length of its path.
     unknown_share : float
-        Share of the path on which it cannot be trusted.
+        Share of the scans whose pose is unknown.
     errors : dict
         Its estimated mean RTE in percent, by the length of sub-trajectories in metres.
     """

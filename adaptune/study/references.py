@@ -135,7 +135,7 @@ def accuracy_in_words(stored: StoredEstimate, length: float) -> str:
     error = stored.error(length)
     own = "its own error is not known" if math.isnan(error) else f"its own error is {error:.2g} %"
     share = 100.0 * stored.unknown_share
-    return f"{own} over {length:g} m, unknown on {share:.0f} % of the path"
+    return f"{own} over {length:g} m, unknown for {share:.0f} % of the scans"
 
 
 def estimates_of(study: Study, names: Iterable[str]) -> dict[str, StoredEstimate]:

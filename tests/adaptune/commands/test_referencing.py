@@ -48,7 +48,7 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     done = adaptune(bag, "--out", "refs", "--length", "1.5")
     assert done.exit_code == 0, done.stderr
     assert re.search(
-        r"cannot be trusted on \d.* of the path, and has no poses there: 0.9-2.0 s", done.stdout
+        r"cannot be trusted on \d.* of the scans, and has no poses there: 0.9-2.0 s", done.stdout
     )
     assert "over 1.5 m" in done.stdout
     assert (tmp_path / "refs/one_reference.json").exists()
