@@ -13,6 +13,7 @@ import argparse
 import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,14 +25,17 @@ from scipy.stats import spearmanr
 
 from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
+from adaptune.model import PairedSettings, make_rule
 from adaptune.reference.estimate import estimated
 from adaptune.reference.estimated import EstimateError
 from adaptune.reference.registering import pass_over
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import simulate
+from offline import leave_one_out
 from offline.bank_simulation import chained
 from offline.labelled import LabelledData
-from offline.leave_one_out import LeftOut, Validation, leave_out
+from offline.leave_one_out import PAIRED, LeftOut, Validation
+from offline.tuning import choose
 
 LENGTH = 25.0
 
@@ -114,7 +118,6 @@ def judge(name: str, of_trials: Path, of_reference: Path) -> Judged:
 
 def agreement(courses: Sequence[Judged]) -> None:
     """Print how well the estimate agrees with the truth on each course, and over all of them."""
-    fixed = [int(sum(np.log(c.errors[by]) for c in courses).argmin()) for by in (0, 1)]
     mean = [int(sum(c.errors[by] for c in courses).argmin()) for by in (0, 1)]
     print("course    error %  says %  rank correlation  picked / best")
     rows = []
@@ -137,40 +140,54 @@ def agreement(courses: Sequence[Judged]) -> None:
         f"of the means {says.mean() / wrong.mean():.2f}",
         flush=True,
     )
-    del fixed
 
 
 def trained(data: LabelledData, estimates: LabelledData, size: int) -> None:
     """Leave each course out: banks trained on the truth, and on the estimates, judged by truth."""
     found: dict[str, list[LeftOut]] = {"truth": [], "estimate": [], "circular": []}
+    # What is chosen on the estimates does not depend on who judges it.
+    leave_one_out.choose = lru_cache(maxsize=1)(choose)
     for i, (of_truth, of_estimate) in enumerate(
         zip(data.sequences, estimates.sequences, strict=True)
     ):
         with_truth, without = (
-            d._replace(sequences=[s for j, s in enumerate(d.sequences) if j != i])
+            Others([s for j, s in enumerate(d.sequences) if j != i], d.sets)
             for d in (data, estimates)
         )
-        found["truth"].append(leave_out(of_truth, with_truth, {}, size, by_recording=True))
-        found["estimate"].append(leave_out(of_truth, without, {}, size, by_recording=True))
-        found["circular"].append(leave_out(of_estimate, without, {}, size, by_recording=True))
-    tuned = [left.errors["fixed"].mean() for left in found["truth"]]
+        for name, left, others in (
+            ("truth", of_truth, with_truth),
+            ("estimate", of_truth, without),
+            ("circular", of_estimate, without),
+        ):
+            rules: dict[str, Any] = {PAIRED: lambda _: make_rule(PAIRED, PairedSettings())}
+            found[name].append(leave_one_out.leave_out(left, others, rules, size, True))
     for name, what in (
         ("truth", "trained with truth, judged by truth"),
         ("estimate", "trained without truth, judged by truth"),
         ("circular", "trained without truth, judged by the estimate"),
     ):
         print(f"bank {what}: ", end="")
-        print_summary(Validation(found[name]), ["paired"])
-    own = [left.errors["paired"].mean() for left in found["estimate"]]
-    ratios = np.array(own) / np.array(tuned)
-    gain = [float(Validation(found[n]).summary("paired")["geometric"]) for n in ("truth",)]
+        print_summary(Validation(found[name]), [PAIRED])
+    tuned = np.array([left.errors["fixed"].mean() for left in found["truth"]])
+    without_truth = np.array([left.errors[PAIRED].mean() for left in found["estimate"]])
+    gain = Validation(found["truth"]).summary(PAIRED)["geometric"]
+    ratios = without_truth / tuned
     kept = float(np.exp(np.log(ratios).mean()))
     print(
         f"bank trained without truth / the fixed set tuned with truth: {kept:.3f}, worst "
-        f"{ratios.max():.2f}; trained with truth {gain[0]:.3f}: keeps "
-        f"{np.log(kept) / np.log(gain[0]):.0%} of the logarithmic gain",
+        f"{ratios.max():.2f}; trained with truth {gain:.3f}: keeps "
+        f"{np.log(kept) / np.log(gain):.0%} of the logarithmic gain",
         flush=True,
     )
+
+
+class Others(LabelledData):
+    """Labelled data that is known by its identity, so that choices on it can be remembered."""
+
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
 
 def of_odometry(

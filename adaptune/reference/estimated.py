@@ -13,8 +13,12 @@ from adaptune.trajectory import Trajectory
 
 BREAK = 1.0
 """Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
-HALVES_TO_WHOLE = 0.5
-"""Error of the whole reference, as a share of the difference between its two halves."""
+HALVES_TO_WHOLE = 0.725
+"""Error of the whole reference, as a share of the difference between its two halves: half of it if
+they had nothing in common, but they share what all registrations get wrong."""
+OF_BOTH = 0.03
+"""Percent. Error that both halves share even where they agree. Both figures were found on simulated
+courses, see docs/research/without-ground-truth.md."""
 
 
 class EstimateError(AdaptuneError):
@@ -118,4 +122,6 @@ class EstimatedReference:
         one, other = (np.where(known, half, np.nan) for half in self.halves)
         errors = sub_trajectory_rte(one, other, length)
         errors = errors[np.isfinite(errors)]
-        return HALVES_TO_WHOLE * float(errors.mean()) if len(errors) else float("nan")
+        if not len(errors):
+            return float("nan")
+        return float(np.hypot(HALVES_TO_WHOLE * errors.mean(), OF_BOTH))
