@@ -15,7 +15,9 @@ from adaptune.odometry.agreement import LEVER
 from adaptune.reference.consensus import HALVES
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.reference.graph import Edge, optimised, positions
+from adaptune.reference.loops import closed, loops
 from adaptune.reference.registering import LENGTHS, Guess, Pass, pass_over
+from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.trajectory import Trajectory
 
@@ -67,11 +69,24 @@ def estimate_reference(
         done += 1
         advance(done, max(n, done))
 
-    return estimated(scans.name, pass_over(scans, one), priors)
+    return estimated(scans.name, pass_over(scans, one), priors, scans)
 
 
-def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> EstimatedReference:
-    """The reference that follows from a pass over a recording; `name` is for messages.
+def estimated(
+    name: str, found: Pass, priors: Trajectory | None = None, scans: Iterable[Scan] = ()
+) -> EstimatedReference:
+    """The reference that follows from a pass over a recording.
+
+    Parameters
+    ----------
+    name
+        Of the recording, for messages.
+    found
+        What the pass has found.
+    priors
+        See `estimate_reference`.
+    scans
+        The recording, which is read again where the path comes by again; by default it is not.
 
     Raises
     ------
@@ -86,9 +101,11 @@ def estimated(name: str, found: Pass, priors: Trajectory | None = None) -> Estim
         )
     revised = _revised(found)
     T = optimised(revised.T_odom_sensor, revised.edges)
-    if priors is not None:
-        places = positions(priors, found.stamps, T)
-        T = optimised(revised.T_odom_sensor, revised.edges, places, T)
+    places = None if priors is None else positions(priors, found.stamps, T)
+    again = loops(T, np.unique([edge.end for edge in revised.edges]))
+    by_loops = closed(scans, again, T) if again else []
+    if places is not None or by_loops:
+        T = optimised(revised.T_odom_sensor, [*revised.edges, *by_loops], places, T)
     registrations = _judged(found.guesses, revised.edges, T)
     reference = EstimatedReference(
         found.stamps, T, _trusted(T, registrations), _halves(found, revised, T), registrations
