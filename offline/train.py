@@ -45,6 +45,9 @@ from offline.trial import TrialSettings, TrialSetup
 from offline.whole_runs import WholeRuns, mean_values, rivalry, run_whole, whole_values
 from offline.workers import Workers
 
+COARSE = 0.6
+"""A reference whose error is more than this share of the best set's hardly tells sets apart."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -73,13 +76,35 @@ class Training(NamedTuple):
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
         if self.fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [*self.references, f"{beaten}; the fixed set is the baseline.", baseline]
+            return [
+                *self.references,
+                *self.doubts,
+                f"{beaten}; the fixed set is the baseline.",
+                baseline,
+            ]
         return [
             *self.references,
+            *self.doubts,
             f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {_short(sets[self.fixed])}",
             baseline,
             *([self.remark] if self.remark else []),
+        ]
+
+    @property
+    def doubts(self) -> list[str]:
+        """A sentence about references that are hardly more accurate than the best sets."""
+        coarse = [
+            f"{row['sequence']} ({row['_reference_error']:.2g} against {row['own best']:.2g} %)"
+            for row in self.rows
+            if (row["_reference_error"] or 0.0) > COARSE * row["own best"]
+        ]
+        if not coarse:
+            return []
+        return [
+            f"The estimated reference is hardly more accurate than the best set on "
+            f"{', '.join(coarse)}: it pulls ratios towards 1, and sets that differ by less cannot "
+            f"be told apart. A longer sub_trajectory may help."
         ]
 
 

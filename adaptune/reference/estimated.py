@@ -13,10 +13,10 @@ from adaptune.trajectory import Trajectory
 
 BREAK = 1.0
 """Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
-HALVES_TO_WHOLE = 0.725
+HALVES_TO_WHOLE = 0.75
 """Error of the whole reference, as a share of the difference between its two halves: half of it if
 they had nothing in common, but they share what all registrations get wrong."""
-OF_BOTH = 0.03
+OF_BOTH = 0.02
 """Percent. Error that both halves share even where they agree. Both figures were found on simulated
 courses, see docs/research/without-ground-truth.md."""
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hop import Hop
+from adaptune.reference.registering import LENGTHS
 from adaptune.trajectory import Trajectory
 
 _OF_A_STEP = (0.005, 0.002)
@@ -18,7 +19,13 @@ _OF_A_STEP = (0.005, 0.002)
 _SHARE = (0.05, 0.02)
 """What each metre adds to the metres, and each radian to the radians."""
 _OF_A_HOP = (0.02, 0.003)
-"""Metres and radians by which a registration is wrong, about."""
+"""Metres and radians by which a registration over `_LONG` metres is wrong, about."""
+_LONG = LENGTHS[-1]
+_SHORTER = (1.0, 0.5)
+"""Exponents. Registrations over shorter ways are not more wrong, but many follow each other, and
+what they get wrong alike adds up: on open ground, the rings of the laser on the ground pull each
+towards no motion. So they count as more wrong: in metres as the way is shorter, in radians as its
+square root."""
 _UNKNOWN = 10.0
 """Metres by which a registration is wrong along a direction that it does not tell."""
 _OF_A_PRIOR = 1.0
@@ -149,7 +156,8 @@ def _noise(hop: Hop) -> Any:
     """Noise of a registration: rotation, then translation in the frame of its end."""
     import gtsam
 
-    metres, radians = _OF_A_HOP
+    shorter = max(1.0, _LONG / float(np.linalg.norm(hop.T_start_end[:3, 3])))
+    metres, radians = (of * shorter**by for of, by in zip(_OF_A_HOP, _SHORTER, strict=True))
     known = np.eye(3) - hop.projection
     if np.abs(known).max() < 1e-6:
         return _sigmas(metres, radians)
