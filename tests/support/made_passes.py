@@ -14,8 +14,8 @@ from adaptune.simulation.simulate import simulate
 
 STEP = 0.4
 """Metres between the scans of a made-up pass."""
-REACHES = (5, 13, 25)
-"""Scans over which it is registered: 2, 5.2 and 10 m."""
+REACHES = (6, 12, 24)
+"""Scans over which it is registered: 2.4, 4.8 and 9.6 m."""
 
 
 @cache
@@ -79,9 +79,7 @@ def pairs(n, reaches=REACHES, every=3):
 
 def guesses(T, of=None, member=-1):
     """Registrations that are right."""
-    return [
-        Guess(start, end, member, hop(T, start, end)) for start, end in of or [*pairs(len(T))]
-    ]
+    return [Guess(start, end, member, hop(T, start, end)) for start, end in of or pairs(len(T))]
 
 
 def failed(found, which):

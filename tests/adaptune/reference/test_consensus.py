@@ -49,7 +49,9 @@ def test_where_all_agree_it_moves_by_their_mean():
 def test_a_scan_is_prepared_once_for_all_members_of_a_kind(monkeypatch, kind):
     cls, prepared = odometry_class(kind), []
     prepare = cls.prepare
-    monkeypatch.setattr(cls, "prepare", lambda self, scan: prepared.append(0) or prepare(self, scan))
+    monkeypatch.setattr(
+        cls, "prepare", lambda self, scan: prepared.append(0) or prepare(self, scan)
+    )
     consensus = Consensus()
     for scan in course()[:3]:
         consensus.register(scan)

@@ -1,4 +1,5 @@
 import weakref
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -26,13 +27,20 @@ class Made:
     """Drives along poses that are made up; `answer` stands for the registration of two scans."""
 
     def __init__(self, monkeypatch, T, members=None, seconds=0.1):
-        self.T, self.stamps = T, (np.arange(len(T)) * round(seconds * 1e9)).tolist()
+        self.stamps = (np.arange(len(T)) * round(seconds * 1e9)).tolist()
         motions = np.concatenate([np.eye(4)[None], steps(T)])
-        self.members = np.repeat(motions[:, None], N_MEMBERS, 1) if members is None else members
-        self.asked, self.alive, self.most = [], weakref.WeakSet(), 0
+        members = np.repeat(motions[:, None], N_MEMBERS, 1) if members is None else members
         self.answer = lambda guess: Hop(guess, np.eye(3))
-        monkeypatch.setattr(registering, "Consensus", self._consensus)
-        self._consensus.n_members = N_MEMBERS
+        self.asked, self.alive, self.most = [], weakref.WeakSet(), 0
+        along = iter(zip(T, members, strict=True))
+
+        class Along:
+            n_members = N_MEMBERS
+
+            def register(self, _):
+                return next(along)
+
+        monkeypatch.setattr(registering, "Consensus", Along)
         monkeypatch.setattr(registering, "HopCloud", self._cloud)
         monkeypatch.setattr(registering, "register", self._register)
 
@@ -44,11 +52,8 @@ class Made:
     def pairs(self):
         return [(guess.start, guess.end) for guess in self.drive()]
 
-    class _consensus:  # noqa: N801
-        pass
-
-    def _cloud(self, scan, motion, seconds):
-        cloud = HopCloud(scan, motion, seconds)
+    def _cloud(self, *given):
+        cloud = HopCloud(*given)
         self.alive.add(cloud)
         self.most = max(self.most, len(self.alive))
         return cloud
@@ -64,17 +69,7 @@ class Made:
 
 @pytest.fixture
 def made(monkeypatch):
-    def make(T, *given, **settings):
-        drive, numbers = Made(monkeypatch, T, *given, **settings), iter(range(len(T)))
-
-        def register(_self, _scan):
-            number = next(numbers)
-            return drive.T[number], drive.members[number]
-
-        Made._consensus.register = register
-        return drive
-
-    return make
+    return partial(Made, monkeypatch)
 
 
 def ends_of(pairs):
@@ -129,28 +124,24 @@ def test_enough_registrations_begin_at_the_first_scan(made):
     assert len(set(pairs)) == len(pairs)
 
 
-def test_metres_are_those_of_the_path_not_of_the_time(made):
-    T = straight(300, 0.1)
-    found = made(T).drive()
+def test_starts_are_some_metres_back_whatever_the_speed(made):
+    T = np.array(
+        [moved(x) for x in np.concatenate([np.arange(0, 20, 0.1), np.arange(20, 60, 0.4)])]
+    )
     metres = travelled(T)
-    ways = np.array([metres[g.end] - metres[g.start] for g in found])
-    nearest = np.array(LENGTHS)[np.abs(ways[:, None] - LENGTHS).argmin(axis=1)]
-    assert (ways >= nearest - 1e-9).all()
-    # One length, and one scan that is registered, more than that.
-    assert (ways[ends_after(found, 60)] < nearest[ends_after(found, 60)] + 0.5).all()
-
-
-def ends_after(found, number):
-    return np.array([g.end > number and g.end < 299 for g in found])
+    for start, end in made(T).pairs():
+        way = metres[end] - metres[start]
+        # One scan that is registered farther, at most.
+        assert any(0.0 <= way - length + 1e-9 < 1.3 for length in LENGTHS)
 
 
 def test_few_scans_are_in_memory(made):
-    long, short = made(straight(1500)), made(straight(200))
-    long.drive()
-    short_of = made(straight(200))
-    short_of.drive()
-    assert long.most == short_of.most < 20
-    assert not short.asked
+    most = []
+    for n in (200, 1500):
+        drive = made(straight(n))
+        drive.drive()
+        most.append(drive.most)
+    assert most[0] == most[1] < 20
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
@@ -170,20 +161,17 @@ class TestGuesses:
         motions[20:, :, 0, 3] = speeds
         return motions
 
-    def drive(self, made, speeds, right=None):
+    def drive(self, made, speeds, fails=False):
         drive = made(straight(60), self.members(60, speeds))
-        if right is not None:
-            # Only a guess near the truth leads anywhere.
-            drive.answer = lambda guess: (
-                Hop(guess, np.eye(3)) if any(abs(guess[0, 3] - m) < 0.05 for m in right) else None
-            )
+        if fails:
+            drive.answer = lambda _: None
         return drive
 
     def test_members_are_not_tried_where_the_consensus_leads_there(self, made):
         assert {g.member for g in self.drive(made, (0.4, 0.6, 0.8)).drive()} == {-1}
 
     def test_members_are_tried_where_it_fails(self, made):
-        drive = self.drive(made, (0.4, 0.6, 0.8), right=())
+        drive = self.drive(made, (0.4, 0.6, 0.8), fails=True)
         found = drive.drive()
         assert all(guess.hop is None for guess in found)
         late = [g for g in found if g.start > 20]
@@ -197,7 +185,7 @@ class TestGuesses:
                 assert asked[0, 3] == pytest.approx(speed * (guess.end - guess.start))
 
     def test_members_that_agree_with_each_other_are_tried_once(self, made):
-        found = self.drive(made, (0.6, 0.61, 0.6), right=()).drive()
+        found = self.drive(made, (0.6, 0.61, 0.6), fails=True).drive()
         assert {g.member for g in found} == {-1, 0}
 
     def test_a_member_without_a_motion_moves_as_the_consensus(self, made):
