@@ -149,7 +149,9 @@ def _revised(found: Pass) -> _Revised:
             continue
         motions[first:stop] = theirs
         edges += near[best]
-    return _Revised(_chained(found.T_odom_sensor[0], motions), edges)
+    # One that spans two such runs was found twice.
+    once = {(edge.start, edge.end): edge for edge in edges}
+    return _Revised(_chained(found.T_odom_sensor[0], motions), list(once.values()))
 
 
 def _edges(guesses: Iterable[Guess], member: int) -> list[Edge]:
