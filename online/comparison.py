@@ -134,8 +134,8 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
     judged = any(row.reference == "estimated" for row in rows)
     if judged:
         caption += (
-            f" The error of an estimated reference pulls ratios towards 1; intervals allow for up "
-            f"to {ERROR_FACTOR:g} times what it is estimated at."
+            f" The error of an estimated reference pulls ratios towards 1, or hides what a mode "
+            f"has in common with it; intervals allow for {ERROR_FACTOR:g} times its estimate."
         )
     columns = [{k: v for k, v in row.columns().items() if k not in unknown} for row in rows]
     where = " on test sequences" if rows[0].yardstick == "fixed" else ""

@@ -233,7 +233,7 @@ def compare_modes(
         intervals = bootstrap(mine, others, block) if len(mine) else None
         if intervals is not None and reference.error is not None:
             judge = ERROR_FACTOR * reference.error
-            intervals = without_error(*intervals, float(others.mean()), judge)
+            intervals = allowing_for(*intervals, float(others.mean()), judge)
         rte_interval, ratio_interval = intervals or (None, None)
         rte = float(mine.mean()) if len(mine) else None
         estimated, estimated_interval = _estimated(replay)
@@ -265,13 +265,14 @@ def compare_modes(
     return rows
 
 
-def without_error(
+def allowing_for(
     rte: tuple[float, float], ratio: tuple[float, float], other: float, error: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Intervals that hold, too, what would be measured by a reference without error.
 
-    What a reference errs adds to the error of every mode, in quadrature: taken out, errors become
-    smaller, and ratios lie further from 1.
+    If what the reference errs has nothing to do with a mode, it adds to the mode's error, in
+    quadrature: taken out, errors become smaller, and ratios lie further from 1. If a mode errs as
+    the reference does, as one that averages motions may, that part of its error is not seen.
 
     Parameters
     ----------
@@ -294,7 +295,9 @@ def without_error(
         return true(end * other) / true(other)
 
     (rte_low, rte_high), (low, high) = rte, ratio
-    return (true(rte_low), rte_high), (min(low, further(low)), max(high, further(high)))
+    hidden = math.hypot(high * other, error) / other, low * other / math.hypot(other, error)
+    interval = min(low, further(low), hidden[1]), max(high, further(high), hidden[0])
+    return (true(rte_low), math.hypot(rte_high, error)), interval
 
 
 def _estimated(replay: StoredReplay) -> tuple[float | None, Interval]:

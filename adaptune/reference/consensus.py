@@ -84,7 +84,7 @@ class Consensus:
         self._bank.apply(Selection(trial=0, parameters={}, weights=even))
         self._tracker = Tracker(self._bank, HealthCheck())
 
-    def register(self, scan: Scan) -> tuple[Poses, Poses]:
+    def register(self, scan: Scan) -> tuple[Poses, Poses, bool]:
         """Register the next scan.
 
         Returns
@@ -93,7 +93,10 @@ class Consensus:
             Of the consensus.
         T_previous_current : ndarray of shape (n_members, 4, 4)
             Motions of the members; NaN where one has none.
+        registered : bool
+            False where no member could register the scan.
         """
         found = self._tracker.register(scan)
         members = self._bank.motions.members
-        return found.T_odom_sensor, np.array([members[i] for i in range(self.n_members)])
+        T_previous_current = np.array([members[i] for i in range(self.n_members)])
+        return found.T_odom_sensor, T_previous_current, found.registered

@@ -5,6 +5,7 @@ also registered directly to scans some metres before. A pose graph brings both t
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +15,9 @@ from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angl
 from adaptune.odometry.agreement import LEVER
 from adaptune.reference.consensus import HALVES
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
-from adaptune.reference.graph import Edge, optimised, positions
+from adaptune.reference.graph import Edge, Positions, optimised, positions
 from adaptune.reference.loops import closed, loops
-from adaptune.reference.registering import LENGTHS, Guess, Pass, pass_over
+from adaptune.reference.registering import LENGTHS, SPACING, Guess, Pass, pass_over
 from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.trajectory import Trajectory
@@ -62,18 +63,21 @@ def estimate_reference(
     EstimateError
         If the recording does not allow it: the robot hardly moves, or nothing can be registered.
     """
-    done, n = 0, scans.n_messages
+    n = scans.n_messages
 
-    def one() -> None:
-        nonlocal done
-        done += 1
-        advance(done, max(n, done))
+    def one_more() -> Callable[[], None]:
+        done = count(1)
+        return lambda: advance(i := next(done), max(n, i))
 
-    return estimated(scans.name, pass_over(scans, one), priors, scans)
+    return estimated(scans.name, pass_over(scans, one_more()), priors, scans, one_more())
 
 
 def estimated(
-    name: str, found: Pass, priors: Trajectory | None = None, scans: Iterable[Scan] = ()
+    name: str,
+    found: Pass,
+    priors: Trajectory | None = None,
+    scans: Iterable[Scan] = (),
+    advance: Callable[[], None] = lambda: None,
 ) -> EstimatedReference:
     """The reference that follows from a pass over a recording.
 
@@ -86,29 +90,30 @@ def estimated(
     priors
         See `estimate_reference`.
     scans
-        The recording, which is read again where the path comes by again; by default it is not.
+        The recording, which is read again if the path comes by again; by default it is not.
+    advance
+        Called after every scan that is read again.
 
     Raises
     ------
     EstimateError
         See `estimate_reference`.
     """
-    reach = _reach(found.T_odom_sensor)
-    if reach < SHORTEST:
-        raise EstimateError(
-            f"{name}: the robot comes {reach:.1f} m far, and a reference needs {SHORTEST:g} m: "
-            f"record a longer drive"
-        )
+    _check(name, found)
     revised = _revised(found)
     T = optimised(revised.T_odom_sensor, revised.edges)
     places = None if priors is None else positions(priors, found.stamps, T)
     again = loops(T, np.unique([edge.end for edge in revised.edges]))
-    by_loops = closed(scans, again, T) if again else []
+    by_loops = closed(scans, again, T, advance) if again else []
     if places is not None or by_loops:
         T = optimised(revised.T_odom_sensor, [*revised.edges, *by_loops], places, T)
     registrations = _judged(found.guesses, revised.edges, T)
     reference = EstimatedReference(
-        found.stamps, T, _trusted(T, registrations), _halves(found, revised, T), registrations
+        found.stamps,
+        T,
+        _trusted(T, registrations, revised.edges),
+        _halves(found, [*revised.edges, *by_loops], places, T),
+        registrations,
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
         raise EstimateError(
@@ -126,12 +131,29 @@ class _Revised(NamedTuple):
     edges: list[Edge]
 
 
-def _reach(T_odom_sensor: Poses) -> float:
-    """Metres from the first pose to the one farthest from it."""
-    if not len(T_odom_sensor):
-        return 0.0
-    away = T_odom_sensor[:, :3, 3] - T_odom_sensor[0, :3, 3]
-    return float(np.linalg.norm(away, axis=1).max())
+def _check(name: str, found: Pass) -> None:
+    """Refuse a recording by which nothing can be judged."""
+    way = _way(found.T_odom_sensor[:, :3, 3])
+    if way >= SHORTEST:
+        return
+    if found.registered.mean() < 0.5:
+        raise EstimateError(
+            f"{name}: most of its {len(found.stamps)} scans cannot be registered to each other: "
+            f"see with `adaptune inspect` how many points they have"
+        )
+    raise EstimateError(
+        f"{name}: by its scans, the robot comes {way:.1f} m far, and a reference needs "
+        f"{SHORTEST:g} m: record a longer drive, in a place that does not look the same all along"
+    )
+
+
+def _way(positions: NDArray[np.float64]) -> float:
+    """Metres along positions of shape (n, 3); jitter of a robot that stands adds nothing."""
+    way, last = 0.0, positions[0]
+    for position in positions:
+        if (metres := float(np.linalg.norm(position - last))) >= SPACING[0]:
+            way, last = way + metres, position
+    return way
 
 
 def _revised(found: Pass) -> _Revised:
@@ -208,11 +230,14 @@ def _judged(guesses: Sequence[Guess], edges: Sequence[Edge], T: Poses) -> Regist
     return Registrations(starts, ends, accepted, residual)
 
 
-def _trusted(T_world_sensor: Poses, found: Registrations) -> NDArray[np.bool_]:
+def _trusted(
+    T_world_sensor: Poses, found: Registrations, edges: Sequence[Edge]
+) -> NDArray[np.bool_]:
     """Which motions from scan to scan can be trusted, of shape (n - 1,).
 
-    Enough registrations must confirm a motion, and no more speak against it: those that differ, and
-    those over short ways that fail. Over the longest way, scans may have too little in common.
+    Enough registrations must confirm a motion, in every direction, and no more speak against it:
+    those that differ, and those over short ways that fail. Over the longest way, scans may have too
+    little in common.
     """
     n = len(T_world_sensor)
     way = (invert(T_world_sensor[found.start]) @ T_world_sensor[found.end])[:, :3, 3]
@@ -221,17 +246,37 @@ def _trusted(T_world_sensor: Poses, found: Registrations) -> NDArray[np.bool_]:
     confirmed, doubted = (
         _spanning(n, found.start[which], found.end[which]) for which in (found.accepted, against)
     )
-    return (confirmed >= FEWEST) & ((doubted < FEWEST) | (confirmed >= doubted))
+    known = _in_every_direction(T_world_sensor, found, edges) >= FEWEST - 1e-3
+    return known & ((doubted < FEWEST) | (confirmed >= doubted))
 
 
-def _halves(found: Pass, revised: _Revised, T_world_sensor: Poses) -> Poses:
+def _in_every_direction(
+    T_world_sensor: Poses, found: Registrations, edges: Sequence[Edge]
+) -> NDArray[np.float64]:
+    """How many registrations confirm the motion from each scan to the next where it is least known.
+
+    A registration along a bare corridor does not tell how far it went.
+    """
+    known = {(edge.start, edge.end): edge.hop.projection for edge in edges}
+    changes = np.zeros((len(T_world_sensor), 3, 3))
+    for start, end in zip(found.start[found.accepted], found.end[found.accepted], strict=True):
+        R = T_world_sensor[start, :3, :3]
+        projection = R @ known[start, end] @ R.T
+        changes[start] += projection
+        changes[end] -= projection
+    return np.asarray(np.linalg.eigvalsh(np.cumsum(changes, axis=0)[:-1])[:, 0])
+
+
+def _halves(
+    found: Pass, edges: Sequence[Edge], places: Positions | None, T_world_sensor: Poses
+) -> Poses:
     """The reference twice, each from half of the pool and half of the scans: (2, n, 4, 4)."""
-    ends = {end: i % 2 for i, end in enumerate(sorted({edge.end for edge in revised.edges}))}
+    ends = {end: i % 2 for i, end in enumerate(sorted({edge.end for edge in edges}))}
     halves = []
     for half, members in enumerate(HALVES):
         T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
-        edges = [edge for edge in revised.edges if ends[edge.end] == half]
-        halves.append(optimised(T, edges, T_first_guess=T_world_sensor))
+        own = [edge for edge in edges if ends[edge.end] == half]
+        halves.append(optimised(T, own, places, T_world_sensor))
     return np.array(halves)
 
 

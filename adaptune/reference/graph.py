@@ -140,7 +140,10 @@ def _aligned(of: NDArray[np.float64], to: NDArray[np.float64]) -> Poses:
 
     T = np.eye(4)
     if len(of) > 2:
-        R, _ = Rotation.align_vectors(to - to.mean(axis=0), of - of.mean(axis=0))
+        # Along a straight way, only what is up tells how the path lies: the sensor's at the start.
+        up = np.array([[0.0, 0.0, np.ptp(to, axis=0).max()]])
+        pairs = (np.concatenate([x - x.mean(axis=0), up]) for x in (to, of))
+        R, _ = Rotation.align_vectors(*pairs)
         T[:3, :3] = R.as_matrix()
         T[:3, 3] = to.mean(axis=0) - T[:3, :3] @ of.mean(axis=0)
     return T

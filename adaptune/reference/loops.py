@@ -1,6 +1,6 @@
 """Registrations where the path comes by again."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -48,17 +48,25 @@ def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
         return []
     places, metres = T_world_sensor[numbers, :3, 3], travelled(T_world_sensor)[numbers]
     found: list[Loop] = []
-    last = -np.inf
-    for j, near in enumerate(cKDTree(places).query_ball_point(places, NEAR)):
-        before = [i for i in near if metres[j] - metres[i] > LATER]
-        if before and metres[j] - last >= EVERY:
+    last, tree = -np.inf, cKDTree(places)
+    for j in range(len(numbers)):
+        if metres[j] - last < EVERY:
+            continue
+        if before := [
+            i for i in tree.query_ball_point(places[j], NEAR) if metres[j] - metres[i] > LATER
+        ]:
             away = np.linalg.norm(places[before] - places[j], axis=1)
             found.append(Loop(int(numbers[before[int(away.argmin())]]), int(numbers[j])))
             last = metres[j]
     return found[:: -(-len(found) // MOST)] if found else []
 
 
-def closed(scans: Iterable[Scan], wanted: Iterable[Loop], T_world_sensor: Poses) -> list[Edge]:
+def closed(
+    scans: Iterable[Scan],
+    wanted: Iterable[Loop],
+    T_world_sensor: Poses,
+    advance: Callable[[], None] = lambda: None,
+) -> list[Edge]:
     """Register the scans of loops, which takes another pass over the recording.
 
     Parameters
@@ -69,6 +77,8 @@ def closed(scans: Iterable[Scan], wanted: Iterable[Loop], T_world_sensor: Poses)
         The loops.
     T_world_sensor
         The path as it is known so far, of shape (n, 4, 4).
+    advance
+        Called after every scan.
     """
     wanted = list(wanted)
     numbers, motions = {number for loop in wanted for number in loop}, steps(T_world_sensor)
@@ -77,8 +87,10 @@ def closed(scans: Iterable[Scan], wanted: Iterable[Loop], T_world_sensor: Poses)
     for number, scan in enumerate(scans):
         if last is not None and number - 1 in numbers:
             seconds = (scan.stamp - last.stamp) * 1e-9
-            clouds[number - 1] = HopCloud(last, motions[number - 1], seconds)
+            cloud = clouds[number - 1] = HopCloud(last, motions[number - 1], seconds)
+            _ = cloud.prepared  # the scan itself is not kept
         last = scan
+        advance()
     metres, edges = travelled(T_world_sensor), []
     for start, end in wanted:
         if start not in clouds or end not in clouds:

@@ -61,6 +61,8 @@ class Pass:
         Of the consensus.
     T_previous_current : ndarray of shape (n, n_members, 4, 4)
         Motions of the members; NaN where one has none.
+    registered : ndarray of shape (n,)
+        Whether any member could register the scan.
     guesses : list of Guess
         All registrations, by end, start, and member.
     """
@@ -68,6 +70,7 @@ class Pass:
     stamps: NDArray[np.int64]
     T_odom_sensor: Poses
     T_previous_current: Poses
+    registered: NDArray[np.bool_]
     guesses: Sequence[Guess]
 
 
@@ -97,18 +100,21 @@ def pass_over(scans: Iterable[Scan], advance: Callable[[], None] = lambda: None)
     stamps: list[int] = []
     poses: list[Poses] = []
     motions: list[Poses] = []
+    registered: list[bool] = []
     for scan in scans:
-        T_odom_sensor, T_previous_current = consensus.register(scan)
+        T_odom_sensor, T_previous_current, sound = consensus.register(scan)
         registering.add(scan, T_odom_sensor, T_previous_current)
         stamps.append(scan.stamp)
         poses.append(T_odom_sensor)
         motions.append(T_previous_current)
+        registered.append(sound)
         advance()
     registering.end()
     return Pass(
         np.array(stamps, np.int64),
         np.array(poses).reshape(-1, 4, 4),
         np.array(motions).reshape(-1, Consensus.n_members, 4, 4),
+        np.array(registered, bool),
         registering.guesses,
     )
 

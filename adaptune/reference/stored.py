@@ -13,6 +13,8 @@ from adaptune.trajectory import write_tum
 
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 """Metres over which the error of a reference is noted."""
+_BEYOND = 1.5
+"""By how much a length may exceed the longest that is noted."""
 
 CHECK = ".check"
 """Ends the name of an estimate that is compared with a given reference, and used for nothing
@@ -61,9 +63,11 @@ class StoredEstimate(NamedTuple):
 
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
-        if not self.errors:
-            return math.nan
         lengths = sorted(self.errors)
+        if not lengths or length > _BEYOND * lengths[-1]:
+            return math.nan
+        if length < lengths[0]:  # as many metres as over the shortest
+            return self.errors[lengths[0]] * lengths[0] / length
         values = np.log([max(self.errors[known], 1e-4) for known in lengths])
         return float(np.exp(np.interp(np.log(length), np.log(lengths), values)))
 
