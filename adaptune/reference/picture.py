@@ -73,4 +73,5 @@ def _draw_residuals(axes: Any, found: EstimatedReference) -> None:
     log_scale(axes)
     title = "registrations over 2, 5 and 10 m"
     axes.set(title=title, xlabel="time [s]", ylabel="differ from the reference by [cm]")
-    axes.legend(loc="upper right", ncols=3)
+    if len(at):
+        axes.legend(loc="upper right", ncols=3)

@@ -148,7 +148,7 @@ class TestMembers:
     def test_one_takes_over_where_registrations_confirm_it(self):
         found = estimated("a", self.passed(3))
         off = np.linalg.norm((steps(found.T_world_sensor) - steps(TRUTH))[:, :3, 3], axis=1)
-        assert off.max() < 0.01
+        assert off.max() < 0.02
         assert found.trusted.all()
         # Elsewhere the consensus stays, which is better there.
         assert off[:40].max() < 0.001
@@ -281,7 +281,7 @@ class TestHalves:
         made = made_pass(TRUTH, guesses(TRUTH), motions)
         found = estimated("a", made)
         longer = [np.linalg.norm(steps(half)[-3:, :3, 3], axis=1).mean() for half in found.halves]
-        assert longer[0] > longer[1] + 0.002
+        assert longer[0] > longer[1] + 0.0002
         assert found.error(5.0) > estimated("a", made_pass(TRUTH, guesses(TRUTH))).error(5.0)
 
     def test_registrations_that_differ_from_scan_to_scan_part_them(self):
@@ -311,15 +311,15 @@ class TestHalves:
 
 
 def test_positions_are_right_over_long_ways():
-    T = winding(500)
-    wrong = chained(steps(T) @ moved(yaw=5e-5))
+    T = winding(500, 2.0)
+    wrong = chained(steps(T) @ moved(yaw=1e-4))
     # Registrations share the bias.
-    made = made_pass(wrong, guesses(wrong))
+    made = made_pass(wrong, guesses(wrong, pairs(500, (1, 3, 5), 1)), seconds=0.5)
     given = moved(100.0, 200.0, yaw=1.0) @ T
     alone = estimated("a", made)
     joined = estimated("a", made, Trajectory(made.stamps, given))
     before, after = (
-        np.nanmean(sub_trajectory_rte(T, found.T_world_sensor, 150.0)) for found in (alone, joined)
+        np.nanmean(sub_trajectory_rte(T, found.T_world_sensor, 500.0)) for found in (alone, joined)
     )
     assert after < 0.3 * before
 

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -92,7 +94,7 @@ def test_gaps_are_where_poses_are_unknown(found):
     for first, stop in gaps:
         assert first < stop
         inside |= (seconds > first) & (seconds < stop)
-    assert all(stop <= first for (_, stop), (first, _) in zip(gaps, gaps[1:], strict=False))
+    assert all(stop <= first for (_, stop), (first, _) in pairwise(gaps))
     inside[-1] |= bool(gaps) and gaps[-1][1] == seconds[-1] and not found.known[-1]
     np.testing.assert_array_equal(inside, ~found.known)
 

@@ -1,0 +1,141 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_passes import straight
+from made_references import made_of
+
+from adaptune.reference.estimated import EstimateError
+from adaptune.reference.stored import CHECK, StoredEstimate, stored_estimates, write_estimate
+from adaptune.trajectory import read_tum
+
+ABOUT = {"bag": "drive.bag", "topics": ["/points"], "version": 1}
+
+
+def reference(n=201, lost=(50,)):
+    stamps = 1_600_000_000_123_456_789 + np.arange(n, dtype=np.int64) * 10**8
+    return made_of(stamps, straight(n), lost=lost)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """An estimate, and what was stored of it."""
+    path = tmp_path_factory.mktemp("estimates") / "new" / "drive.tum"
+    return path, write_estimate(path, reference(), ABOUT)
+
+
+def of_errors(errors):
+    return StoredEstimate(Path("a.tum"), {}, 9, 9.0, 0.0, errors)
+
+
+def test_what_is_written_is_read(written):
+    path, stored = written
+    assert StoredEstimate.read(path) == stored
+    found = reference()
+    assert stored.about == ABOUT
+    assert stored.scans == 201
+    assert stored.metres == pytest.approx(found.path(), abs=1e-3)
+    assert stored.unknown_share == pytest.approx(found.unknown_share(), abs=1e-4)
+    assert list(stored.errors) == [1.0, 2.0, 5.0, 10.0, 25.0, 50.0]  # a path of 60 m, in two parts
+    for length, error in stored.errors.items():
+        assert error == pytest.approx(found.error(length), abs=1e-4)
+
+
+def test_its_poses_are_those_that_are_known(written):
+    trajectory, known = read_tum(written[0]), reference().trajectory()
+    np.testing.assert_array_equal(trajectory.stamps, known.stamps)
+    np.testing.assert_allclose(trajectory.T_world_sensor, known.T_world_sensor, atol=1e-6)
+
+
+def test_it_is_plain_data_beside_a_picture(written):
+    path, stored = written
+    assert {file.name for file in path.parent.iterdir()} == {"drive.tum", "drive.png", "drive.json"}
+    known = json.loads(path.with_suffix(".json").read_text())
+    assert set(known) == {"about", "scans", "metres", "unknown_share", "error_percent"}
+    assert known["error_percent"]["10.0"] == stored.errors[10.0]
+
+
+def test_what_is_known_is_written_last(tmp_path, monkeypatch):
+    def fails(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("adaptune.reference.picture.draw_estimate", fails)
+    with pytest.raises(KeyboardInterrupt):
+        write_estimate(tmp_path / "drive.tum", reference(), ABOUT)
+    assert StoredEstimate.read(tmp_path / "drive.tum") is None
+
+
+def test_between_lengths_the_error_is_in_between():
+    stored = of_errors({100.0: 0.1, 1.0: 10.0, 10.0: 1.0})
+    assert stored.error(10.0) == pytest.approx(1.0)
+    # Both are halfway when they are logarithms.
+    assert stored.error(math.sqrt(10.0)) == pytest.approx(math.sqrt(10.0))
+    assert stored.error(50.0) == pytest.approx(0.2)
+    assert stored.error(0.1) == pytest.approx(10.0)
+    assert stored.error(1e4) == pytest.approx(0.1)
+
+
+@given(st.floats(1.0, 100.0), st.floats(0.0, 20.0), st.floats(0.0, 20.0))
+def test_it_is_never_beyond_those_beside_it(length, one, other):
+    stored = of_errors({1.0: one, 100.0: other})
+    low, high = sorted(max(error, 1e-4) for error in (one, other))
+    assert low * 0.999 <= stored.error(length) <= high * 1.001
+
+
+def test_without_any_length_the_error_is_unknown(tmp_path):
+    assert math.isnan(of_errors({}).error(10.0))
+    stored = write_estimate(tmp_path / "short.tum", reference(3, ()), {})
+    assert stored.errors == {}
+    assert StoredEstimate.read(tmp_path / "short.tum") == stored
+
+
+def test_a_file_that_is_no_estimate_is_none(tmp_path):
+    (tmp_path / "given.tum").write_text("1 0 0 0 0 0 0 1\n")
+    assert StoredEstimate.read(tmp_path / "given.tum") is None
+    assert StoredEstimate.read(tmp_path / "missing.tum") is None
+
+
+WHOLE = {"about": {}, "scans": 9, "metres": 9.0, "unknown_share": 0.0, "error_percent": {"5": 1}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        json.dumps(WHOLE)[:40],
+        "[]",
+        "null",
+        "\udcff",
+        *(json.dumps({k: v for k, v in WHOLE.items() if k != left}) for left in WHOLE),
+        json.dumps(WHOLE | {"about": 3}),
+        json.dumps(WHOLE | {"scans": "many"}),
+        json.dumps(WHOLE | {"metres": None}),
+        json.dumps(WHOLE | {"error_percent": [1.0]}),
+        json.dumps(WHOLE | {"error_percent": {"five": 1.0}}),
+        json.dumps(WHOLE | {"error_percent": {"5": {}}}),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path, text):
+    file = tmp_path / "drive.json"
+    file.write_text(text, errors="surrogateescape")
+    with pytest.raises(EstimateError, match=r"drive\.json: is damaged .*; remove it and drive.tum"):
+        StoredEstimate.read(tmp_path / "drive.tum")
+
+
+def test_a_sound_file_is_read(tmp_path):
+    (tmp_path / "drive.json").write_text(json.dumps(WHOLE))
+    assert StoredEstimate.read(tmp_path / "drive.tum").errors == {5.0: 1.0}
+
+
+def test_the_estimates_of_a_folder(tmp_path):
+    for name in ("b", "a", f"c{CHECK}"):
+        (tmp_path / f"{name}.tum").touch()
+        (tmp_path / f"{name}.json").write_text(json.dumps(WHOLE))
+    (tmp_path / "given.tum").touch()
+    (tmp_path / "d.json").write_text(json.dumps(WHOLE))
+    assert [stored.path.name for stored in stored_estimates(tmp_path)] == ["a.tum", "b.tum"]
+    assert stored_estimates(tmp_path / "nowhere") == []
