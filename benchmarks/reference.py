@@ -26,7 +26,7 @@ from scipy.stats import spearmanr
 from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.model import PairedSettings, make_rule
-from adaptune.reference.estimate import estimated
+from adaptune.reference.estimate import VERSION, estimated
 from adaptune.reference.estimated import EstimateError
 from adaptune.reference.registering import pass_over
 from adaptune.simulation import Course
@@ -44,7 +44,7 @@ def reference(path: Path, course: Course) -> None:
     """Estimate the reference of a course, and keep it."""
     scans = list(simulate(course))
     begin = time.process_time()
-    found = estimated(path.stem, pass_over(scans))
+    found = estimated(path.stem, pass_over(scans), scans=scans)
     seconds = (time.process_time() - begin) / len(scans)
     T = np.where(found.known[:, None, None], found.T_world_sensor, np.nan)
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -62,7 +62,7 @@ def references(folder: Path, courses: Mapping[str, Course], seed: int) -> dict[s
     """Estimate what is missing, and return the files; courses that are refused have none."""
     paths = {}
     for name, course in courses.items():
-        path = folder / f"reference-{seed}-{course.length:.0f}-{name}.npz"
+        path = folder / f"reference-{VERSION}-{seed}-{course.length:.0f}-{name}.npz"
         try:
             if not path.exists():
                 reference(path, course)
@@ -75,7 +75,7 @@ def references(folder: Path, courses: Mapping[str, Course], seed: int) -> dict[s
             wrong = cap(errors[~np.isnan(errors)]).mean()
             print(
                 f"{seed} {name:8} wrong by {wrong:.3f} %, says {float(found['error']):.3f} %; "
-                f"unknown on {100 * float(found['unknown']):.1f} % of the path, "
+                f"unknown for {100 * float(found['unknown']):.1f} % of the scans, "
                 f"{1e3 * float(found['seconds']):.0f} ms a scan",
                 flush=True,
             )
@@ -211,13 +211,8 @@ def pooled(worlds: Iterable[Sequence[Judged]]) -> list[Judged]:
     """The same courses with the sets of all odometries side by side."""
     by_course = zip(*worlds, strict=True)
     return [
-        replace_errors(of[0], np.concatenate([c.errors for c in of], axis=1)) for of in by_course
+        of[0]._replace(errors=np.concatenate([c.errors for c in of], axis=1)) for of in by_course
     ]
-
-
-def replace_errors(judged: Judged, errors: NDArray[np.float64]) -> Judged:
-    """The same course with other sets."""
-    return judged._replace(errors=errors)
 
 
 def main() -> None:
