@@ -133,10 +133,10 @@ class _Revised(NamedTuple):
 
 def _check(name: str, found: Pass) -> None:
     """Refuse a recording by which nothing can be judged."""
-    way = _way(found.T_odom_sensor[:, :3, 3])
+    way = _way(found.T_odom_sensor[:, :3, 3]) if len(found.stamps) else 0.0
     if way >= SHORTEST:
         return
-    if found.registered.mean() < 0.5:
+    if len(found.stamps) and found.registered[1:].mean() < 0.5:
         raise EstimateError(
             f"{name}: most of its {len(found.stamps)} scans cannot be registered to each other: "
             f"see with `adaptune inspect` how many points they have"

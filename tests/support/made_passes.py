@@ -93,4 +93,10 @@ def made_pass(T, found, members=None, seconds=0.1):
     motions = np.concatenate([np.eye(4)[None], steps(T)])
     if members is None:
         members = np.repeat(motions[:, None], Consensus.n_members, axis=1)
-    return Pass(stamps, T, members, sorted(found, key=lambda g: (g.end, g.start, g.member)))
+    return Pass(
+        stamps,
+        T,
+        members,
+        np.ones(len(T), bool),
+        sorted(found, key=lambda g: (g.end, g.start, g.member)),
+    )

@@ -63,10 +63,11 @@ def test_a_scan_is_prepared_once_for_all_members_of_a_kind(monkeypatch, kind):
 def test_scans_without_points_leave_it_moving_on():
     consensus = Consensus()
     for scan in course()[:8]:
-        before, _ = consensus.register(scan)
+        before, *_ = consensus.register(scan)
     stamp = course()[8].stamp
     empty = Scan(stamp, np.zeros((0, 3), np.float32))
-    T, members = consensus.register(empty)
+    T, members, registered = consensus.register(empty)
     assert np.isfinite(T).all()
     assert np.linalg.norm((T - before)[:3, 3]) < 1.0
     assert members.shape == (Consensus.n_members, 4, 4)
+    assert not registered

@@ -91,14 +91,28 @@ class TestRefusals:
     def test_a_robot_that_hardly_moves(self):
         scan, told = course()[0], []
         still = Recorded(Scan(scan.stamp + i * 10**8, scan.points) for i in range(5))
-        with pytest.raises(EstimateError, match=r"^some.bag: the robot comes 0\.\d m far.* 10 m: "):
+        with pytest.raises(
+            EstimateError, match=r"^some.bag: by its scans, the robot comes 0\.\d m far.* 10 m: "
+        ):
             estimate_reference(still, lambda *done: told.append(done))
         assert told == [(1, 3), (2, 3), (3, 3), (4, 4), (5, 5)]
 
-    def test_a_robot_that_turns_on_the_spot_however_long(self):
+    def test_a_robot_that_drives_round_a_small_room_is_not_refused(self):
         T = chained([moved(x=0.2, yaw=0.1)] * 300)
-        with pytest.raises(EstimateError, match=r"comes 4\.0 m far"):
-            estimated("a", made_pass(T, guesses(T)))
+        assert estimated("a", made_pass(T, guesses(T))).path() > 50.0
+
+    def test_scans_without_points(self):
+        scans = Recorded(Scan(i * 10**8, np.zeros((5, 3), np.float32)) for i in range(20))
+        with pytest.raises(EstimateError, match=r"most of its 20 scans cannot be registered"):
+            estimate_reference(scans)
+
+    def test_a_corridor_that_does_not_tell_how_far(self):
+        blind = [
+            g._replace(hop=g.hop._replace(projection=np.diag([0.0, 1.0, 1.0])))
+            for g in guesses(straight(N))
+        ]
+        with pytest.raises(EstimateError, match=r"% of its scans cannot be registered"):
+            estimated("a", made_pass(straight(N), blind))
 
     def test_no_scans(self):
         with pytest.raises(EstimateError, match=r"comes 0\.0 m far"):
@@ -262,8 +276,13 @@ class TestTrust:
     def test_what_a_registration_does_not_tell_is_no_disagreement(self):
         along = (0.6, 0.0, 0.0)
         T = straight(N)
-        blind = [g._replace(hop=hop(T, *g[:2], along, unknown=[0])) for g in guesses(T)]
-        found = estimated("a", made_pass(T, blind))
+        # Every second one tells all directions.
+        some = [
+            g._replace(hop=hop(T, *g[:2], along, unknown=[0])) if g.end % 6 else g
+            for g in guesses(T)
+        ]
+        found = estimated("a", made_pass(T, some))
+        assert found.trusted.all()
         assert found.registrations.residual.max() < 0.02
 
     def test_a_motion_that_one_registration_spans_is_not_trusted(self):
@@ -330,7 +349,7 @@ def test_where_the_path_comes_by_again_scans_are_registered(monkeypatch):
     wrong = chained(lap @ moved(yaw=4e-5))
     made = made_pass(wrong, guesses(wrong))
 
-    def closed(scans, wanted, known):
+    def closed(scans, wanted, known, _):
         asked.append((scans, wanted))
         assert np.shape(known) == T.shape
         return [estimate.Edge(*loop, hop(T, *loop)) for loop in wanted]

@@ -38,7 +38,7 @@ class Made:
             n_members = N_MEMBERS
 
             def register(self, _):
-                return next(along)
+                return *next(along), True
 
         monkeypatch.setattr(registering, "Consensus", Along)
         monkeypatch.setattr(registering, "HopCloud", self._cloud)

@@ -75,8 +75,10 @@ def test_between_lengths_the_error_is_in_between():
     # Both are halfway when they are logarithms.
     assert stored.error(math.sqrt(10.0)) == pytest.approx(math.sqrt(10.0))
     assert stored.error(50.0) == pytest.approx(0.2)
-    assert stored.error(0.1) == pytest.approx(10.0)
-    assert stored.error(1e4) == pytest.approx(0.1)
+    # Over less than the shortest, it is wrong by as many metres.
+    assert stored.error(0.1) == pytest.approx(100.0)
+    assert stored.error(140.0) == pytest.approx(0.1)
+    assert math.isnan(stored.error(160.0))
 
 
 @given(st.floats(1.0, 100.0), st.floats(0.0, 20.0), st.floats(0.0, 20.0))
