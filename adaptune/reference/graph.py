@@ -37,11 +37,15 @@ _ITERATIONS = 50
 
 
 class Edge(NamedTuple):
-    """A registration between two scans, by their numbers."""
+    """A registration between two scans, by their numbers.
+
+    `again` says whether the path came by again, and so the scans are no few metres of it apart.
+    """
 
     start: int
     end: int
     hop: Hop
+    again: bool = False
 
 
 def optimised(
@@ -82,9 +86,10 @@ def optimised(
             _OF_A_STEP[0] + _SHARE[0] * metres[i], _OF_A_STEP[1] + _SHARE[1] * radians[i]
         )
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(T), _robust(noise)))
-    for start, end, hop in edges:
-        motion = gtsam.Pose3(hop.T_start_end)
-        graph.add(gtsam.BetweenFactorPose3(start, end, motion, _robust(_noise(hop))))
+    for edge in edges:
+        motion = gtsam.Pose3(edge.hop.T_start_end)
+        noise = _robust(_noise(edge))
+        graph.add(gtsam.BetweenFactorPose3(edge.start, edge.end, motion, noise))
     # Positions say themselves where the first pose is.
     first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6 if places is None else _UNKNOWN)
     graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
@@ -155,11 +160,13 @@ def _sigmas(metres: float, radians: float) -> Any:
     return gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3))
 
 
-def _noise(hop: Hop) -> Any:
+def _noise(edge: Edge) -> Any:
     """Noise of a registration: rotation, then translation in the frame of its end."""
     import gtsam
 
-    shorter = max(1.0, _LONG / float(np.linalg.norm(hop.T_start_end[:3, 3])))
+    hop = edge.hop
+    way = float(np.linalg.norm(hop.T_start_end[:3, 3]))
+    shorter = 1.0 if edge.again else _LONG / np.clip(way, LENGTHS[0], _LONG)
     metres, radians = (of * shorter**by for of, by in zip(_OF_A_HOP, _SHORTER, strict=True))
     known = np.eye(3) - hop.projection
     if np.abs(known).max() < 1e-6:

@@ -99,5 +99,5 @@ def closed(
         hop = register(clouds[start], clouds[end], [T])
         most = max(_DEPARTURE[0], _DEPARTURE[1] * (metres[end] - metres[start]))
         if hop is not None and np.linalg.norm(hop.T_start_end[:3, 3] - T[:3, 3]) <= most:
-            edges.append(Edge(start, end, hop))
+            edges.append(Edge(start, end, hop, again=True))
     return edges

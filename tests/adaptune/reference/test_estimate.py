@@ -352,7 +352,7 @@ def test_where_the_path_comes_by_again_scans_are_registered(monkeypatch):
     def closed(scans, wanted, known, _):
         asked.append((scans, wanted))
         assert np.shape(known) == T.shape
-        return [estimate.Edge(*loop, hop(T, *loop)) for loop in wanted]
+        return [estimate.Edge(*loop, hop(T, *loop), again=True) for loop in wanted]
 
     monkeypatch.setattr(estimate, "closed", closed)
     scans = SimpleNamespace()
