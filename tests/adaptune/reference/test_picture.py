@@ -85,7 +85,7 @@ def test_a_short_one_tells_the_error_over_less(tmp_path):
 
 def test_a_little_that_is_unknown_is_not_nothing(tmp_path):
     assert "unknown" not in title_of(tmp_path / "a.png", reference())
-    found = reference(2001, lost=[1999])
+    found = reference(4001, lost=[3999])
     assert "unknown for 0.1 % of the scans" in title_of(tmp_path / "a.png", found)
 
 

@@ -191,9 +191,12 @@ class TestGuesses:
     def test_a_member_without_a_motion_moves_as_the_consensus(self, made):
         motions = self.members(60, (0.4, 0.4, 0.6))
         motions[:, 1] = np.nan
+        motions[30, 2] = np.nan
         drive = made(straight(60), motions)
         drive.answer = lambda _: None
-        assert {g.member for g in drive.drive()} == {-1, 2}
+        found = drive.drive()
+        assert {g.member for g in found} == {-1, 2}
+        assert {g.member for g in found if g.start > 30} == {-1, 2}
         assert np.isfinite(drive.asked).all()
 
     @pytest.mark.parametrize(("beyond", "kept"), [(-0.02, True), (0.02, False)])
