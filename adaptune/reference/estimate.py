@@ -28,6 +28,8 @@ SHORTEST = 10.0
 """Metres. On a shorter path, nothing is known about any odometry."""
 FEWEST = 2
 """Registrations that must span a motion, so that it can be trusted."""
+N_GRAPHS = 4
+"""Pose graphs for one reference: twice the whole, and its halves."""
 MOST_UNKNOWN = 0.5
 """Share of the scans whose pose may be unknown."""
 _AGREES = (0.1, 0.02)
@@ -63,13 +65,22 @@ def estimate_reference(
     EstimateError
         If the recording does not allow it: the robot hardly moves, or nothing can be registered.
     """
-    n = scans.n_messages
+    n, done = scans.n_messages, count(1)
+    # What comes after the pass takes a while, too.
+    after = max(1, n // (20 * N_GRAPHS)) if n else 1
 
-    def one_more() -> Callable[[], None]:
-        done = count(1)
-        return lambda: advance(i := next(done), max(n, i))
+    def one_more() -> None:
+        i = next(done)
+        advance(i, max(n, i) + N_GRAPHS * after)
 
-    return estimated(scans.name, pass_over(scans, one_more()), priors, scans, one_more())
+    found = pass_over(scans, one_more)
+    last = max(n, len(found.stamps))
+    graphs = count(1)
+
+    def one_graph() -> None:
+        advance(last + next(graphs) * after, last + N_GRAPHS * after)
+
+    return estimated(scans.name, found, priors, scans, one_graph)
 
 
 def estimated(
@@ -92,7 +103,7 @@ def estimated(
     scans
         The recording, which is read again if the path comes by again; by default it is not.
     advance
-        Called after every scan that is read again.
+        Called after each of `N_GRAPHS` pose graphs.
 
     Raises
     ------
@@ -104,15 +115,17 @@ def estimated(
     T = optimised(revised.T_odom_sensor, revised.edges)
     places = None if priors is None else positions(priors, found.stamps, T)
     again = loops(T, np.unique([edge.end for edge in revised.edges]))
-    by_loops = closed(scans, again, T, advance) if again else []
+    by_loops = closed(scans, again, T) if again else []
+    advance()
     if places is not None or by_loops:
         T = optimised(revised.T_odom_sensor, [*revised.edges, *by_loops], places, T)
+    advance()
     registrations = _judged(found.guesses, revised.edges, T)
     reference = EstimatedReference(
         found.stamps,
         T,
         _trusted(T, registrations, revised.edges),
-        _halves(found, [*revised.edges, *by_loops], places, T),
+        _halves(found, [*revised.edges, *by_loops], places, T, advance),
         registrations,
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
@@ -143,7 +156,8 @@ def _check(name: str, found: Pass) -> None:
         )
     raise EstimateError(
         f"{name}: by its scans, the robot comes {way:.1f} m far, and a reference needs "
-        f"{SHORTEST:g} m: record a longer drive, in a place that does not look the same all along"
+        f"{SHORTEST:g} m: name another part, or record a longer drive, in a place that does not "
+        f"look the same all along"
     )
 
 
@@ -268,7 +282,11 @@ def _in_every_direction(
 
 
 def _halves(
-    found: Pass, edges: Sequence[Edge], places: Positions | None, T_world_sensor: Poses
+    found: Pass,
+    edges: Sequence[Edge],
+    places: Positions | None,
+    T_world_sensor: Poses,
+    advance: Callable[[], None],
 ) -> Poses:
     """The reference twice, each from half of the pool and half of the scans: (2, n, 4, 4)."""
     ends = {end: i % 2 for i, end in enumerate(sorted({edge.end for edge in edges}))}
@@ -277,6 +295,7 @@ def _halves(
         T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
         own = [edge for edge in edges if ends[edge.end] == half]
         halves.append(optimised(T, own, places, T_world_sensor))
+        advance()
     return np.array(halves)
 
 

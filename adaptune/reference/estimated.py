@@ -25,6 +25,14 @@ class EstimateError(AdaptuneError):
     """A recording from which no reference can be estimated."""
 
 
+class Gap(NamedTuple):
+    """Seconds since the first scan between which a reference is unknown, and why."""
+
+    begin: float
+    end: float
+    reason: str
+
+
 class Registrations(NamedTuple):
     """Direct registrations of scans to scans some metres before.
 
@@ -81,15 +89,31 @@ class EstimatedReference:
             known[i + 1 : max(int(end), i + 2)] = False
         return known
 
-    def gaps(self) -> list[tuple[float, float]]:
-        """Seconds since the first scan from which to which the reference is unknown."""
+    def gaps(self) -> list["Gap"]:
+        """Where the reference is unknown, and why."""
         seconds = (self.stamps - self.stamps[0]) * 1e-9
         edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
         last = len(seconds) - 1
         return [
-            (float(seconds[max(first - 1, 0)]), float(seconds[min(stop, last)]))
+            Gap(
+                float(seconds[max(first - 1, 0)]),
+                float(seconds[min(stop, last)]),
+                self._reason(max(first - 1, 0), min(stop, last)),
+            )
             for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
         ]
+
+    def _reason(self, first: int, last: int) -> str:
+        """Why nothing is known between two scans."""
+        breaks = np.diff(self.stamps[first : last + 1]) * 1e-9
+        if breaks.max(initial=0.0) > BREAK + 2.0 * float(np.median(np.diff(self.stamps)) * 1e-9):
+            return f"no scans for {breaks.max():.1f} s"
+        of = self.registrations
+        across = (of.start < last) & (of.end > first) & ~of.accepted
+        if not across.any():
+            return "too few registrations"
+        differ = np.isfinite(of.residual[across]).mean()
+        return "registrations contradict each other" if differ > 0.5 else "registrations fail"
 
     def trajectory(self) -> Trajectory:
         """The poses that are known."""

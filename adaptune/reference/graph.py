@@ -56,7 +56,7 @@ def optimised(
 ) -> Poses:
     """The poses on which motions and registrations agree best.
 
-    All have robust weights (Cauchy's): a wrong one hardly counts.
+    All have robust weights: a wrong one hardly counts.
 
     Parameters
     ----------
@@ -88,13 +88,13 @@ def optimised(
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(T), _robust(noise)))
     for edge in edges:
         motion = gtsam.Pose3(edge.hop.T_start_end)
-        noise = _robust(_noise(edge))
+        noise = _robust(_noise(edge), bounded=not edge.again)
         graph.add(gtsam.BetweenFactorPose3(edge.start, edge.end, motion, noise))
     # Positions say themselves where the first pose is.
     first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6 if places is None else _UNKNOWN)
     graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
     if places is not None:
-        noise = _robust(gtsam.noiseModel.Isotropic.Sigma(3, _OF_A_PRIOR))
+        noise = _robust(gtsam.noiseModel.Isotropic.Sigma(3, _OF_A_PRIOR), bounded=False)
         for number, metres in zip(places.numbers.tolist(), places.metres, strict=True):
             graph.add(gtsam.GPSFactor(number, metres, noise))
     options = gtsam.LevenbergMarquardtParams()
@@ -177,7 +177,14 @@ def _noise(edge: Edge) -> Any:
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
-def _robust(noise: Any) -> Any:
+def _robust(noise: Any, bounded: bool = True) -> Any:
+    """Noise with Cauchy's weights, by which one that is far off hardly counts, or with Huber's.
+
+    Registrations share what they get wrong, and are many: against them, what holds together over
+    long ways would count as far off.
+    """
     import gtsam
 
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy(1.0), noise)
+    of = gtsam.noiseModel.mEstimator
+    kernel = of.Cauchy(1.0) if bounded else of.Huber(1.345)
+    return gtsam.noiseModel.Robust.Create(kernel, noise)

@@ -1,6 +1,6 @@
 """Registrations where the path comes by again."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +65,6 @@ def closed(
     scans: Iterable[Scan],
     wanted: Iterable[Loop],
     T_world_sensor: Poses,
-    advance: Callable[[], None] = lambda: None,
 ) -> list[Edge]:
     """Register the scans of loops, which takes another pass over the recording.
 
@@ -77,8 +76,6 @@ def closed(
         The loops.
     T_world_sensor
         The path as it is known so far, of shape (n, 4, 4).
-    advance
-        Called after every scan.
     """
     wanted = list(wanted)
     numbers, motions = {number for loop in wanted for number in loop}, steps(T_world_sensor)
@@ -90,7 +87,6 @@ def closed(
             cloud = clouds[number - 1] = HopCloud(last, motions[number - 1], seconds)
             _ = cloud.prepared  # the scan itself is not kept
         last = scan
-        advance()
     metres, edges = travelled(T_world_sensor), []
     for start, end in wanted:
         if start not in clouds or end not in clouds:

@@ -93,7 +93,7 @@ class StudySequences:
         if isinstance(entry, str):
             return f"sequences.{name}"
         ((whole, part),) = entry.items()
-        return f"training: [{whole}: {part}]"
+        return f"[{whole}: {part}]"
 
     def entry(self, name: str) -> str | dict[str, str]:
         """How `training` or `test` names a sequence: ``{hall: 0-60%}`` for a part."""
