@@ -92,7 +92,9 @@ class StoredEstimate(NamedTuple):
 
 
 def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any]) -> StoredEstimate:
-    """Write ``.tum``, ``.png`` and, last, ``.json``.
+    """Write ``.png``, ``.tum`` and, last, ``.json``.
+
+    If it is interrupted, no ``.json`` is there, and so nothing that counts as an estimate.
 
     Parameters
     ----------
@@ -105,11 +107,13 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     """
     stored = StoredEstimate.of(path, found, about)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_tum(path, found.trajectory())
+    # What is known of an estimate before is not of these poses.
+    path.with_suffix(".json").unlink(missing_ok=True)
     # It imports Matplotlib.
     from adaptune.reference.picture import draw_estimate
 
     draw_estimate(path.with_suffix(".png"), path.stem, found, stored)
+    write_tum(path, found.trajectory())
     known = stored._asdict() | {"error_percent": stored.errors}
     del known["path"], known["errors"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
