@@ -117,6 +117,24 @@ def test_what_judged_is_said(estimator, load):
     )
 
 
+@pytest.mark.usefixtures("estimator")
+def test_a_file_that_was_estimated_is_called_so(load, tmp_path):
+    study = load(LEFT_OUT)
+    ensure_references(study, ["one"])
+    known, file = estimates_as_data(study, ["one"]), tmp_path / "my_reference.tum"
+    for suffix in (".tum", ".json"):
+        made = study.folder / f"references/one{suffix}"
+        made.rename(file.with_suffix(suffix))
+    named = load(f"sequences.one.reference={file}")
+    assert named.sequences.is_estimated("one+back")
+    assert estimates_as_data(named, ["one", "two"]) == known
+    assert named.sequences.config("one").reference == str(file)
+    # Other files beside it say nothing.
+    for text in ("[1, 2]", "{}", "no JSON"):
+        file.with_suffix(".json").write_text(text)
+        assert not named.sequences.is_estimated("one")
+
+
 def test_it_is_estimated_again_when_something_has_changed(
     estimator, load, tmp_path, monkeypatch, caplog
 ):
