@@ -101,9 +101,7 @@ def learn(
         earlier = learned
         learned.adding(drive.entry, drive.sequences).write()
     try:
-        with_drive = reload()
-        if drive.name not in with_drive.config.training:
-            raise LearnError("-o training=...: names all training sequences; leave it out")
+        with_drive = _with(drive, reload())
         training = train(with_drive, progress)
     except Exception as error:
         told = isinstance(error, AdaptuneError)
@@ -124,6 +122,13 @@ def learn(
     after = Known.of(with_drive, training.model)
     words = [*changes(before, after), runs_in_words(stored, stored_runs(study.folder))]
     return Lesson(with_drive, training, words)
+
+
+def _with(drive: NewDrive, study: OfflineStudy) -> OfflineStudy:
+    """The study, which must train on the drive."""
+    if drive.name not in study.config.training:
+        raise LearnError("-o training=...: names all training sequences; leave it out")
+    return study
 
 
 def _content(path: Path) -> bytes | None:
