@@ -52,9 +52,10 @@ Given = Annotated[
         show_default="as `inspect` proposes",
     ),
 ]
-Priors = Annotated[
+Prior = Annotated[
     str | None,
     typer.Option(
+        "--position-prior",
         metavar="TOPIC|FILE",
         help="Positions to join that are right over long distances, as those of a GPS.",
         show_default="none",
@@ -83,7 +84,7 @@ def reference(
     folder: Out = None,
     points: Points = None,
     given: Given = None,
-    priors: Priors = None,
+    prior: Prior = None,
     length: Length = None,
     check: Check = False,
 ) -> None:
@@ -99,9 +100,10 @@ def reference(
         if check or override:
             raise AdaptuneError(f"{target}: --check and -o are for studies; give a study's YAML")
         with _on_one_core():
-            _of_recording(target, folder or Path(), (points, given, priors), length)
+            _of_recording(target, folder or Path(), (points, given, prior), length)
         return
-    options = {"--points": points, "--reference": given, "--priors": priors, "--length": length}
+    options: dict[str, str | float | None] = {"--points": points, "--reference": given}
+    options |= {"--position-prior": prior, "--length": length}
     if wrong := [name for name, value in options.items() if value is not None]:
         raise AdaptuneError(
             f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
@@ -143,18 +145,21 @@ def _of_recording(
     """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.inspect import inspect
     from adaptune.reference import estimate, of_recording
+    from adaptune.reference.prior import warn_of_unused
     from adaptune.reference.proposal import proposed_sub_trajectory
     from adaptune.reference.stored import write_estimate
     from adaptune.sequence.opening import open_sequence
 
-    points, given, priors = topics
+    points, given, prior = topics
     config = of_recording.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
-    joined = None if priors is None else of_recording.read_priors(config, priors)
+    joined = None if prior is None else of_recording.read_prior(config, prior)
     path = out / f"{of_recording.estimated_name(target)}.tum"
     with progress() as show:
         found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
-        about = {"recording": str(target.resolve()), "points": config.points, "priors": priors}
+        warn_of_unused(scans.name, joined, found)
+        about = {"recording": str(target.resolve()), "points": config.points}
+        about["position_prior"] = prior
         stored = write_estimate(path, found, about)
         metres = length or proposed_sub_trajectory(found.trajectory())
         there, why = scans.reference(), ""

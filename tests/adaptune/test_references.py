@@ -171,6 +171,19 @@ def test_a_prior_is_seen_from_the_lidar(estimator, load):
     np.testing.assert_allclose(prior.T_world_sensor[:, 1, 3], 2.0)
 
 
+@pytest.mark.parametrize(("gap", "used"), [([], True), (["sequences.one.max_gap=1.5"], False)])
+def test_a_prior_may_have_a_position_every_two_seconds(
+    estimator, load, tmp_path, caplog, gap, used
+):
+    path, few = tmp_path / "gps.tum", truth()
+    write_tum(path, Trajectory(few.stamps[::19], few.T_world_sensor[::19]))
+    ensure_references(load(LEFT_OUT, f"sequences.one.position_prior={path}", *gap), ["one"])
+    ((_, prior),) = estimator.asked
+    known = np.isfinite(prior.at(few.stamps[:38])[:, 0, 3])
+    assert known.mean() == (1.0 if used else pytest.approx(0.05, abs=0.03))
+    assert ("one: the position prior was not used" in caplog.text) == (not used)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
