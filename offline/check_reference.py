@@ -179,7 +179,9 @@ def _given_names(study: OfflineStudy, archive: Archive) -> list[str]:
     """The training sequences that have a given reference and finished trials."""
     found = [n for n in dict.fromkeys(study.config.training) if archive.finished(n)]
     # A simulated course is none of the recordings, and its reference is the truth.
-    recorded = {name: study.sequences.recordings.get(name) for name in found}
+    # A file that adaptune estimated is none that was given.
+    given = [name for name in found if not study.sequences.is_estimated(name)]
+    recorded = {name: study.sequences.recordings.get(name) for name in given}
     return [name for name, config in recorded.items() if config is None or _is_given(config)]
 
 

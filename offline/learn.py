@@ -71,7 +71,8 @@ def learn(
     """Add a drive to the training sequences, run the trials that are missing, and fit again.
 
     If it is interrupted, the drive stays among the training sequences, and the study can be
-    resumed. After any error, it is not.
+    resumed. After an error, it is not, unless the model knows it already. If an earlier run was
+    interrupted, only an error that says what is wrong with it takes it out again.
 
     Parameters
     ----------
@@ -93,25 +94,46 @@ def learn(
     # From here on, no other process writes to the folder.
     study.open()
     stored, learned = stored_runs(study.folder), LearnedDrives.read(study.folder)
+    model = _content(study.model_path)
     if drive.begun:
         earlier = learned.without(drive.name)
     else:
         earlier = learned
         learned.adding(drive.entry, drive.sequences).write()
     try:
-        with_drive = reload()
-        if drive.name not in with_drive.config.training:
-            raise LearnError("-o training=...: names all training sequences; leave it out")
+        with_drive = _with(drive, reload())
         training = train(with_drive, progress)
-    except (AdaptuneError, OSError) as error:
-        earlier.write()
-        raise LearnError(
-            f"{error}\nNothing was learned from {drive.name}, and the study is as it was; finished "
-            f"trials are kept"
-        ) from error
+    except Exception as error:
+        told = isinstance(error, AdaptuneError)
+        stays = drive.begun and (not told or isinstance(error, OSError))
+        if _content(study.model_path) != model:
+            said = f"The error model has been fitted with {drive.name}, which stays"
+        elif stays:
+            said = f"{drive.name} stays among the training sequences; run this again to go on"
+        else:
+            earlier.write()
+            said = (
+                f"Nothing was learned from {drive.name}, and the study is as it was; finished "
+                f"trials are kept"
+            )
+        if not told and not isinstance(error, OSError):
+            raise
+        raise LearnError(f"{error}\n{said}") from error
     after = Known.of(with_drive, training.model)
     words = [*changes(before, after), runs_in_words(stored, stored_runs(study.folder))]
     return Lesson(with_drive, training, words)
+
+
+def _with(drive: NewDrive, study: OfflineStudy) -> OfflineStudy:
+    """The study, which must train on the drive."""
+    if drive.name not in study.config.training:
+        raise LearnError("-o training=...: names all training sequences; leave it out")
+    return study
+
+
+def _content(path: Path) -> bytes | None:
+    """What a file holds; None if there is none."""
+    return path.read_bytes() if path.exists() else None
 
 
 def _known_before(study: OfflineStudy) -> Known | None:

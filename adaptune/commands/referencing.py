@@ -17,6 +17,7 @@ from adaptune.terminal import Show, console, progress, say
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from adaptune.reference.estimated import Gap
     from adaptune.reference.of_recording import Comparison
     from adaptune.reference.stored import StoredEstimate
     from adaptune.sequence.config import SequenceConfig
@@ -52,9 +53,10 @@ Given = Annotated[
         show_default="as `inspect` proposes",
     ),
 ]
-Priors = Annotated[
+Prior = Annotated[
     str | None,
     typer.Option(
+        "--position-prior",
         metavar="TOPIC|FILE",
         help="Positions to join that are right over long distances, as those of a GPS.",
         show_default="none",
@@ -83,7 +85,7 @@ def reference(
     folder: Out = None,
     points: Points = None,
     given: Given = None,
-    priors: Priors = None,
+    prior: Prior = None,
     length: Length = None,
     check: Check = False,
 ) -> None:
@@ -99,9 +101,10 @@ def reference(
         if check or override:
             raise AdaptuneError(f"{target}: --check and -o are for studies; give a study's YAML")
         with _on_one_core():
-            _of_recording(target, folder or Path(), (points, given, priors), length)
+            _of_recording(target, folder or Path(), (points, given, prior), length)
         return
-    options = {"--points": points, "--reference": given, "--priors": priors, "--length": length}
+    options: dict[str, str | float | None] = {"--points": points, "--reference": given}
+    options |= {"--position-prior": prior, "--length": length}
     if wrong := [name for name, value in options.items() if value is not None]:
         raise AdaptuneError(
             f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
@@ -143,19 +146,22 @@ def _of_recording(
     """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.inspect import inspect
     from adaptune.reference import estimate, of_recording
+    from adaptune.reference.prior import warn_of_unused
     from adaptune.reference.proposal import proposed_sub_trajectory
     from adaptune.reference.stored import write_estimate
     from adaptune.sequence.opening import open_sequence
 
-    points, given, priors = topics
+    points, given, prior = topics
     config = of_recording.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
-    joined = None if priors is None else of_recording.read_priors(config, priors)
+    joined = None if prior is None else of_recording.read_prior(config, prior)
     path = out / f"{of_recording.estimated_name(target)}.tum"
     with progress() as show:
         found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
-        about = {"recording": str(target.resolve()), "points": config.points, "priors": priors}
-        stored = write_estimate(path, found, about)
+        warn_of_unused(scans.name, joined, found)
+        about = {"recording": str(target.resolve()), "points": config.points}
+        about["position_prior"] = prior
+        stored = write_estimate(path, found, about, metres)
         metres = length or proposed_sub_trajectory(found.trajectory())
         there, why = scans.reference(), ""
         if there is not None:
@@ -170,22 +176,22 @@ def _of_recording(
     say_next(why, "offline", "STUDY.yaml", first=first)
 
 
-def _say_estimate(
-    stored: "StoredEstimate", unknown: list[tuple[float, float]], length: float
-) -> None:
+def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float) -> None:
     """What the estimated reference is worth."""
     say(f"Estimated reference: {stored.metres:.1f} m, {stored.scans:,} scans.")
     error = stored.error(length)
     if math.isnan(error):
         say(f"Its error is not known: the path holds no {length:g} m without interruption.")
     else:
-        say(f"It is wrong by about {error:.2g} % over {length:g} m, as its two halves tell.")
+        say(
+            f"It is wrong by about {error:.2g} % over {length:g} m, as two halves of the registrations tell."
+        )
     if not unknown:
-        say("It can be trusted everywhere.")
+        say("It is known everywhere.")
         return
-    where = ", ".join(f"{start:.1f}-{stop:.1f}" for start, stop in unknown)
+    where = ", ".join(f"{gap.begin:.1f}-{gap.end:.1f} s ({gap.reason})" for gap in unknown)
     share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
-    say(f"It cannot be trusted on {share}, and has no poses there: {where} s after the first scan.")
+    say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
 
 
 def _say_comparison(comparison: "Comparison", config: "SequenceConfig", length: float) -> None:

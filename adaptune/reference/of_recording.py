@@ -9,16 +9,13 @@ import numpy as np
 from adaptune.inspect import Inspection
 from adaptune.reference.estimated import EstimatedReference, EstimateError
 from adaptune.reference.given import MeasuredReference, mean_difference, measure_reference
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
+from adaptune.sequence.config import ESTIMATED, SequenceConfig
+from adaptune.sequence.opening import position_prior
 from adaptune.sequence.sequence import Sequence
 from adaptune.trajectory import Trajectory
 
 Advance = Callable[[int, int], None]
 """Called with how many scans are done, and about how many there are."""
-
-PRIOR_GAP = 3.0
-"""Seconds. A GPS may give a position a second, and miss one."""
 
 
 def recording_config(
@@ -48,7 +45,7 @@ def recording_config(
     return SequenceConfig(**given)
 
 
-def read_priors(config: SequenceConfig, source: str) -> Trajectory:
+def read_prior(config: SequenceConfig, source: str) -> Trajectory:
     """Positions that are right over long distances, from a topic of the recording or a file.
 
     Raises
@@ -56,11 +53,14 @@ def read_priors(config: SequenceConfig, source: str) -> Trajectory:
     AdaptuneError
         If there are none, or they are of another time.
     """
-    given = config.model_dump(exclude_unset=True) | {"reference": source, "max_gap": PRIOR_GAP}
-    priors = open_sequence(SequenceConfig(**given)).reference()
-    if priors is None:
-        raise EstimateError(f"--priors {source}: holds no pose; name a topic or a file of poses")
-    return priors
+    given = config.model_dump(exclude_unset=True, exclude={"max_gap"})
+    joined = {"reference": ESTIMATED, "position_prior": source}
+    prior = position_prior(SequenceConfig(**given | joined))
+    if prior is None:
+        raise EstimateError(
+            f"--position-prior {source}: holds no pose; name a topic or a file of poses"
+        )
+    return prior
 
 
 class Comparison(NamedTuple):

@@ -95,8 +95,12 @@ class StoredEstimate(NamedTuple):
             ) from error
 
 
-def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any]) -> StoredEstimate:
-    """Write ``.tum``, ``.png`` and, last, ``.json``.
+def write_estimate(
+    path: Path, found: EstimatedReference, about: dict[str, Any], length: float = 25.0
+) -> StoredEstimate:
+    """Write ``.png``, ``.tum`` and, last, ``.json``.
+
+    If it is interrupted, no ``.json`` is there, and so nothing that counts as an estimate.
 
     Parameters
     ----------
@@ -106,15 +110,22 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
         The reference.
     about
         What it was estimated from, as plain data.
+    length
+        Metres over which the picture tells its error.
     """
     stored = StoredEstimate.of(path, found, about)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_tum(path, found.trajectory())
+    # What is known of an estimate before is not of these poses.
+    path.with_suffix(".json").unlink(missing_ok=True)
     # It imports Matplotlib.
     from adaptune.reference.picture import draw_estimate
 
-    draw_estimate(path.with_suffix(".png"), path.stem, found, stored)
+    draw_estimate(path.with_suffix(".png"), path.stem, found, stored, length)
+    write_tum(path, found.trajectory())
     known = stored._asdict() | {"error_percent": stored.errors}
+    known["unknown_seconds"] = [
+        [round(gap.begin, 3), round(gap.end, 3), gap.reason] for gap in found.gaps()
+    ]
     del known["path"], known["errors"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
     return stored

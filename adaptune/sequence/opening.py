@@ -26,6 +26,10 @@ from adaptune.sequence.timing import Timing
 from adaptune.sequence.views import Reversible
 from adaptune.trajectory import Trajectory
 
+PRIOR_GAP = 3.0
+"""Seconds. The default of `max_gap` for a prior: a GPS may give a position a second, and miss
+one."""
+
 # Livox IMUs measure acceleration in multiples of this.
 _STANDARD_GRAVITY = 9.80665
 
@@ -69,7 +73,7 @@ def check_sequence(config: SequenceConfig) -> None:
             f"position_prior: joins an estimated reference, and the recording has poses of its "
             f"own; write `reference: {ESTIMATED}`, or leave `position_prior` out"
         )
-    _recorded(_of_prior(config)).check()
+    _recorded(of_prior(config)).check()
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
@@ -89,17 +93,19 @@ def open_unseen(config: SequenceConfig) -> RecordedSequence:
 
 def position_prior(config: SequenceConfig) -> Trajectory | None:
     """Poses of the LiDAR that are right over long distances only, if the sequence names any."""
-    return None if config.position_prior is None else _recorded(_of_prior(config)).reference()
+    return None if config.position_prior is None else _recorded(of_prior(config)).reference()
 
 
 def prior_files(config: SequenceConfig) -> Items[Path]:
     """The files of these poses, where they are not in the recording."""
-    return () if config.position_prior is None else sequence_files(_of_prior(config)).reference
+    return () if config.position_prior is None else sequence_files(of_prior(config)).reference
 
 
-def _of_prior(config: SequenceConfig) -> SequenceConfig:
+def of_prior(config: SequenceConfig) -> SequenceConfig:
     """The sequence with the poses of its prior as its reference."""
-    return config.model_copy(update={"reference": config.position_prior, "position_prior": None})
+    gap = config.max_gap if "max_gap" in config.model_fields_set else PRIOR_GAP
+    of = {"reference": config.position_prior, "position_prior": None, "max_gap": gap}
+    return config.model_copy(update=of)
 
 
 class SequenceFiles(NamedTuple):

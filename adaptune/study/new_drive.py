@@ -172,7 +172,11 @@ def _described(study: Study, path: Path, reference: str | None) -> tuple[str, di
     entry = proposed if like is None else {**_source(proposed), **like}
     if reference is not None:
         entry = _with_reference(entry, reference, topics)
-    elif entry.get("reference") != ESTIMATED and entry.get("reference") not in topics:
+    elif (
+        entry.get("reference") != ESTIMATED
+        and "position_prior" not in entry
+        and entry.get("reference") not in topics
+    ):
         entry = _with_reference(entry, proposed.get("reference"), topics)
     return str(name).encode()[:_LONGEST].decode(errors="ignore"), entry
 
@@ -193,16 +197,27 @@ def _source(given: Mapping[str, Any]) -> dict[str, Any]:
 def _like_others(
     study: Study, proposed: Mapping[str, Any], topics: Collection[str]
 ) -> dict[str, Any] | None:
-    """The keys of the study's first sequence of the same kind whose topics are there, if any."""
+    """The keys of the study's first sequence of the same kind whose topics are there, if any.
+
+    They are as the user wrote them, also if its reference has been estimated since.
+    """
     own = study.config
     for name in dict.fromkeys([*own.training, *own.test, *own.sequences, *own.courses]):
-        config = study.sequences.config(name)
+        config = study.sequences.unseen(name)
         (kind,) = _source(proposed)
         imu = None if config.imu is None else config.imu.topic
         needed = {topic for topic in (config.points, imu) if topic is not None}
         if getattr(config, kind) is not None and needed <= set(topics):
-            return config.model_dump(mode="json", exclude_defaults=True, exclude=_OF_DRIVE)
+            like = config.model_dump(mode="json", exclude_defaults=True, exclude=_OF_DRIVE)
+            if config.position_prior not in (None, *topics):
+                # A file, whose poses are of that drive.
+                return _without(like, "position_prior", *_OF_REFERENCE)
+            return like
     return None
+
+
+def _without(entry: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key not in keys}
 
 
 def _with_reference(
@@ -221,6 +236,7 @@ def _with_reference(
             raise DriveError(f"--reference: the recording has no topic {wanted!r}: {help_}")
     before = entry.get("reference")
     alike = before == wanted or (is_file and str(before).endswith(REFERENCE_FILES))
-    left_out = {"reference", *(() if alike else _OF_REFERENCE)}
-    rest = {key: value for key, value in entry.items() if key not in left_out}
+    # A prior goes with an estimate only, and these keys are then the prior's.
+    alike = alike or (wanted == ESTIMATED and "position_prior" in entry)
+    rest = _without(entry, "reference", *(() if alike else ("position_prior", *_OF_REFERENCE)))
     return rest if wanted is None else rest | {"reference": wanted}

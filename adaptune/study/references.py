@@ -11,10 +11,12 @@ from typing import Any
 from adaptune.cores import pin
 from adaptune.reference import estimate
 from adaptune.reference.estimated import EstimateError
+from adaptune.reference.prior import warn_of_unused
 from adaptune.reference.stored import StoredEstimate, write_estimate
 from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.names import origin
 from adaptune.sequence.opening import (
+    of_prior,
     open_unseen,
     position_prior,
     prior_files,
@@ -98,7 +100,7 @@ def _about(study: Study, name: str) -> dict[str, Any]:
     if given.position_prior is not None:
         files = prior_files(given)
         keys = {"child_frame", "extrinsic", "clock_offset", "max_gap"}
-        prior = given.model_dump(mode="json", include=keys)
+        prior = of_prior(given).model_dump(mode="json", include=keys)
         prior["poses"] = fingerprints(files) if files else given.position_prior
     about = {"estimator": estimate.VERSION, "scans": scans, "prior": prior}
     plain: dict[str, Any] = json.loads(json.dumps(about))
@@ -107,9 +109,9 @@ def _about(study: Study, name: str) -> dict[str, Any]:
 
 def _estimate(study: Study, name: str, advance: Callable[[int, int], None], required: bool) -> None:
     given, path = study.sequences.recordings[name], study.sequences.estimate_path(name)
-    about, scans = _about(study, name), open_unseen(given)
+    about, scans, prior = _about(study, name), open_unseen(given), position_prior(given)
     try:
-        found = estimate.estimate_reference(scans, advance, position_prior(given))
+        found = estimate.estimate_reference(scans, advance, prior)
     except EstimateError as error:
         # What was estimated before is of something else.
         for suffix in (".json", ".tum", ".png"):
@@ -120,7 +122,8 @@ def _estimate(study: Study, name: str, advance: Callable[[int, int], None], requ
             raise EstimateError(refused) from error
         _log.warning("%s; it is replayed without a reference, and not judged", refused)
         return
-    stored = write_estimate(path, found, about)
+    warn_of_unused(name, prior, found)
+    stored = write_estimate(path, found, about, study.config.sub_trajectory)
     _log.info(
         "%s: its reference is estimated, %.0f m; %s (%s)",
         name,

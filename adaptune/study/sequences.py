@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.program_input import ProgramInput, program_input
-from adaptune.reference.estimated import BREAK
+from adaptune.reference.estimated import BREAK, EstimateError
 from adaptune.reference.stored import StoredEstimate
-from adaptune.sequence.config import SequenceConfig, ViewConfig
+from adaptune.sequence.config import REFERENCE_FILES, SequenceConfig, ViewConfig
 from adaptune.sequence.export import Layout
 from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.names import OF_VIEW, origin
@@ -63,11 +63,14 @@ class StudySequences:
             config = self.config(name)
             return config.model_copy(update={"views": (*config.views, self.views[view])})
         if name in self.recordings:
-            given = self.recordings[name]
-            if not self.is_estimated(name):
-                return given
-            reference = str(self.estimate_path(name).absolute())
-            return given.model_copy(update=_AS_ESTIMATED | {"reference": reference})
+            made = self._is_made(name)
+            return self.by_estimate(name, self.estimate_path(name)) if made else self.unseen(name)
+        return self.unseen(name)
+
+    def unseen(self, name: str) -> SequenceConfig:
+        """Configuration of a sequence, or a course, without an estimate that was made of it."""
+        if name in self.recordings:
+            return self.recordings[name]
         from adaptune.simulation.rig import as_sequence
 
         return as_sequence(self.courses[name], self.recording(name))
@@ -76,16 +79,34 @@ class StudySequences:
         """The TUM file of an estimated reference; the views of a sequence share it."""
         return self.folder / "references" / f"{origin(name)}.tum"
 
-    def is_estimated(self, name: str) -> bool:
-        """Whether the reference of a sequence, or a view, is one that was estimated."""
+    def by_estimate(self, name: str, path: Path) -> SequenceConfig:
+        """Configuration of a sequence, or a course, with an estimate of it as its reference."""
+        reference = str(path.absolute())
+        return self.unseen(name).model_copy(update=_AS_ESTIMATED | {"reference": reference})
+
+    def _is_made(self, name: str) -> bool:
+        """Whether an estimated reference of a sequence, or a view, is in the study's folder."""
         given, path = self.recordings.get(origin(name)), self.estimate_path(name)
         # The file beside it is written last.
         there = given is not None and path.exists() and path.with_suffix(".json").exists()
         return there and wants_estimate(self.recordings[origin(name)])
 
+    def is_estimated(self, name: str) -> bool:
+        """Whether the reference of a sequence, or a view, is one that was estimated."""
+        return self.estimate(name) is not None
+
     def estimate(self, name: str) -> StoredEstimate | None:
-        """What is known about an estimated reference; None if it is not one."""
-        return StoredEstimate.read(self.estimate_path(name)) if self.is_estimated(name) else None
+        """What is known about an estimated reference, also a file's; None if it is not one."""
+        if self._is_made(name):
+            return StoredEstimate.read(self.estimate_path(name))
+        given = self.recordings.get(origin(name))
+        if given is None or not (given.reference or "").endswith(REFERENCE_FILES):
+            return None
+        try:
+            return StoredEstimate.read(Path(given.reference or ""))
+        except EstimateError:
+            # The user's own file of poses may have any file beside it.
+            return None
 
     def key(self, name: str) -> str:
         """The key under which the user finds a sequence: a part has none of its own."""

@@ -4,12 +4,14 @@ import json
 import shutil
 
 import drives
+import estimates
 import numpy as np
 import pytest
 import small_bag
 
 from adaptune.errors import AdaptuneError
 from adaptune.study.new_drive import find_drive
+from adaptune.study.references import ensure_references
 from offline.offline_study import load_study
 
 
@@ -119,6 +121,36 @@ def test_a_reference_of_its_own(find, bag, tmp_path):
     offset = [f"sequences.{name}.clock_offset=1700000000" for name in ("one", "two", "three")]
     found = entry_of(find(bag, *files, *offset))
     assert found == {"bag": str(bag), "points": "/points", "reference": "/truth"}
+
+
+@pytest.mark.parametrize("reference", ["estimated", ""])
+def test_an_estimate_of_another_drive_is_not_its_reference(
+    find, bag, study_file, tmp_path, monkeypatch, reference
+):
+    estimates.install(monkeypatch)
+    prior = ["sequences.one.position_prior=/truth", "sequences.one.max_gap=5"]
+    overrides = [f"sequences.one.reference={reference}", *prior]
+    ensure_references(load_study(study_file, overrides, tmp_path / "run"), ["one"])
+    found = entry_of(find(bag, *overrides))
+    wanted = {"reference": "estimated"} if reference else {}
+    assert found == {
+        "bag": str(bag),
+        "points": "/points",
+        "position_prior": "/truth",
+        "max_gap": 5.0,
+        **wanted,
+    }
+    assert entry_of(find(bag, *overrides, reference="estimated"))["max_gap"] == 5.0
+    given = entry_of(find(bag, *overrides, reference="/truth"))
+    assert given == {"bag": str(bag), "points": "/points", "reference": "/truth"}
+
+
+def test_positions_of_another_drive_are_not_joined(find, bag, tmp_path):
+    file = tmp_path / "gps.tum"
+    file.write_text("1700000000 0 0 0 0 0 0 1\n1700000009 1 0 0 0 0 0 1\n")
+    prior = [f"sequences.one.position_prior={file}", "sequences.one.max_gap=5"]
+    found = entry_of(find(bag, "sequences.one.reference=estimated", *prior))
+    assert found == {"bag": str(bag), "points": "/points", "reference": "estimated"}
 
 
 def test_a_folder_of_scans(find, tmp_path):

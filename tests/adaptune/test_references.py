@@ -117,6 +117,24 @@ def test_what_judged_is_said(estimator, load):
     )
 
 
+@pytest.mark.usefixtures("estimator")
+def test_a_file_that_was_estimated_is_called_so(load, tmp_path):
+    study = load(LEFT_OUT)
+    ensure_references(study, ["one"])
+    known, file = estimates_as_data(study, ["one"]), tmp_path / "my_reference.tum"
+    for suffix in (".tum", ".json"):
+        made = study.folder / f"references/one{suffix}"
+        made.rename(file.with_suffix(suffix))
+    named = load(f"sequences.one.reference={file}")
+    assert named.sequences.is_estimated("one+back")
+    assert estimates_as_data(named, ["one", "two"]) == known
+    assert named.sequences.config("one").reference == str(file)
+    # Other files beside it say nothing.
+    for text in ("[1, 2]", "{}", "no JSON"):
+        file.with_suffix(".json").write_text(text)
+        assert not named.sequences.is_estimated("one")
+
+
 def test_it_is_estimated_again_when_something_has_changed(
     estimator, load, tmp_path, monkeypatch, caplog
 ):
@@ -151,6 +169,19 @@ def test_a_prior_is_seen_from_the_lidar(estimator, load):
     ((_, prior),) = estimator.asked
     assert len(prior) == 40
     np.testing.assert_allclose(prior.T_world_sensor[:, 1, 3], 2.0)
+
+
+@pytest.mark.parametrize(("gap", "used"), [([], True), (["sequences.one.max_gap=1.5"], False)])
+def test_a_prior_may_have_a_position_every_two_seconds(
+    estimator, load, tmp_path, caplog, gap, used
+):
+    path, few = tmp_path / "gps.tum", truth()
+    write_tum(path, Trajectory(few.stamps[::19], few.T_world_sensor[::19]))
+    ensure_references(load(LEFT_OUT, f"sequences.one.position_prior={path}", *gap), ["one"])
+    ((_, prior),) = estimator.asked
+    known = np.isfinite(prior.at(few.stamps[:38])[:, 0, 3])
+    assert known.mean() == (1.0 if used else pytest.approx(0.05, abs=0.03))
+    assert ("one: the position prior was not used" in caplog.text) == (not used)
 
 
 @pytest.mark.parametrize(

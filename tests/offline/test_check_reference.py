@@ -165,6 +165,17 @@ def test_a_study_is_checked_by_its_trials(study_file, folder, counted):
     assert len(counted) == 3
 
 
+def test_a_file_that_was_estimated_is_not_given(study_file, folder, counted, tmp_path):
+    check_reference(load_study(study_file, [], folder))
+    for suffix in (".tum", ".json"):
+        made = folder / f"references/one.check{suffix}"
+        made.rename((tmp_path / "mine").with_suffix(suffix))
+    overrides = [f"sequences.one.reference={tmp_path / 'mine.tum'}"]
+    study = load_study(study_file, overrides, folder)
+    assert [row["sequence"] for row in check_reference(study)] == ["two"]
+    assert len(counted) == 2
+
+
 def test_the_command_writes_a_table(study_file, folder, counted, monkeypatch):
     monkeypatch.setattr(terminal.console, "width", 120)
     done = commands.call("reference", study_file, "--check", "--folder", folder)

@@ -8,9 +8,11 @@ import pytest
 import yaml
 
 from adaptune.archive import Archive
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.study.driven import BANK, ONE_SET
-from offline.learn import Known, changes, runs_in_words
+from adaptune.study.new_drive import NewDrive
+from offline.learn import Known, LearnError, changes, learn, runs_in_words
 from offline.offline_study import load_study
 
 FIGURES = {
@@ -166,3 +168,35 @@ def test_an_interrupted_lesson_goes_on(monkeypatch):
     assert done.exit_code == 0, done.stderr
     assert "Going on with three." in done.stdout
     assert load_study("small.yaml").training == ["one", "two", "three"]
+
+
+@pytest.mark.parametrize(
+    ("error", "fitted", "begun", "stays"),
+    [
+        (RuntimeError("a bug"), False, False, False),
+        (OSError("no room"), False, False, False),
+        (OSError("no room"), True, False, True),
+        (OSError("no room"), False, True, True),
+        (RuntimeError("a bug"), False, True, True),
+        (AdaptuneError("is damaged"), False, True, False),
+    ],
+)
+def test_what_an_error_leaves_of_a_drive(
+    study_file, tmp_path, monkeypatch, error, fitted, begun, stays
+):
+    def fail(study, _):
+        if fitted:
+            study.model_path.write_bytes(b"new")
+        raise error
+
+    def load():
+        return load_study(study_file, [], tmp_path / "run")
+
+    if begun:
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run/learned.yaml").write_text("training: [three]")
+    monkeypatch.setattr("offline.learn.train", fail)
+    expected = RuntimeError if isinstance(error, RuntimeError) else LearnError
+    with pytest.raises(expected, match=str(error)):
+        learn(load(), NewDrive("three", "three", {}, begun=begun), load)
+    assert ("three" in load().training) == stays

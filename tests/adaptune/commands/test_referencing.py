@@ -40,7 +40,7 @@ def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
     assert "write `reference: one_reference.tum` under" in done.stdout.splitlines()[-1]
     assert len(read_tum(tmp_path / "one_reference.tum")) == 40
     stored = StoredEstimate.read(tmp_path / "one_reference.tum")
-    assert stored.about == {"recording": str(bag), "points": "/points", "priors": None}
+    assert stored.about == {"recording": str(bag), "points": "/points", "position_prior": None}
 
 
 def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
@@ -72,12 +72,15 @@ def test_a_recording_without_reference_is_not_compared(adaptune, tmp_path):
     assert (tmp_path / "scans_reference.tum").exists()
 
 
-def test_priors_are_a_topic_or_a_file(adaptune, bag, tmp_path):
+def test_a_prior_is_a_topic_or_a_file(adaptune, bag, tmp_path):
     assert adaptune(bag).exit_code == 0
-    for priors in ("/truth", "one_reference.tum"):
-        done = adaptune(bag, "--priors", priors, "--out", "with")
+    for prior in ("/truth", "one_reference.tum"):
+        done = adaptune(bag, "--position-prior", prior, "--out", "with")
         assert done.exit_code == 0, done.stderr
-        assert StoredEstimate.read(tmp_path / "with/one_reference.tum").about["priors"] == priors
+        assert (
+            StoredEstimate.read(tmp_path / "with/one_reference.tum").about["position_prior"]
+            == prior
+        )
 
 
 @pytest.mark.parametrize(
@@ -86,11 +89,11 @@ def test_priors_are_a_topic_or_a_file(adaptune, bag, tmp_path):
         (["none.bag"], "there is no such file"),
         (["BAG", "--points", "/none"], "/none"),
         (["BAG", "--reference", "/none"], "/none"),
-        (["BAG", "--priors", "/none"], "/none"),
+        (["BAG", "--position-prior", "/none"], "/none"),
         (["BAG", "--check"], "are for studies"),
         (["BAG", "-o", "training=[one]"], "are for studies"),
         (["STUDY", "--length", "3"], "--length is for a single recording"),
-        (["STUDY", "--priors", "/gps"], "--priors is for a single recording"),
+        (["STUDY", "--position-prior", "/gps"], "--position-prior is for a single recording"),
         (["STUDY"], "every sequence has a reference"),
         (["poses.tum"], "is a file of poses"),
     ],

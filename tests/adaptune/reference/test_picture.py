@@ -19,7 +19,7 @@ def drawn(path, found, title="drive"):
     stored = StoredEstimate.of(path, found, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        draw_estimate(path.with_suffix(".svg"), title, found, stored)
+        draw_estimate(path.with_suffix(".svg"), title, found, stored, 10.0)
     return texts(path)
 
 
@@ -92,5 +92,5 @@ def test_a_little_that_is_unknown_is_not_nothing(tmp_path):
 def test_a_picture_is_a_white_png(tmp_path):
     found = reference(accepted=[1, 0], residual=[0.01, NAN], lost=[3])
     path = tmp_path / "a.png"
-    draw_estimate(path, "drive", found, StoredEstimate.of(path, found, {}))
+    draw_estimate(path, "drive", found, StoredEstimate.of(path, found, {}), 10.0)
     assert is_white(path)

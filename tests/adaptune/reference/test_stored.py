@@ -55,7 +55,12 @@ def test_it_is_plain_data_beside_a_picture(written):
     path, stored = written
     assert {file.name for file in path.parent.iterdir()} == {"drive.tum", "drive.png", "drive.json"}
     known = json.loads(path.with_suffix(".json").read_text())
-    assert set(known) == {"about", "scans", "metres", "unknown_share", "error_percent"}
+    assert set(known) == {
+        *("about", "scans", "metres", "unknown_share", "unknown_seconds", "error_percent")
+    }
+    ((begin, end, why),) = known["unknown_seconds"]
+    assert 4.9 < begin < end < 6.2
+    assert why == "too few registrations"
     assert known["error_percent"]["10.0"] == stored.errors[10.0]
 
 
@@ -141,3 +146,21 @@ def test_the_estimates_of_a_folder(tmp_path):
     (tmp_path / "d.json").write_text(json.dumps(WHOLE))
     assert [stored.path.name for stored in stored_estimates(tmp_path)] == ["a.tum", "b.tum"]
     assert stored_estimates(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize(
+    "at", ["adaptune.reference.picture.draw_estimate", "adaptune.reference.stored.write_text"]
+)
+def test_what_was_known_before_is_not_of_new_poses(tmp_path, monkeypatch, at):
+    path = tmp_path / "one.tum"
+    write_estimate(path, reference(), {"of": 1})
+    assert StoredEstimate.read(path).about == {"of": 1}
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(at, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            write_estimate(path, reference(), {"of": 2})
+    assert StoredEstimate.read(path) is None
