@@ -208,43 +208,34 @@ def _say_comparison(comparison: "Comparison", config: "SequenceConfig", length: 
 def _of_study(study: "OfflineStudy") -> None:
     """Estimate the references that a study lacks, and say what each is worth."""
     from adaptune import report
-    from adaptune.reference.stored import stored_estimates
+    from adaptune.study.references import ensure_references, estimates_of, to_estimate
 
-    names = _without_reference(study)
+    names = to_estimate(study, (*study.config.training, *study.config.test))
     if not names:
         raise AdaptuneError(
             f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
             f"is to be estimated, or compare with --check"
         )
-    from adaptune.study.references import ensure_references
-
     study.open()
     with progress() as show:
-        ensure_references(study, names, show)
-    folder, length = study.folder / "references", study.config.sub_trajectory
+        refused = ensure_references(study, names, show, required=False)
+    length = study.config.sub_trajectory
     rows = [
         {
-            "reference": stored.path.stem,
+            "reference": name,
             "scans": stored.scans,
             "metres": stored.metres,
             "its error [%]": stored.error(length),
             "unknown [% of the scans]": 100.0 * stored.unknown_share,
         }
-        for stored in stored_estimates(folder)
+        for name, stored in estimates_of(study, names).items()
     ]
-    caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
-    console.print(report.table("Estimated references", rows, caption))
-    say(f"Files: {folder}/")
-
-
-def _without_reference(study: "OfflineStudy") -> list[str]:
-    """The recordings of a study that have no reference, or are to have an estimated one."""
-    from adaptune.sequence.names import origin
-    from adaptune.sequence.opening import wants_estimate
-
-    names = dict.fromkeys(map(origin, (*study.config.training, *study.config.test)))
-    given = {name: of for name in names if (of := study.sequences.recordings.get(name))}
-    return [name for name, of in given.items() if wants_estimate(of)]
+    if rows:
+        caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
+        console.print(report.table("Estimated references", rows, caption))
+        say(f"Files: {study.folder / 'references'}/")
+    if refused:
+        raise AdaptuneError("\n".join(refused.values()))
 
 
 def _check(study: "OfflineStudy") -> None:

@@ -1,6 +1,4 @@
 import re
-import sys
-from types import ModuleType
 
 import commands
 import drives
@@ -12,6 +10,8 @@ from adaptune import terminal
 from adaptune.reference import estimate
 from adaptune.reference.estimated import EstimateError
 from adaptune.reference.stored import StoredEstimate, write_estimate
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import open_sequence
 from adaptune.trajectory import read_tum
 
 
@@ -116,27 +116,40 @@ def test_a_recording_that_cannot_be_estimated_is_told(adaptune, bag, monkeypatch
     assert "moves 0.1 m only" in done.stderr
 
 
-def test_of_a_study_those_that_it_lacks_are_estimated(adaptune, study_file, tmp_path, monkeypatch):
+def test_of_a_study_those_that_it_lacks_are_estimated(
+    adaptune, bag, study_file, tmp_path, monkeypatch
+):
+    made = made_references.of_truth(bag)
     asked = []
 
-    def ensure(study, names, progress):
-        asked.append(names)
-        for name in names:
-            scans = study.sequences.open(name)
-            found = made_references.of_truth(study_file.parent / f"{name}.bag")(scans)
-            write_estimate(study.folder / "references" / f"{name}.tum", found, {})
-            progress(name, 1, 1)
+    def estimated(scans, *given):
+        asked.append(scans.name.rpartition("/")[2])
+        if "two" in scans.name:
+            raise EstimateError("the robot moves 0.1 m only")
+        return made(scans, *given)
 
-    module = ModuleType("adaptune.study.references")
-    module.ensure_references = ensure
-    monkeypatch.setitem(sys.modules, "adaptune.study.references", module)
-    (tmp_path / "study.yaml").write_text(
-        study_file.read_text()
-        .replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
-        .replace("bag: ", f"bag: {study_file.parent}/")
-    )
+    monkeypatch.setattr(estimate, "estimate_reference", estimated)
+    text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
+    one = text.replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
+    (tmp_path / "study.yaml").write_text(one)
     done = adaptune("study.yaml", "--folder", "run")
     assert done.exit_code == 0, done.stderr
-    assert asked == [["one"]]
     assert re.search(r"one +40 +11\.\d", done.stdout)
     assert "adaptune offline study.yaml --folder run" in done.stdout.splitlines()[-1]
+    assert asked == ["one.bag"]
+    # One that is refused leaves the others; one that is not asked for is not listed.
+    (tmp_path / "study.yaml").write_text(
+        text.replace("reference: /truth", "reference: estimated").replace(
+            "test: [three]", "test: []"
+        )
+    )
+    write_estimate(
+        tmp_path / "run/references/stale.tum", made(open_sequence(SequenceConfig(bag=str(bag)))), {}
+    )
+    done = adaptune("study.yaml", "--folder", "run", "-o", "training=[two, one]")
+    assert done.exit_code == 2
+    assert "sequences.two: " in done.stderr
+    assert "the robot moves 0.1 m only" in done.stderr
+    assert re.search(r"one +40 +11\.\d", done.stdout)
+    assert "stale" not in done.stdout
+    assert asked == ["one.bag", "two.bag"]
