@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from adaptune.reference.of_recording import Comparison
     from adaptune.reference.stored import StoredEstimate
     from adaptune.sequence.config import SequenceConfig
+    from adaptune.sequence.sequence import Sequence
+    from adaptune.trajectory import Trajectory
     from offline.offline_study import OfflineStudy
 
 _STUDIES = (".yaml", ".yml")
@@ -155,6 +157,9 @@ def _of_recording(
     scans = open_sequence(config)
     joined = None if prior is None else of_recording.read_prior(config, prior)
     path = out / f"{of_recording.estimated_name(target)}.tum"
+    # What can fail is found before the estimate, which takes minutes.
+    of_recording.check_writable(path)
+    there = _given_reference(scans, required=given is not None)
     with progress() as show:
         found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
         warn_of_unused(scans.name, joined, found)
@@ -162,7 +167,6 @@ def _of_recording(
         about["position_prior"] = prior
         stored = write_estimate(path, found, about)
         metres = length or proposed_sub_trajectory(found.trajectory())
-        there, why = scans.reference(), ""
         if there is not None:
             advance = _advance(show, "given reference")
             comparison = of_recording.beside_given(scans, there, found, metres, advance)
@@ -173,6 +177,17 @@ def _of_recording(
     first = f"write `reference: {path}` under this sequence in a study; then "
     why = "train with it, as with a given one"
     say_next(why, "offline", "STUDY.yaml", first=first)
+
+
+def _given_reference(scans: "Sequence", required: bool) -> "Trajectory | None":
+    """The reference to compare with; one that was not asked for may be of no use."""
+    try:
+        return scans.reference()
+    except AdaptuneError as error:
+        if required:
+            raise
+        say(f"The given reference is not compared with: {error}")
+        return None
 
 
 def _say_estimate(

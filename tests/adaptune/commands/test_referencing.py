@@ -2,6 +2,7 @@ import re
 
 import commands
 import drives
+import estimates
 import made_references
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from adaptune.reference.estimated import EstimateError
 from adaptune.reference.stored import StoredEstimate, write_estimate
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import open_sequence
+from adaptune.sequence.recorded import RecordedSequence
+from adaptune.sequence.sequence import SequenceError
 from adaptune.trajectory import read_tum
 
 
@@ -104,6 +107,55 @@ def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, wo
     done = adaptune(*(named.get(word, word) for word in words))
     assert done.exit_code == 2
     assert expected in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--out", "a_file/refs"], "a_file/refs: cannot be written to"),
+        (["--out", "mine"], "mine/one_reference.tum: is there, and is not of an estimate"),
+        (["--reference", "early.tum"], "covers 1.000 s to 2.000 s"),
+        (["--reference", "bad.tum"], "bad.tum"),
+        (["--position-prior", "early.tum"], "covers 1.000 s to 2.000 s"),
+        (["--position-prior", "bad.tum"], "bad.tum"),
+    ],
+)
+def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, words, expected):
+    (tmp_path / "a_file").touch()
+    (tmp_path / "early.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    (tmp_path / "bad.tum").write_text("x y z\n")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/one_reference.tum").write_text("mine")
+
+    def estimated(*_):
+        raise AssertionError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimate, "estimate_reference", estimated)
+        done = adaptune(bag, *words)
+    assert done.exit_code == 2
+    assert expected in done.stderr
+    assert (tmp_path / "mine/one_reference.tum").read_text() == "mine"
+
+
+def test_an_estimate_is_made_again_over_itself(adaptune, bag):
+    for _ in range(2):
+        done = adaptune(bag, "--out", "refs")
+        assert done.exit_code == 0, done.stderr
+
+
+def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
+    adaptune, bag, monkeypatch
+):
+    def fail(_):
+        raise SequenceError("the reference covers another time")
+
+    monkeypatch.setattr(RecordedSequence, "reference", fail)
+    monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator())
+    done = adaptune(bag)
+    assert done.exit_code == 0, done.stderr
+    assert "is not compared with: the reference covers another time" in done.stdout
+    assert "The two differ" not in done.stdout
 
 
 def test_a_recording_that_cannot_be_estimated_is_told(adaptune, bag, monkeypatch):
