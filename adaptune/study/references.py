@@ -200,6 +200,12 @@ def estimates_in_words(study: Study, names: Iterable[str]) -> list[str]:
     return [f"Judged by an estimated reference: {'; '.join(each)}."]
 
 
+def estimates_beside_intervals(study: Study, names: Iterable[str]) -> list[str]:
+    """The same beside intervals that do not include the error of a reference."""
+    said = estimates_in_words(study, names)
+    return [f"{sentence} Intervals do not include its error." for sentence in said]
+
+
 def estimates_as_data(study: Study, names: Iterable[str]) -> dict[str, Any]:
     """The same as plain data, by the names of the sequences; empty if there is none."""
     length = study.config.sub_trajectory
