@@ -1,8 +1,9 @@
 """Whether an estimated reference would have judged the trials as the given one does."""
 
-import json
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +13,12 @@ from adaptune.archive import Archive, Frames
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.metrics import cap, sub_trajectory_rte, window_ends
-from adaptune.reference import estimate
+from adaptune.reference.estimated import EstimateError
 from adaptune.reference.given import MeasuredReference, common_poses, mean_difference
-from adaptune.reference.stored import CHECK, StoredEstimate, write_estimate
+from adaptune.reference.stored import CHECK, StoredEstimate
 from adaptune.sequence.config import ESTIMATED, NO_REFERENCE, SequenceConfig
 from adaptune.sequence.opening import open_sequence
-from adaptune.trajectory import read_tum
+from adaptune.study.references import estimated_at
 from offline.offline_study import OfflineStudy
 from offline.trial import episodes
 
@@ -152,9 +153,10 @@ def check_reference(study: OfflineStudy, show: Show = lambda *_: None) -> list[d
     Raises
     ------
     AdaptuneError
-        If there is no such sequence, or a recording does not allow an estimate.
+        If there is no such sequence, or no recording allows an estimate. Where some do not, a
+        warning says so.
     """
-    archive, rows, found = Archive(study.folder / "trials"), [], []
+    archive, rows, found, refused = Archive(study.folder / "trials"), [], [], list[str]()
     names = _given_names(study, archive)
     if not names:
         raise AdaptuneError(
@@ -163,12 +165,20 @@ def check_reference(study: OfflineStudy, show: Show = lambda *_: None) -> list[d
         )
     for name in names:
         frames, numbers = archive.read_frames(name), sorted(archive.finished(name))
-        stored = _estimate(study, name, show)
-        T = read_tum(stored.path).at(frames.stamps)
+        try:
+            stored = _estimate(study, name, show)
+        except EstimateError as error:
+            refused.append(str(error))
+            continue
+        T = _poses(study, name, stored.path, frames)
         judged = _judge_trials(study, archive, name, frames, T)
         found.append((numbers, judged))
         rows.append(_row(study, name, frames, T, stored) | _choice_cells(len(numbers), judged))
-    if len(names) > 1:
+    if not rows:
+        raise EstimateError("\n".join(refused))
+    for said in refused:
+        _log.warning("%s; it is not in the table", said)
+    if len(rows) > 1:
         judged = over_all(found)
         named = dict.fromkeys(rows[0]) | {"sequence": "all: fixed set"}
         rows.append(named | _choice_cells(len(judged.given), judged))
@@ -194,23 +204,14 @@ def _is_given(config: SequenceConfig) -> bool:
 def _estimate(study: OfflineStudy, name: str, show: Show) -> StoredEstimate:
     """The estimated reference of a sequence, made if it is not there or of other scans."""
     path = study.folder / "references" / f"{name}{CHECK}.tum"
-    about = _about(study, name)
-    if path.exists() and (stored := StoredEstimate.read(path)) is not None:
-        if stored.about == about:
-            return stored
-        _log.info("%s: is of other scans, and is estimated again", path)
-
-    def advance(done: int, total: int) -> None:
-        show(name, done, total)
-
-    scans = study.sequences.open(name)
-    return write_estimate(path, estimate.estimate_reference(scans, advance), about)
+    return estimated_at(study, name, path, partial(show, name))
 
 
-def _about(study: OfflineStudy, name: str) -> dict[str, Any]:
-    about = {"estimator": estimate.VERSION} | study.sequences.identity(name)
-    plain: dict[str, Any] = json.loads(json.dumps(about))
-    return plain
+def _poses(study: OfflineStudy, name: str, path: Path, frames: Frames) -> Poses:
+    """The estimated poses of the scans that the trials have seen."""
+    trajectory = open_sequence(study.sequences.by_estimate(name, path)).reference()
+    assert trajectory is not None
+    return trajectory.at(frames.stamps)
 
 
 def _judge_trials(

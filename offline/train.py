@@ -21,7 +21,7 @@ from adaptune.study.inputs import InputNotes, digest, resume
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
-    estimates_in_words,
+    estimates_beside_intervals,
     estimates_of,
 )
 from offline.baseline import run_baseline
@@ -62,7 +62,7 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     remark: str | None  # see `rivalry`
-    references: Sequence[str] = ()  # see `estimates_in_words`
+    references: Sequence[str] = ()  # see `estimates_beside_intervals`
 
     @property
     def words(self) -> list[str]:
@@ -173,7 +173,7 @@ def train(
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     rows = _training_rows(study, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
-    judged = estimates_in_words(study, study.training)
+    judged = estimates_beside_intervals(study, study.training)
     return Training(model, means, fixed, rows, remark, judged)
 
 

@@ -14,7 +14,7 @@ from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.study.driven import Driven, driven
 from adaptune.study.inputs import check_model
-from adaptune.study.references import estimates_in_words
+from adaptune.study.references import estimates_beside_intervals
 from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledData, labelled_data
 from offline.leave_one_out import (
@@ -93,7 +93,7 @@ def validate(
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
     said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
-    said += estimates_in_words(study, study.training)
+    said += estimates_beside_intervals(study, study.training)
     return Validated(validation, rows, learning, banks, said)
 
 

@@ -109,7 +109,9 @@ def _replay_all(
     Sequences without a reference get an estimated one before, where that is possible.
     """
     study.open()
-    ensure_references(study, sequences, progress, required=False)
+    refused = ensure_references(study, sequences, progress, required=False)
+    for said in refused.values():
+        _log.warning("%s; it is replayed without a reference, and not judged", said)
     digest = "" if modes.model is None else modes.model.digest
     made = 0
     for name in sequences:

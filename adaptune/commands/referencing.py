@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from adaptune.reference.of_recording import Comparison
     from adaptune.reference.stored import StoredEstimate
     from adaptune.sequence.config import SequenceConfig
+    from adaptune.sequence.sequence import Sequence
+    from adaptune.trajectory import Trajectory
     from offline.offline_study import OfflineStudy
 
 _STUDIES = (".yaml", ".yml")
@@ -156,14 +158,16 @@ def _of_recording(
     scans = open_sequence(config)
     joined = None if prior is None else of_recording.read_prior(config, prior)
     path = out / f"{of_recording.estimated_name(target)}.tum"
+    # What can fail is found before the estimate, which takes minutes.
+    of_recording.check_writable(path)
+    there = _given_reference(scans, required=given is not None)
     with progress() as show:
         found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
         warn_of_unused(scans.name, joined, found)
         about = {"recording": str(target.resolve()), "points": config.points}
         about["position_prior"] = prior
-        stored = write_estimate(path, found, about, metres)
         metres = length or proposed_sub_trajectory(found.trajectory())
-        there, why = scans.reference(), ""
+        stored = write_estimate(path, found, about, metres)
         if there is not None:
             advance = _advance(show, "given reference")
             comparison = of_recording.beside_given(scans, there, found, metres, advance)
@@ -176,6 +180,17 @@ def _of_recording(
     say_next(why, "offline", "STUDY.yaml", first=first)
 
 
+def _given_reference(scans: "Sequence", required: bool) -> "Trajectory | None":
+    """The reference to compare with; one that was not asked for may be of no use."""
+    try:
+        return scans.reference()
+    except AdaptuneError as error:
+        if required:
+            raise
+        say(f"The given reference is not compared with: {error}")
+        return None
+
+
 def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float) -> None:
     """What the estimated reference is worth."""
     say(f"Estimated reference: {stored.metres:.1f} m, {stored.scans:,} scans.")
@@ -183,9 +198,7 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
     if math.isnan(error):
         say(f"Its error is not known: the path holds no {length:g} m without interruption.")
     else:
-        say(
-            f"It is wrong by about {error:.2g} % over {length:g} m, as two halves of the registrations tell."
-        )
+        say(f"It is wrong by about {error:.2g} % over {length:g} m, as its two halves tell.")
     if not unknown:
         say("It is known everywhere.")
         return
@@ -209,43 +222,34 @@ def _say_comparison(comparison: "Comparison", config: "SequenceConfig", length: 
 def _of_study(study: "OfflineStudy") -> None:
     """Estimate the references that a study lacks, and say what each is worth."""
     from adaptune import report
-    from adaptune.reference.stored import stored_estimates
+    from adaptune.study.references import ensure_references, estimates_of, to_estimate
 
-    names = _without_reference(study)
+    names = to_estimate(study, (*study.config.training, *study.config.test))
     if not names:
         raise AdaptuneError(
             f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
             f"is to be estimated, or compare with --check"
         )
-    from adaptune.study.references import ensure_references
-
     study.open()
     with progress() as show:
-        ensure_references(study, names, show)
-    folder, length = study.folder / "references", study.config.sub_trajectory
+        refused = ensure_references(study, names, show, required=False)
+    length = study.config.sub_trajectory
     rows = [
         {
-            "reference": stored.path.stem,
+            "reference": name,
             "scans": stored.scans,
             "metres": stored.metres,
             "its error [%]": stored.error(length),
             "unknown [% of the scans]": 100.0 * stored.unknown_share,
         }
-        for stored in stored_estimates(folder)
+        for name, stored in estimates_of(study, names).items()
     ]
-    caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
-    console.print(report.table("Estimated references", rows, caption))
-    say(f"Files: {folder}/")
-
-
-def _without_reference(study: "OfflineStudy") -> list[str]:
-    """The recordings of a study that have no reference, or are to have an estimated one."""
-    from adaptune.sequence.names import origin
-    from adaptune.sequence.opening import wants_estimate
-
-    names = dict.fromkeys(map(origin, (*study.config.training, *study.config.test)))
-    given = {name: of for name in names if (of := study.sequences.recordings.get(name))}
-    return [name for name, of in given.items() if wants_estimate(of)]
+    if rows:
+        caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
+        console.print(report.table("Estimated references", rows, caption))
+        say(f"Files: {study.folder / 'references'}/")
+    if refused:
+        raise AdaptuneError("\n".join(refused.values()))
 
 
 def _check(study: "OfflineStudy") -> None:

@@ -1,7 +1,8 @@
 """How accurate a reference is that came with a recording, by direct registrations of its scans."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from adaptune.sequence.scan import Scan
 from adaptune.sequence.sequence import Sequence
 from adaptune.trajectory import Trajectory
 
-Advance = Callable[[int, int], None]
-"""Called with how many scans are done, and about how many there are."""
+if TYPE_CHECKING:
+    # It would import what estimates.
+    from adaptune.reference.estimate import Advance
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ class MeasuredReference:
 
 
 def measure_reference(
-    scans: Sequence, reference: Trajectory, advance: Advance = lambda *_: None
+    scans: Sequence, reference: Trajectory, advance: "Advance" = lambda *_: None
 ) -> MeasuredReference:
     """Register the scans of a recording to find how wrong its reference is.
 

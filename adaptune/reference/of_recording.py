@@ -1,21 +1,23 @@
 """Estimate the reference of a single recording, and compare it with the one that came with it."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from adaptune.inspect import Inspection
 from adaptune.reference.estimated import EstimatedReference, EstimateError
 from adaptune.reference.given import MeasuredReference, mean_difference, measure_reference
+from adaptune.reference.stored import StoredEstimate
 from adaptune.sequence.config import ESTIMATED, SequenceConfig
 from adaptune.sequence.opening import position_prior
 from adaptune.sequence.sequence import Sequence
 from adaptune.trajectory import Trajectory
 
-Advance = Callable[[int, int], None]
-"""Called with how many scans are done, and about how many there are."""
+if TYPE_CHECKING:
+    # It would import what estimates.
+    from adaptune.reference.estimate import Advance
 
 
 def recording_config(
@@ -75,7 +77,7 @@ def beside_given(
     given: Trajectory,
     found: EstimatedReference,
     length: float,
-    advance: Advance = lambda *_: None,
+    advance: "Advance" = lambda *_: None,
 ) -> Comparison:
     """Compare an estimated reference with a given one, and measure the given one.
 
@@ -95,6 +97,31 @@ def beside_given(
     measured = measure_reference(scans, given, advance)
     T = np.where(found.known[:, None, None], found.T_world_sensor, np.nan)
     return Comparison(mean_difference(given.at(found.stamps), T, length), measured)
+
+
+def check_writable(path: Path) -> None:
+    """Make sure that an estimate can be written, and that nothing of the user's is overwritten.
+
+    Raises
+    ------
+    EstimateError
+        If the folder of the TUM file cannot be written to, or there is a file that is no estimate.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise EstimateError(
+            f"{path.parent}: cannot be written to ({error.strerror}); write elsewhere with --out"
+        ) from error
+    if StoredEstimate.read(path) is None:
+        files = (path.with_suffix(suffix) for suffix in (".tum", ".json", ".png"))
+        if there := [file for file in files if file.exists()]:
+            raise EstimateError(
+                f"{there[0]}: is there, and is not of an estimate that is complete; move it away, "
+                f"or write elsewhere with --out"
+            )
 
 
 def estimated_name(recording: Path) -> str:

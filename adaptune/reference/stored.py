@@ -75,6 +75,8 @@ class StoredEstimate(NamedTuple):
     def read(cls, path: Path) -> "StoredEstimate | None":
         """What is known about the estimated reference in a TUM file; None if it is not one.
 
+        Nor is it one where an estimate was refused, see `Refusal`.
+
         Raises
         ------
         EstimateError
@@ -83,6 +85,8 @@ class StoredEstimate(NamedTuple):
         beside = path.with_suffix(".json")
         try:
             known = json.loads(beside.read_text(encoding="utf-8"))
+            if "refused" in known:
+                return None
             errors = {float(length): float(e) for length, e in known["error_percent"].items()}
             numbers = int(known["scans"]), float(known["metres"]), float(known["unknown_share"])
             return cls(path, dict(known["about"]), *numbers, errors)
@@ -131,7 +135,31 @@ def write_estimate(
     return stored
 
 
-def stored_estimates(folder: Path) -> list[StoredEstimate]:
-    """All estimated references of a folder by name, without those that only check a given one."""
-    paths = (path for path in sorted(folder.glob("*.tum")) if not path.stem.endswith(CHECK))
-    return [stored for path in paths if (stored := StoredEstimate.read(path)) is not None]
+class Refusal(NamedTuple):
+    """Why no reference could be estimated.
+
+    Attributes
+    ----------
+    about : dict
+        What it was to be estimated from, as plain data.
+    refused : str
+        The reason.
+    """
+
+    about: dict[str, Any]
+    refused: str
+
+    @classmethod
+    def read(cls, path: Path) -> "Refusal | None":
+        """Why there is no estimate in a TUM file; None if it was not refused, or is unreadable."""
+        try:
+            known = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+            return cls(dict(known["about"]), str(known["refused"]))
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def write(self, path: Path) -> None:
+        """Keep it beside where the TUM file would be; an estimate that is there is removed."""
+        for suffix in (".json", ".tum", ".png"):
+            path.with_suffix(suffix).unlink(missing_ok=True)
+        write_text(path.with_suffix(".json"), json.dumps(self._asdict(), indent=1) + "\n")

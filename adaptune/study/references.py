@@ -4,15 +4,16 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from adaptune.cores import pin
 from adaptune.reference import estimate
-from adaptune.reference.estimated import EstimateError
+from adaptune.reference.estimated import EstimatedReference, EstimateError
 from adaptune.reference.prior import warn_of_unused
-from adaptune.reference.stored import StoredEstimate, write_estimate
+from adaptune.reference.stored import Refusal, StoredEstimate, write_estimate
 from adaptune.sequence.fingerprint import fingerprints
 from adaptune.sequence.names import origin
 from adaptune.sequence.opening import (
@@ -34,16 +35,27 @@ _CHANGES = {
 _log = logging.getLogger(__name__)
 
 
+def to_estimate(study: Study, names: Iterable[str]) -> list[str]:
+    """Those of the sequences whose reference is to be estimated: none is given, or it is asked for.
+
+    Views count as the sequence that they are of. A course has a reference of its own.
+    """
+    recordings = study.sequences.recordings
+    each = dict.fromkeys(map(origin, names))
+    return [name for name in each if name in recordings and wants_estimate(recordings[name])]
+
+
 def ensure_references(
     study: Study,
     names: Iterable[str],
     progress: Callable[[str, int, int], None] = lambda *_: None,
     required: bool = True,
-) -> None:
+) -> dict[str, str]:
     """Estimate the references that are to be estimated and are not yet, or of something else.
 
     An estimate is made from the scans as they were recorded, so the views of a sequence share it.
     It knows nothing of the study's odometry: what judges a bank is not built from its members.
+    One that was refused is not tried again before something has changed.
 
     Parameters
     ----------
@@ -54,47 +66,83 @@ def ensure_references(
     progress
         Called about every scan.
     required
-        Whether the sequences are of no use without. If not, those of which no reference can be
-        estimated are warned of.
+        Whether the sequences are of no use without.
+
+    Returns
+    -------
+    dict of str to str
+        By its name, why the reference of a sequence cannot be estimated.
 
     Raises
     ------
     EstimateError
-        If the reference of a sequence cannot be estimated.
+        If the reference of a sequence cannot be estimated, and is required.
     """
-    due = [name for name in dict.fromkeys(map(origin, names)) if _is_due(study, name)]
-    if not due:
-        return
-    study.open()
-    # Open3D's results repeat on one core only.
-    unpin = pin(os.getpid())
-    try:
-        for name in due:
-            _estimate(study, name, partial(progress, f"{name}, estimating its reference"), required)
-    finally:
-        unpin()
+    refused = {}
+    for name in to_estimate(study, names):
+        path, before = study.sequences.estimate_path(name), study.sequences.estimate(name)
+        try:
+            shown = partial(progress, f"{name}, estimating its reference")
+            stored = estimated_at(study, name, path, shown)
+        except EstimateError as error:
+            if required:
+                raise
+            refused[name] = str(error)
+            continue
+        if stored != before:
+            accuracy = accuracy_in_words(stored, study.config.sub_trajectory)
+            message = "%s: its reference is estimated, %.0f m; %s (%s)"
+            _log.info(message, name, stored.metres, accuracy, path)
+    return refused
 
 
-def _is_due(study: Study, name: str) -> bool:
-    """Whether the reference of a sequence must be estimated; why, if that was done before."""
-    given = study.sequences.recordings.get(name)
-    if given is None or not wants_estimate(given):
-        return False
-    stored = study.sequences.estimate(name)
-    if stored is None:
-        return True
-    about = _about(study, name)
-    changes = [said for key, said in _CHANGES.items() if stored.about.get(key) != about[key]]
+def estimated_at(
+    study: Study, name: str, path: Path, advance: Callable[[int, int], None]
+) -> StoredEstimate:
+    """The estimated reference of a sequence or a course in a file, made unless it is there.
+
+    Parameters
+    ----------
+    study
+        The study.
+    name
+        Of the sequence, not of a view.
+    path
+        The TUM file.
+    advance
+        Called about every scan, if it is made.
+
+    Raises
+    ------
+    EstimateError
+        If it cannot be estimated, now or when it was tried with the same scans.
+    """
+    about, stored, refusal = _about(study, name), StoredEstimate.read(path), Refusal.read(path)
+    before = stored or refusal
+    changes = [] if before is None else _changes(before.about, about)
     if changes:
         _log.info("%s: its reference is estimated again: %s", name, "; ".join(changes))
-    return bool(changes)
+    elif stored is not None and path.exists():
+        return stored
+    if refusal is None or changes:
+        found = _estimate(study, name, advance)
+        if isinstance(found, EstimatedReference):
+            return write_estimate(path, found, about, study.config.sub_trajectory)
+        refusal = Refusal(about, found)
+        refusal.write(path)
+    raise EstimateError(f"{study.sequences.key(name)}: {refusal.refused}")
+
+
+def _changes(before: Mapping[str, Any], about: Mapping[str, Any]) -> list[str]:
+    return [said for key, said in _CHANGES.items() if before.get(key) != about[key]]
 
 
 def _about(study: Study, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
-    given = study.sequences.recordings[name]
+    given = study.sequences.unseen(name)
     scans = study.sequences.identity(name)
-    seen = {"views", "compensate"}
+    # Scans as they were recorded depend on none of these.
+    seen = {"views", "compensate", "imu"}
     scans["sequence"] = {key: v for key, v in scans["sequence"].items() if key not in seen}
     prior = None
     if given.position_prior is not None:
@@ -107,30 +155,23 @@ def _about(study: Study, name: str) -> dict[str, Any]:
     return plain
 
 
-def _estimate(study: Study, name: str, advance: Callable[[int, int], None], required: bool) -> None:
-    given, path = study.sequences.recordings[name], study.sequences.estimate_path(name)
-    about, scans, prior = _about(study, name), open_unseen(given), position_prior(given)
+def _estimate(
+    study: Study, name: str, advance: Callable[[int, int], None]
+) -> EstimatedReference | str:
+    """The reference of a sequence, or why it cannot be estimated."""
+    study.open()
+    given = study.sequences.unseen(name)
+    scans, prior = open_unseen(given), position_prior(given)
+    # Open3D's results repeat on one core only.
+    unpin = pin(os.getpid())
     try:
         found = estimate.estimate_reference(scans, advance, prior)
     except EstimateError as error:
-        # What was estimated before is of something else.
-        for suffix in (".json", ".tum", ".png"):
-            path.with_suffix(suffix).unlink(missing_ok=True)
-        where = "" if scans.name in str(error) else f"{scans.name}: "
-        refused = f"{study.sequences.key(name)}: {where}{error}"
-        if required:
-            raise EstimateError(refused) from error
-        _log.warning("%s; it is replayed without a reference, and not judged", refused)
-        return
+        return str(error) if scans.name in str(error) else f"{scans.name}: {error}"
+    finally:
+        unpin()
     warn_of_unused(name, prior, found)
-    stored = write_estimate(path, found, about, study.config.sub_trajectory)
-    _log.info(
-        "%s: its reference is estimated, %.0f m; %s (%s)",
-        name,
-        stored.metres,
-        accuracy_in_words(stored, study.config.sub_trajectory),
-        path,
-    )
+    return found
 
 
 def accuracy_in_words(stored: StoredEstimate, length: float) -> str:
@@ -157,6 +198,12 @@ def estimates_in_words(study: Study, names: Iterable[str]) -> list[str]:
     if not each:
         return []
     return [f"Judged by an estimated reference: {'; '.join(each)}."]
+
+
+def estimates_beside_intervals(study: Study, names: Iterable[str]) -> list[str]:
+    """The same beside intervals that do not include the error of a reference."""
+    said = estimates_in_words(study, names)
+    return [f"{sentence} Intervals do not include its error." for sentence in said]
 
 
 def estimates_as_data(study: Study, names: Iterable[str]) -> dict[str, Any]:

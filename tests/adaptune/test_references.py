@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptune.reference.estimated import EstimateError
-from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.config import ImuConfig, SequenceConfig
 from adaptune.sequence.opening import open_sequence, wants_estimate
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.study.references import (
@@ -222,7 +222,7 @@ def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path, study_file):
         load_study(study_file, [entry], tmp_path / "run")
 
 
-def test_a_recording_that_allows_none_is_named(estimator, load, caplog):
+def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, load, caplog):
     study = load(LEFT_OUT)
     ensure_references(study, ["one"])
     estimator.refusal = EstimateError("the robot hardly moves")
@@ -231,13 +231,35 @@ def test_a_recording_that_allows_none_is_named(estimator, load, caplog):
         ensure_references(other, ["one"])
     # What was estimated of something else is gone.
     assert not study.sequences.is_estimated("one")
-    caplog.clear()
-    ensure_references(other, ["one"], required=False)
-    (said,) = caplog.messages
-    assert said.endswith(
-        "the robot hardly moves; it is replayed without a reference, and not judged"
-    )
+    # It is not tried again, and said again.
+    n = len(estimator.asked)
+    with pytest.raises(EstimateError, match=r"^sequences\.one: .*one\.bag: the robot hardly moves"):
+        ensure_references(other, ["one"])
+    refused = ensure_references(other, ["one", "two"], required=False)
+    assert list(refused) == ["one"]
+    assert refused["one"].endswith("one.bag: the robot hardly moves")
+    assert len(estimator.asked) == n
     assert other.sequences.open("one").reference() is None
+    assert not other.sequences.is_estimated("one")
+    # But when something has changed.
+    estimator.refusal = None
+    caplog.clear()
+    assert not ensure_references(study, ["one"], required=False)
+    assert caplog.messages[0] == "one: its reference is estimated again: its scans are others"
+    assert study.sequences.is_estimated("one")
+
+
+def test_with_an_imu_it_is_the_same_estimate(estimator, load, monkeypatch):
+    study = load(LEFT_OUT)
+    ensure_references(study, ["one"])
+    with_imu = study.sequences.config("two").model_copy(update={"imu": ImuConfig(unit="g")})
+    config = with_imu.model_copy(
+        update={"bag": study.sequences.config("one").bag, "reference": None}
+    )
+    monkeypatch.setitem(study.sequences.recordings, "one", config)
+    assert study.sequences.identity("one")["sequence"]["imu"]["unit"] == "g"
+    ensure_references(study, ["one"])
+    assert len(estimator.asked) == 1
 
 
 def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch):

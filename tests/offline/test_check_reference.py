@@ -12,6 +12,9 @@ from hypothesis.extra.numpy import arrays
 from adaptune import terminal
 from adaptune.archive import Archive
 from adaptune.reference import estimate
+from adaptune.reference.estimated import EstimateError
+from adaptune.reference.stored import StoredEstimate
+from adaptune.study.references import ensure_references
 from offline.check_reference import (
     Judged,
     Run,
@@ -174,6 +177,38 @@ def test_a_file_that_was_estimated_is_not_given(study_file, folder, counted, tmp
     study = load_study(study_file, overrides, folder)
     assert [row["sequence"] for row in check_reference(study)] == ["two"]
     assert len(counted) == 2
+
+
+def test_scans_are_taken_as_they_were_recorded(study_file, folder, counted):
+    dropping = ["sequences.one.views=[{drop: {share: 0.5}}]", "training=[one]"]
+    rows = check_reference(load_study(study_file, dropping, folder))
+    assert len(counted) == 1
+    assert rows[0]["not trusted [%]"] == 0.0
+    # The estimate of the study itself is the same.
+    about = StoredEstimate.read(folder / "references/one.check.tum").about
+    study = load_study(study_file, [*dropping, "sequences.one.reference="], folder)
+    ensure_references(study, ["one"])
+    assert study.sequences.estimate("one").about == about
+    assert StoredEstimate.read(folder / "references/one.check.tum").scans == 40
+
+
+def test_one_that_is_refused_leaves_the_others(study_file, folder, counted, monkeypatch, caplog):
+    made = estimate.estimate_reference
+
+    def refuse(scans, *given):
+        if "one" in scans.name:
+            raise EstimateError("the robot hardly moves")
+        return made(scans, *given)
+
+    monkeypatch.setattr(estimate, "estimate_reference", refuse)
+    rows = check_reference(load_study(study_file, [], folder))
+    assert [row["sequence"] for row in rows] == ["two"]
+    (said,) = (message for message in caplog.messages if "hardly" in message)
+    assert said.startswith("sequences.one: ")
+    only = load_study(study_file, ["training=[one]"], folder)
+    with pytest.raises(EstimateError, match=r"sequences\.one: .* hardly moves"):
+        check_reference(only)
+    assert len(counted) == 1
 
 
 def test_the_command_writes_a_table(study_file, folder, counted, monkeypatch):

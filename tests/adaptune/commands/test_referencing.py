@@ -1,9 +1,8 @@
 import re
-import sys
-from types import ModuleType
 
 import commands
 import drives
+import estimates
 import made_references
 import numpy as np
 import pytest
@@ -12,6 +11,10 @@ from adaptune import terminal
 from adaptune.reference import estimate
 from adaptune.reference.estimated import EstimateError
 from adaptune.reference.stored import StoredEstimate, write_estimate
+from adaptune.sequence.config import SequenceConfig
+from adaptune.sequence.opening import open_sequence
+from adaptune.sequence.recorded import RecordedSequence
+from adaptune.sequence.sequence import SequenceError
 from adaptune.trajectory import read_tum
 
 
@@ -34,7 +37,7 @@ def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
     assert done.exit_code == 0, done.stderr
     assert "Estimated reference: 11.7 m, 40 scans." in done.stdout
     assert re.search(r"It is wrong by about \d.* % over 2 m, as its two halves tell", done.stdout)
-    assert "It can be trusted everywhere." in done.stdout
+    assert "It is known everywhere." in done.stdout
     assert "Given reference (/truth): wrong by at most" in done.stdout
     assert re.search(r"The two differ by \d.* % over 2 m", done.stdout)
     assert "write `reference: one_reference.tum` under" in done.stdout.splitlines()[-1]
@@ -48,7 +51,7 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     done = adaptune(bag, "--out", "refs", "--length", "1.5")
     assert done.exit_code == 0, done.stderr
     assert re.search(
-        r"cannot be trusted on \d.* of the scans, and has no poses there: 0.9-2.0 s", done.stdout
+        r"unknown for \d.* % of the scans, which have no pose: 0.9-2.0 s \(.*\) after", done.stdout
     )
     assert "over 1.5 m" in done.stdout
     assert (tmp_path / "refs/one_reference.json").exists()
@@ -106,6 +109,55 @@ def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, wo
     assert expected in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--out", "a_file/refs"], "a_file/refs: cannot be written to"),
+        (["--out", "mine"], "mine/one_reference.tum: is there, and is not of an estimate"),
+        (["--reference", "early.tum"], "covers 1.000 s to 2.000 s"),
+        (["--reference", "bad.tum"], "bad.tum"),
+        (["--position-prior", "early.tum"], "covers 1.000 s to 2.000 s"),
+        (["--position-prior", "bad.tum"], "bad.tum"),
+    ],
+)
+def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, words, expected):
+    (tmp_path / "a_file").touch()
+    (tmp_path / "early.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    (tmp_path / "bad.tum").write_text("x y z\n")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/one_reference.tum").write_text("mine")
+
+    def estimated(*_):
+        raise AssertionError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimate, "estimate_reference", estimated)
+        done = adaptune(bag, *words)
+    assert done.exit_code == 2
+    assert expected in done.stderr
+    assert (tmp_path / "mine/one_reference.tum").read_text() == "mine"
+
+
+def test_an_estimate_is_made_again_over_itself(adaptune, bag):
+    for _ in range(2):
+        done = adaptune(bag, "--out", "refs")
+        assert done.exit_code == 0, done.stderr
+
+
+def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
+    adaptune, bag, monkeypatch
+):
+    def fail(_):
+        raise SequenceError("the reference covers another time")
+
+    monkeypatch.setattr(RecordedSequence, "reference", fail)
+    monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator())
+    done = adaptune(bag)
+    assert done.exit_code == 0, done.stderr
+    assert "is not compared with: the reference covers another time" in done.stdout
+    assert "The two differ" not in done.stdout
+
+
 def test_a_recording_that_cannot_be_estimated_is_told(adaptune, bag, monkeypatch):
     def refuse(*_):
         raise EstimateError("one.bag: the robot moves 0.1 m only")
@@ -116,27 +168,40 @@ def test_a_recording_that_cannot_be_estimated_is_told(adaptune, bag, monkeypatch
     assert "moves 0.1 m only" in done.stderr
 
 
-def test_of_a_study_those_that_it_lacks_are_estimated(adaptune, study_file, tmp_path, monkeypatch):
+def test_of_a_study_those_that_it_lacks_are_estimated(
+    adaptune, bag, study_file, tmp_path, monkeypatch
+):
+    made = made_references.of_truth(bag)
     asked = []
 
-    def ensure(study, names, progress):
-        asked.append(names)
-        for name in names:
-            scans = study.sequences.open(name)
-            found = made_references.of_truth(study_file.parent / f"{name}.bag")(scans)
-            write_estimate(study.folder / "references" / f"{name}.tum", found, {})
-            progress(name, 1, 1)
+    def estimated(scans, *given):
+        asked.append(scans.name.rpartition("/")[2])
+        if "two" in scans.name:
+            raise EstimateError("the robot moves 0.1 m only")
+        return made(scans, *given)
 
-    module = ModuleType("adaptune.study.references")
-    module.ensure_references = ensure
-    monkeypatch.setitem(sys.modules, "adaptune.study.references", module)
-    (tmp_path / "study.yaml").write_text(
-        study_file.read_text()
-        .replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
-        .replace("bag: ", f"bag: {study_file.parent}/")
-    )
+    monkeypatch.setattr(estimate, "estimate_reference", estimated)
+    text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
+    one = text.replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
+    (tmp_path / "study.yaml").write_text(one)
     done = adaptune("study.yaml", "--folder", "run")
     assert done.exit_code == 0, done.stderr
-    assert asked == [["one"]]
     assert re.search(r"one +40 +11\.\d", done.stdout)
     assert "adaptune offline study.yaml --folder run" in done.stdout.splitlines()[-1]
+    assert asked == ["one.bag"]
+    # One that is refused leaves the others; one that is not asked for is not listed.
+    (tmp_path / "study.yaml").write_text(
+        text.replace("reference: /truth", "reference: estimated").replace(
+            "test: [three]", "test: []"
+        )
+    )
+    write_estimate(
+        tmp_path / "run/references/stale.tum", made(open_sequence(SequenceConfig(bag=str(bag)))), {}
+    )
+    done = adaptune("study.yaml", "--folder", "run", "-o", "training=[two, one]")
+    assert done.exit_code == 2
+    assert "sequences.two: " in done.stderr
+    assert "the robot moves 0.1 m only" in done.stderr
+    assert re.search(r"one +40 +11\.\d", done.stdout)
+    assert "stale" not in done.stdout
+    assert asked == ["one.bag", "two.bag"]
