@@ -10,7 +10,7 @@ from made_passes import straight
 from made_references import made_of
 
 from adaptune.reference.estimated import EstimateError
-from adaptune.reference.stored import CHECK, StoredEstimate, stored_estimates, write_estimate
+from adaptune.reference.stored import StoredEstimate, write_estimate
 from adaptune.trajectory import read_tum
 
 ABOUT = {"bag": "drive.bag", "topics": ["/points"], "version": 1}
@@ -136,16 +136,6 @@ def test_a_damaged_file_is_named(tmp_path, text):
 def test_a_sound_file_is_read(tmp_path):
     (tmp_path / "drive.json").write_text(json.dumps(WHOLE))
     assert StoredEstimate.read(tmp_path / "drive.tum").errors == {5.0: 1.0}
-
-
-def test_the_estimates_of_a_folder(tmp_path):
-    for name in ("b", "a", f"c{CHECK}"):
-        (tmp_path / f"{name}.tum").touch()
-        (tmp_path / f"{name}.json").write_text(json.dumps(WHOLE))
-    (tmp_path / "given.tum").touch()
-    (tmp_path / "d.json").write_text(json.dumps(WHOLE))
-    assert [stored.path.name for stored in stored_estimates(tmp_path)] == ["a.tum", "b.tum"]
-    assert stored_estimates(tmp_path / "nowhere") == []
 
 
 @pytest.mark.parametrize(
