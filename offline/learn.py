@@ -120,7 +120,8 @@ def learn(
             raise
         raise LearnError(f"{error}\n{said}") from error
     after = Known.of(with_drive, training.model)
-    words = [*changes(before, after), runs_in_words(stored, stored_runs(study.folder))]
+    judged = *training.references, *training.doubts
+    words = [*changes(before, after), *judged, runs_in_words(stored, stored_runs(study.folder))]
     return Lesson(with_drive, training, words)
 
 

@@ -13,9 +13,11 @@ import numpy as np
 from adaptune import report, yaml
 from adaptune.archive import Archive
 from adaptune.cores import available
+from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
 from adaptune.parameter_sets import ParameterSets
+from adaptune.sequence.config import NO_REFERENCE
 from adaptune.sequence.names import origin
 from adaptune.study.inputs import InputNotes, digest, resume
 from adaptune.study.references import (
@@ -143,6 +145,7 @@ def train(
         own parameters, no set keeps the limits, or stored trials depend on something that has
         changed.
     """
+    _check_references(study)
     ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
     resume(study, again)
     config = study.config.offline
@@ -183,6 +186,17 @@ def _finished(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verd
         name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
         for name in study.training
     }
+
+
+def _check_references(study: OfflineStudy) -> None:
+    """Refuse what cannot be trained on before any stored trial is removed."""
+    for name in study.config.training:
+        of = study.sequences.recordings.get(name)
+        if of is not None and of.reference == NO_REFERENCE:
+            raise AdaptuneError(
+                f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
+                f"topic or file, or leave `reference` out to have it estimated"
+            )
 
 
 def _fixed(

@@ -303,11 +303,14 @@ def allowing_for(
 def _estimated(replay: StoredReplay) -> tuple[float | None, Interval]:
     """Mean of the estimated errors, and of the ends of their intervals.
 
-    The interval is right if all estimates err together, and else too wide.
+    The interval is right if all estimates err together, and else too wide. There is none where less
+    than half of the recording was estimated: the rest may be of another kind.
     """
     known = replay.estimated[np.isfinite(replay.estimated[:, 0])]
     if not len(known):
         return None, None
+    if 2 * len(known) < len(replay.estimated):
+        return float(known[:, 0].mean()), None
     mean, low, high = known.mean(axis=0).tolist()
     return mean, (low, high) if np.isfinite([low, high]).all() else None
 

@@ -255,6 +255,8 @@ class SequenceConfig(_Part):
             raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
         if self.compensate == "gyro" and self.imu is None:
             raise ValueError("`compensate: gyro` needs `imu`")
+        if self.position_prior in (ESTIMATED, NO_REFERENCE):
+            raise ValueError("`position_prior` names a topic or a file of poses")
         if self.position_prior is not None and self.reference not in (None, ESTIMATED):
             raise ValueError(
                 f"`position_prior` joins an estimated reference: write `reference: {ESTIMATED}`, "

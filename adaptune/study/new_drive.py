@@ -172,11 +172,7 @@ def _described(study: Study, path: Path, reference: str | None) -> tuple[str, di
     entry = proposed if like is None else {**_source(proposed), **like}
     if reference is not None:
         entry = _with_reference(entry, reference, topics)
-    elif (
-        entry.get("reference") != ESTIMATED
-        and "position_prior" not in entry
-        and entry.get("reference") not in topics
-    ):
+    elif like is None or entry.get("reference", ESTIMATED) not in (ESTIMATED, *topics):
         entry = _with_reference(entry, proposed.get("reference"), topics)
     return str(name).encode()[:_LONGEST].decode(errors="ignore"), entry
 

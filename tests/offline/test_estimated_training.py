@@ -8,6 +8,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from adaptune.cli import app
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.show import render
 from adaptune.reference.estimated import EstimateError
@@ -65,3 +66,14 @@ def test_a_training_sequence_without_is_an_error_before_the_first_trial(
     assert "error: sequences.one: " in done.stderr
     assert "one.bag: the robot hardly moves" in done.stderr
     assert not (tmp_path / "run/trials").exists()
+
+
+def test_a_sequence_without_reference_is_refused_before_trials_are_removed(load, monkeypatch):
+    estimates.install(monkeypatch)
+    study = load()
+    train(study)
+    trials = sorted(study.folder.glob("trials/*/*.npz"))
+    changed = load("sequences.two.reference=none")
+    with pytest.raises(AdaptuneError, match=r"sequences\.two: training needs a reference"):
+        train(changed, again=True)
+    assert sorted(study.folder.glob("trials/*/*.npz")) == trials
