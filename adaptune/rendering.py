@@ -44,7 +44,8 @@ def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableT
     parts.append(Text(_read_text(inspection)))
     parts += [Text(f"! {f.text}", "red" if f.lacks else "yellow") for f in inspection.faults]
     parts += [_stage_text(inspection, stage) for stage in inspection.missing]
-    parts.append(Text("\n" + inspection.entry))
+    # Broken lines would not be YAML.
+    parts.append(Text("\n" + inspection.entry, no_wrap=True, overflow="ignore"))
     return Group(*parts)
 
 

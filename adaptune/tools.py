@@ -42,7 +42,7 @@ def inspect(
             measured, accuracy = _measured(found, show)
     else:
         found = inspect_file(file)
-    console.print(render_inspection(found, accuracy))
+    console.print(render_inspection(found, accuracy), crop=False)
     _begin_study(found, measured)
     if png is not None:  # last: the lines of the study are to be copied in one piece
         draw_inspection(found, png)

@@ -94,11 +94,10 @@ def learn(
     # From here on, no other process writes to the folder.
     study.open()
     stored, learned = stored_runs(study.folder), LearnedDrives.read(study.folder)
-    model = _content(study.model_path)
+    model, earlier = _content(study.model_path), learned
     if drive.begun:
         earlier = learned.without(drive.name)
     else:
-        earlier = learned
         learned.adding(drive.entry, drive.sequences).write()
     try:
         with_drive = _with(drive, reload())
@@ -119,9 +118,9 @@ def learn(
         if not told and not isinstance(error, OSError):
             raise
         raise LearnError(f"{error}\n{said}") from error
-    after = Known.of(with_drive, training.model)
     judged = *training.references, *training.doubts
-    words = [*changes(before, after), *judged, runs_in_words(stored, stored_runs(study.folder))]
+    after = changes(before, Known.of(with_drive, training.model))
+    words = [*after, *judged, runs_in_words(stored, stored_runs(study.folder))]
     return Lesson(with_drive, training, words)
 
 

@@ -145,8 +145,7 @@ def train(
         own parameters, no set keeps the limits, or stored trials depend on something that has
         changed.
     """
-    _check_references(study)
-    ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
+    _ensure_references(study, progress)
     resume(study, again)
     config = study.config.offline
     if timed := sorted(config.metrics & set(TIMED)):
@@ -188,8 +187,8 @@ def _finished(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verd
     }
 
 
-def _check_references(study: OfflineStudy) -> None:
-    """Refuse what cannot be trained on before any stored trial is removed."""
+def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
+    """Estimate what is lacking; refuse what is without, before any stored trial is removed."""
     for name in study.config.training:
         of = study.sequences.recordings.get(name)
         if of is not None and of.reference == NO_REFERENCE:
@@ -197,6 +196,7 @@ def _check_references(study: OfflineStudy) -> None:
                 f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
                 f"topic or file, or leave `reference` out to have it estimated"
             )
+    ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
 
 
 def _fixed(

@@ -282,7 +282,7 @@ def test_a_path_that_is_too_short_is_found_before_scans_are_read(study, tmp_path
     sequences = dataclasses.replace(study.sequences, recordings={name: config})
     settings = TrialSettings(sub_trajectory=3.0 if part is None else 9.0)
     setup = dataclasses.replace(setup_of(study), sequences=sequences, settings=settings)
-    key = r"sequences\.hall" if part is None else r"training: \[hall: 0-30%\]"
+    key = r"sequences\.hall" if part is None else r"\[hall: 0-30%\]"
     read = []
     with pytest.raises(AdaptuneError, match=rf"^{key}: its path of .* holds no sub-trajectory"):
         setup.prepare(name, 1e9, lambda *progress: read.append(progress))
