@@ -236,7 +236,7 @@ def _row(
         "sequence": name,
         "estimate, by the given [%]": mean_difference(frames.T_ref_sensor, T_estimated, length),
         "by itself [%]": stored.error(length),
-        "not trusted [%]": 100.0 * stored.unknown_share,
+        "unknown [%]": 100.0 * stored.unknown_share,
         "given, by scans [%]": None if given is None else given.mean,
     }
 

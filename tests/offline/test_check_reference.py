@@ -183,7 +183,7 @@ def test_scans_are_taken_as_they_were_recorded(study_file, folder, counted):
     dropping = ["sequences.one.views=[{drop: {share: 0.5}}]", "training=[one]"]
     rows = check_reference(load_study(study_file, dropping, folder))
     assert len(counted) == 1
-    assert rows[0]["not trusted [%]"] == 0.0
+    assert rows[0]["unknown [%]"] == 0.0
     # The estimate of the study itself is the same.
     about = StoredEstimate.read(folder / "references/one.check.tum").about
     study = load_study(study_file, [*dropping, "sequences.one.reference="], folder)
