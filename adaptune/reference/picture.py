@@ -88,4 +88,4 @@ def _draw_residuals(axes: Any, found: EstimatedReference) -> None:
     time = f"time [s], breaks drawn as {_LONGEST_BREAK:g} s" if shortened else "time [s]"
     axes.set(title=title, xlabel=time, ylabel="differ from the reference by [cm], logarithmic")
     if len(at):
-        axes.legend(loc="upper right", ncols=3)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)

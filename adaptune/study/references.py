@@ -162,7 +162,7 @@ def _estimate(
     study.open()
     given = study.sequences.unseen(name)
     scans, prior = open_unseen(given), position_prior(given)
-    # Open3D's results repeat on one core only.
+    # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
     unpin = pin(os.getpid())
     try:
         found = estimate.estimate_reference(scans, advance, prior)
