@@ -81,7 +81,8 @@ class HopCloud:
     scan
         The scan.
     T_previous_current
-        The sensor's motion over the scan before, of shape (4, 4), for motion compensation.
+        The sensor's motion from the scan before, or to the next one where that is known, of shape
+        (4, 4), for motion compensation.
     seconds
         How long that motion took; 0 for no compensation.
     """

@@ -127,7 +127,8 @@ class _Registering:
         self._anchors: deque[_Anchor] = deque()
         self._tracks = np.tile(np.eye(4), (1 + n_members, 1, 1))
         self._newest: tuple[int, Scan] | None = None
-        self._of_first = 0  # registrations to the first scan
+        self._T_last, self._seconds = np.eye(4), 0.0  # the last motion, and how long it took
+        self._n_to_first = 0  # registrations to the first scan
 
     def add(self, scan: Scan, T_odom_sensor: Poses, T_previous_current: Poses) -> None:
         """Take the next scan, with the pose of the consensus and the motions of its members."""
@@ -137,14 +138,15 @@ class _Registering:
             return
         number, before = self._newest
         T = invert(self._tracks[0]) @ T_odom_sensor
+        seconds = (scan.stamp - before.stamp) * 1e-9
         # How the sensor moved during a scan is known once the next one is registered.
-        self._register(number, before, T, (scan.stamp - before.stamp) * 1e-9)
+        self._register(number, before, T, seconds)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(1, 2)))
         members = np.where(known[:, None, None], T_previous_current, T)
         self._tracks[1:] = rectify(self._tracks[1:] @ members)
         self._tracks[0] = T_odom_sensor
         self._newest = number + 1, scan
-        self._T_last, self._seconds = T, (scan.stamp - before.stamp) * 1e-9
+        self._T_last, self._seconds = T, seconds
 
     def end(self) -> None:
         """Register the last scan, however near it is to the last one that was registered."""
@@ -180,9 +182,9 @@ class _Registering:
         for length in LENGTHS:
             starts += [a for a in self._anchors if metres - a.metres >= length][-1:]
             # The robot may stand at first: without these, nothing spans its first motions.
-            if self._of_first < len(LENGTHS) and metres >= LENGTHS[self._of_first]:
+            if self._n_to_first < len(LENGTHS) and metres >= LENGTHS[self._n_to_first]:
                 starts.append(self._anchors[0])
-                self._of_first += 1
+                self._n_to_first += 1
         yield from {start.number: start for start in starts}.values()
 
     def _tries(self, start: _Anchor, end: _Anchor) -> Iterator[Guess]:
