@@ -25,6 +25,8 @@ POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
 )
 """Odometries and their parameters. No study's trials are among them: the reference that judges an
 odometry is not made with it."""
+_WARM_UP = 2.0
+"""Seconds. Odometries that register to a keyframe have no map to build."""
 HALVES = ((0, 1, 2), (3, 4))
 """Members of either half, which have no algorithm in common."""
 _SETTINGS: Mapping[str, Mapping[str, float]] = {
@@ -79,7 +81,7 @@ class Consensus:
             return _Member(kinds, kind, adapter(kind, of))
 
         sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
-        self._bank = Bank(make, sets, WarmUp())
+        self._bank = Bank(make, sets, WarmUp(seconds=_WARM_UP))
         even = dict.fromkeys(sets, 1.0)
         self._bank.apply(Selection(trial=0, parameters={}, weights=even))
         self._tracker = Tracker(self._bank, HealthCheck())
