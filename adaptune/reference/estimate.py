@@ -149,7 +149,7 @@ def _check(name: str, found: Pass) -> None:
     way = _way(found.T_odom_sensor[:, :3, 3]) if len(found.stamps) else 0.0
     if way >= SHORTEST:
         return
-    if len(found.stamps) and found.registered[1:].mean() < 0.5:
+    if 2 * np.count_nonzero(~found.registered) > len(found.stamps):
         raise EstimateError(
             f"{name}: most of its {len(found.stamps)} scans cannot be registered to each other: "
             f"see with `adaptune inspect` how many points they have"
