@@ -113,11 +113,10 @@ def reference(
             f"docs/reference-study.md"
         )
     loaded = load(target, override, folder)
-    with _on_one_core():
-        if check:
-            _check(loaded)
-        else:
-            _of_study(loaded)
+    if check:
+        _check(loaded)
+    else:
+        _of_study(loaded)
     following = "trials" if check else "offline"
     why = "the trials themselves" if check else "run trials, fit the error model"
     say_next_of_study(why, following, target, override, folder)

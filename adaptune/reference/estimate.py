@@ -56,7 +56,7 @@ def estimate_reference(
     scans
         The recording; its own reference is not used.
     advance
-        Called after every scan.
+        Called after every scan, and after each of `N_GRAPHS` pose graphs.
     priors
         Positions that are right over long distances only, as those of a GPS.
 
@@ -67,7 +67,7 @@ def estimate_reference(
     """
     n, done = scans.n_messages, count(1)
     # What comes after the pass takes a while, too.
-    after = max(1, n // (20 * N_GRAPHS)) if n else 1
+    after = max(1, n // (20 * N_GRAPHS))
 
     def one_more() -> None:
         i = next(done)
@@ -300,12 +300,16 @@ def _halves(
 
 
 def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Poses:
-    """Mean motions of some members; those far from the reference are left out."""
+    """Mean motions of some members.
+
+    Those far from the reference are left out where others are near; one without a motion moves as
+    the reference.
+    """
     whole = steps(T_world_sensor)[:, None]
     theirs = found.T_previous_current[1:, list(members)]
     apart = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)
     apart += LEVER * rotation_angle(invert(whole) @ theirs)
     near = apart <= _NEAR
     near |= ~near.any(axis=1, keepdims=True)
-    theirs = np.where((near & np.isfinite(apart))[..., None, None], theirs, whole)
+    theirs = np.where(np.isfinite(apart)[..., None, None], theirs, whole)
     return mean_motion(theirs, near.astype(np.float64))

@@ -1,6 +1,6 @@
 """Registrations where the path comes by again."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,11 +61,7 @@ def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
     return found[:: -(-len(found) // MOST)] if found else []
 
 
-def closed(
-    scans: Iterable[Scan],
-    wanted: Iterable[Loop],
-    T_world_sensor: Poses,
-) -> list[Edge]:
+def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses) -> list[Edge]:
     """Register the scans of loops, which takes another pass over the recording.
 
     Parameters
@@ -77,7 +73,6 @@ def closed(
     T_world_sensor
         The path as it is known so far, of shape (n, 4, 4).
     """
-    wanted = list(wanted)
     numbers, motions = {number for loop in wanted for number in loop}, steps(T_world_sensor)
     clouds: dict[int, HopCloud] = {}
     last: Scan | None = None

@@ -175,7 +175,7 @@ def _estimate(
 
 
 def accuracy_in_words(stored: StoredEstimate, length: float) -> str:
-    """How accurate an estimated reference is over `length` metres, and on how much of the path."""
+    """How accurate an estimated reference is over `length` metres, and for how many scans."""
     error = stored.error(length)
     own = "its own error is not known" if math.isnan(error) else f"its own error is {error:.2g} %"
     share = 100.0 * stored.unknown_share
