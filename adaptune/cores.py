@@ -1,7 +1,24 @@
 """Which cores a process may use."""
 
+import itertools
 import os
+import resource
 from collections.abc import Callable
+from pathlib import Path
+
+
+def resident_megabytes() -> float:
+    """Memory that this process takes at present; where the system does not tell, at most so far."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except OSError:
+        return 1e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return 1e-6 * pages * os.sysconf("SC_PAGE_SIZE")
+
+
+_before: set[int] | None = None
+"""Cores that this process had before it was pinned alone."""
+_numbers = itertools.count(1)
 
 
 def available() -> int:
@@ -11,15 +28,41 @@ def available() -> int:
     return os.cpu_count() or 1
 
 
-def pin(core: int) -> Callable[[], None]:
+def pin(core: int, alone: bool = False) -> Callable[[], None]:
     """Keep this process on one core, if the system can, and return a function that undoes it.
 
     Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
     by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
     beyond the last core restart at the first.
+
+    Parameters
+    ----------
+    core
+        Number of the core, among those of this process.
+    alone
+        Whether this process is the only one at work: then `next_core` gives others the rest.
     """
+    global _before  # noqa: PLW0603 - the cores are those of the process
     if not hasattr(os, "sched_setaffinity"):
         return lambda: None
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
-    return lambda: os.sched_setaffinity(0, cores)
+    _before = cores if alone else None
+
+    def unpin() -> None:
+        global _before  # noqa: PLW0603
+        os.sched_setaffinity(0, cores)
+        _before = None
+
+    return unpin
+
+
+def next_core() -> int | None:
+    """Core for another process that works beside this one; None if the system cannot keep it there.
+
+    Each call gives the next core, after the one that `pin` gives to the number of this process.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return None
+    cores = sorted(_before or os.sched_getaffinity(0))
+    return cores[(os.getpid() + next(_numbers)) % len(cores)]

@@ -85,6 +85,8 @@ def _run(
     code = 1
     try:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if bounds.core is not None:
+            os.sched_setaffinity(0, {bounds.core})
         if bounds.memory:
             statm = Path("/proc/self/statm")
             pages = int(statm.read_text().split()[0]) if statm.exists() else 0

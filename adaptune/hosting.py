@@ -72,11 +72,15 @@ class Program:
         The program and its arguments.
     memory
         Limit on the address space of each of its processes, in gigabytes.
+    core
+        The only core that it may use; None for those of this process.
     streams
         Of `subprocess.Popen`: its input and output, and its folder.
     """
 
-    def __init__(self, command: Sequence[str], memory: float, **streams: Any):
+    def __init__(
+        self, command: Sequence[str], memory: float, core: int | None = None, **streams: Any
+    ):
         self._here, there = socket.socketpair()
         under = [sys.executable, "-I", "-S", keeper.__file__, str(there.fileno()), str(memory)]
         with there:
@@ -87,6 +91,9 @@ class Program:
                 start_new_session=True,
                 **streams,
             )
+        if core is not None:
+            # The keeper has not begun yet.
+            os.sched_setaffinity(self._keeper.pid, {core})
 
     def wait(self, seconds: float) -> Ended | None:
         """Wait for the program to end; None if it runs longer."""
@@ -138,12 +145,15 @@ class Bounds(NamedTuple):
         Gigabytes, in addition to what the process begins with; 0 for no limit.
     late, full : str
         What is said where one of them is exceeded.
+    core : int, optional
+        The only core that it may use.
     """
 
     seconds: float = 0.0
     memory: float = 0.0
     late: str = "it took too long"
     full: str = "out of memory"
+    core: int | None = None
 
 
 UNBOUNDED = Bounds()

@@ -60,7 +60,7 @@ def keep(child: int, connection: int, sampled: bool = False) -> Ended:
     peak, pid, status = 0.0, 0, 0
     while not pid:
         if sampled:
-            peak = max(peak, sum(map(_resident, [child, *_descendants(child)])))
+            peak = max(peak, sum(map(_resident, [child, *descendants(child)])))
         pid, status = os.waitpid(child, os.WNOHANG)
         # A child that ends from here on wakes this process up.
         for ready, _ in poll.poll(_BETWEEN_SAMPLES if sampled else None) if not pid else ():
@@ -81,7 +81,7 @@ def _end_rest(group: int) -> None:
         os.killpg(group, signal.SIGKILL)
     with contextlib.suppress(ChildProcessError):
         while True:
-            _kill(_descendants(os.getpid()))
+            _kill(descendants(os.getpid()))
             if os.waitpid(-1, os.WNOHANG) == (0, 0):
                 time.sleep(_UNTIL_DEAD)
 
@@ -92,7 +92,7 @@ def _kill(processes: list[int]) -> None:
             os.kill(process, signal.SIGKILL)
 
 
-def _descendants(ancestor: int) -> list[int]:
+def descendants(ancestor: int) -> list[int]:
     """Descendants of a process; none where there is no /proc."""
     found = [ancestor]
     for process in found:

@@ -1,7 +1,7 @@
 """A bank: instances with different parameters, and the weighted mean of their motions."""
 
+import logging
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,25 +17,23 @@ from adaptune.odometry.base import (
     Usage,
     WarmUp,
 )
+from adaptune.odometry.preparations import Preparations, PreparedScan
 from adaptune.odometry.short_registrations import ShortRegistrations
-from adaptune.odometry.warm_up import Make, PreparedScan, RecentScans
+from adaptune.odometry.warm_up import Make, RecentScans, catch_up_together
+from adaptune.pooled_space import ODOMETRY
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 
-
-class BankScan(NamedTuple):
-    """What a bank prepares: the prepared scan, and its points for the short registrations."""
-
-    scan: PreparedScan
-    points: NDArray[np.float32]
+_log = logging.getLogger(__name__)
 
 
 class Bank(OdometryInstance):
     """Several instances, each with its own parameters and each on every scan.
 
     The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
-    others restart on the scans of the last seconds, at most once a second.
+    others restart on the scans of the last seconds, at most once a second. So does a member that a
+    fault has ended, until it has had too many of them: it costs its weight, and nothing else.
 
     Parameters
     ----------
@@ -61,17 +59,31 @@ class Bank(OdometryInstance):
         self.restarts = 0
         self._members = [make(dict(parameters)) for parameters in sets.values()]
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
+        # Members in processes of their own register while those of this process do.
+        self._apart_first = sorted(self._members, key=lambda member: not member.apart)
+        self._names = [
+            f"trial {trial}" + (f" ({of[ODOMETRY]})" if ODOMETRY in of else "")
+            for trial, of in sets.items()
+        ]
+        self._told: set[int] = set()
         self._weights = np.eye(len(sets))[0]
         self._agreement = Agreement(len(sets), lost_track)
         self._short = ShortRegistrations()
         self._lost = False
         self._asked = np.zeros(len(sets), np.bool_)
-        self._recent = RecentScans(warm_up, self._members[0])
+        self._preparations = Preparations()
+        self._recent = RecentScans(warm_up)
         self._last_motion = LastMotion()
 
     @property
     def faults(self) -> list[str]:
         return [fault for member in self._members for fault in member.faults]
+
+    @property
+    def dead(self) -> frozenset[int]:
+        """Trial numbers of the members that a fault has ended, and that are not back yet."""
+        pairs = zip(self.trials, self._members, strict=True)
+        return frozenset(trial for trial, member in pairs if member.ended)
 
     @property
     def usage(self) -> Usage:
@@ -83,8 +95,11 @@ class Bank(OdometryInstance):
         members = dict(zip(self.trials, self._T_previous_current, strict=True))
         return self._last_motion.motions._replace(members=members)
 
-    def prepare(self, scan: Scan) -> BankScan:
-        return BankScan(PreparedScan.by(self._members[0], scan), scan.points)
+    def prepare(self, scan: Scan) -> PreparedScan:
+        prepared = self._preparations.of(scan)
+        for member in self._members:
+            prepared.by(member)
+        return prepared
 
     def apply(self, selection: Selection) -> None:
         # Members without a weight get 0.
@@ -100,31 +115,33 @@ class Bank(OdometryInstance):
         self._asked = np.isin(self.trials, list(selection.restart))
 
     def start(
-        self, prepared: BankScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+        self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        scan, points = prepared
         for member in self._members:
-            member.start(scan.prepared, T_odom_sensor, T_previous_current)
+            member.start(prepared.by(member), T_odom_sensor, T_previous_current)
         self._T_previous_current = self._member_motions()
         self._agreement.start()
-        self._short.start(scan.stamp, points)
-        self._recent.start(scan, T_odom_sensor, T_previous_current)
+        self._short.start(prepared.stamp, prepared.scan.points)
+        self._recent.start(prepared, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
         self._asked[:] = False
+        self._tell()
 
-    def submit(self, prepared: BankScan) -> None:
+    def submit(self, prepared: PreparedScan) -> None:
         self._restart(self._asked)
         self._asked[:] = False
         self._submitted = prepared
-        for member in self._members:
-            member.submit(prepared.scan.prepared)
+        for member in self._apart_first:
+            member.submit(prepared.by(member))
 
     def collect(self) -> Registration:
-        scan, points = self._submitted
-        registrations = [member.collect() for member in self._members]
+        scan = self._submitted
+        found = {member: member.collect() for member in reversed(self._apart_first)}
+        registrations = [found[member] for member in self._members]
+        self._tell()
         self._T_previous_current = T_previous_current = self._member_motions()
         seconds = (scan.stamp - self._recent.last.scan.stamp) * 1e-9
-        self._short.add(scan.stamp, points)
+        self._short.add(scan.stamp, scan.scan.points)
         agreeing = self._agreement.judge(
             T_previous_current, seconds, self._weights, self._short, self._lost
         )
@@ -148,8 +165,22 @@ class Bank(OdometryInstance):
         return np.array([member.motions.T_previous_current for member in self._members])
 
     def _restart(self, members: NDArray[np.bool_]) -> None:
-        """Restart members at the bank's pose."""
-        for i in np.flatnonzero(members):
-            self._recent.replay_to(self._members[i]).catch_up()
+        """Restart members at the bank's pose, but for those that have given up."""
+        members = members & ~np.array([member.given_up for member in self._members])
+        due = [self._members[i] for i in np.flatnonzero(members)]
+        in_order = [member for member in self._apart_first if member in due]
+        catch_up_together([self._recent.replay_to(member) for member in in_order])
         self.restarts += int(members.sum())
         self._agreement.restarted(members)
+        self._tell()
+
+    def _tell(self) -> None:
+        """Log which members have ended, or are back, since this was last called."""
+        for i, (name, member) in enumerate(zip(self._names, self._members, strict=True)):
+            if member.ended and i not in self._told:
+                self._told.add(i)
+                why = member.faults[-1] if member.faults else "it was closed"
+                _log.warning("%s ended: %s; the bank goes on without it", name, why)
+            elif not member.ended and i in self._told:
+                self._told.remove(i)
+                _log.warning("%s is back", name)

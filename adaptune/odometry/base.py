@@ -1,7 +1,7 @@
 """What every odometry offers, and the base class of adapters."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -22,6 +22,10 @@ MIN_POINTS = 20
 
 class OdometryError(AdaptuneError):
     """An odometry that cannot do what is asked of it."""
+
+
+class NotInstalledError(OdometryError):
+    """An odometry whose package is not installed."""
 
 
 class BaseSettings(StrictModel):
@@ -65,13 +69,16 @@ class Usage(NamedTuple):
     cpu: float  # seconds of CPU time
     memory: float | None  # peak megabytes of its own processes; None if it shares this process
     seconds: float | None = None  # a scan, if it runs apart from its calls; None if within them
+    elsewhere: float = 0.0  # of `cpu`, seconds in other processes
 
     @classmethod
     def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
         """CPU time of all together, and the sum or the maximum of their memory."""
-        cpu, peaks, _ = zip(*usages, strict=True)
-        known = [peak for peak in peaks if peak is not None]
-        return cls(sum(cpu), memory(known) if known else None)
+        every = list(usages)
+        known = [usage.memory for usage in every if usage.memory is not None]
+        peak = memory(known) if known else None
+        cpu, elsewhere = sum(one.cpu for one in every), sum(one.elsewhere for one in every)
+        return cls(cpu, peak, elsewhere=elsewhere)
 
 
 class Motions(NamedTuple):
@@ -112,7 +119,14 @@ class OdometryInstance(Protocol):
 
     `submit` and `collect` let several instances in other processes work at the same time. After
     `close`, `prepare` still works and `start` begins again.
+
+    Attributes
+    ----------
+    apart : bool
+        Whether it works in another process, from `submit` on; class attribute.
     """
+
+    apart: ClassVar[bool] = False
 
     @property
     def faults(self) -> Sequence[str]:
@@ -126,11 +140,26 @@ class OdometryInstance(Protocol):
     def motions(self) -> Motions:
         """Motions over the last scan."""
 
+    @property
+    def preparation(self) -> Hashable:
+        """What `prepare` depends on besides the scan; where it is equal, instances share scans."""
+        return type(self).prepare
+
+    @property
+    def ended(self) -> bool:
+        """Whether a fault has ended it: it gives no pose until the next start."""
+        return False
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it had so many faults that it does not start again."""
+        return False
+
     @abstractmethod
     def prepare(self, scan: Scan) -> Any:
-        """Do to a scan all that does not depend on parameters, pose or earlier scans.
+        """Do to a scan all that does not depend on the pose or on earlier scans.
 
-        All instances with the same settings share the result, and none may change it.
+        All instances with the same `preparation` share the result, and none may change it.
         """
 
     @abstractmethod
@@ -259,9 +288,18 @@ class Odometry(ABC):
         """What a study must know of the odometry with these settings."""
         return Description(cls.space, cls.live, cls.needs_imu, cls.warm_up)
 
+    @property
+    def preparation(self) -> Hashable:
+        """What `prepare` depends on besides the scan: class and settings, unless overridden.
+
+        An adapter that prepares by parameters, too, overrides it.
+        """
+        # Classes that share `prepare` may differ in what that calls.
+        return type(self), self.settings.model_dump_json()
+
     @abstractmethod
     def prepare(self, scan: Scan) -> Any:
-        """Prepare a scan for all instances with the same settings; see `OdometryInstance`."""
+        """Prepare a scan for all with the same `preparation`; see `OdometryInstance`."""
 
     @abstractmethod
     def start(
@@ -302,7 +340,8 @@ def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
         return tuple(map(import_module, modules))
     except ImportError as error:
         install = f"pip install 'adaptune[{extra}]'"
-        raise OdometryError(f"{extra} cannot be imported ({error}); run `{install}`") from error
+        what = f"{extra} cannot be imported ({error}); run `{install}`"
+        raise NotInstalledError(what) from error
 
 
 def prepared_bytes(prepared: Any) -> int:

@@ -1,12 +1,10 @@
 """What runs in a process of its own for an odometry, see `adaptune.hosting`."""
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from adaptune import hosting
-from adaptune.cores import pin
 from adaptune.odometry import wire
 from adaptune.odometry.declaration import declare_here
 from adaptune.odometry.registry import odometry_class
@@ -19,8 +17,6 @@ def load(name: str) -> None:
 
 def converse(reader: wire.Readable, writer: BinaryIO, name: str) -> None:
     """Be an instance."""
-    # Nothing else limits TBB's threads, and it sums in the order in which they finish.
-    pin(os.getpid())
     wire.serve(reader, writer, name)
 
 

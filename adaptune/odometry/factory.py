@@ -1,12 +1,13 @@
 """Make an odometry from its name, wherever it runs."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 from adaptune.odometry.base import Description, OdometryInstance
 from adaptune.odometry.command import Command
+from adaptune.odometry.content import Content, odometry_content
 from adaptune.odometry.declaration import declare
 from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.in_process import InProcess
@@ -69,6 +70,24 @@ class OdometryFactory:
         return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
 
     @property
+    def content(self) -> Content:
+        """What the poses depend on besides name, settings and parameters."""
+        return odometry_content(self.name, self.settings, self.module)
+
+    @property
+    def has_user_class(self) -> bool:
+        """Whether it is a class of the user."""
+        return is_user_class(self.name)
+
+    def allowing(self, user_code: bool) -> "OdometryFactory":
+        """The same where classes of the user may, or may not, run in this process."""
+        return replace(self, user_code=user_code)
+
+    def reading(self, program_input: Callable[[str], ProgramInput]) -> "OdometryFactory":
+        """The same with another source of whole recordings, if it reads any."""
+        return self if self.program_input is None else replace(self, program_input=program_input)
+
+    @property
     def apart(self) -> bool:
         """Whether it runs in processes of their own, which have limits."""
         return self.name in PROGRAMS or not self._clean or is_user_class(self.name)
@@ -96,7 +115,7 @@ class OdometryFactory:
         isolated
             Run in a process of its own even if the odometry is clean, to measure its memory.
         """
-        given = self.space.baseline | (parameters or {})
+        given = self.space.complete(parameters or {})
         if self.name == "command":
             read = None
             if sequence is not None and self.program_input is not None:

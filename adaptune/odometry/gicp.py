@@ -9,9 +9,10 @@ import small_gicp
 from adaptune.geometry import Poses
 from adaptune.odometry.base import MIN_POINTS
 from adaptune.odometry.keyframe import (
+    DOWNSAMPLING,
+    ITERATIONS,
     Alignment,
     KeyframeOdometry,
-    KeyframeSettings,
     PreparedCloud,
     crop,
 )
@@ -22,15 +23,13 @@ from adaptune.space import Float, ParameterSpace
 class _SmallGicp(KeyframeOdometry):
     """A keyframe odometry on small_gicp."""
 
-    settings_type = KeyframeSettings
-
     def prepare(self, scan: Scan) -> PreparedCloud:
         points = crop(scan, self.settings.min_range)
         # small_gicp crashes on an empty target, and calls a guess from too few points converged.
         if len(points) < MIN_POINTS:
             return PreparedCloud(scan.stamp, None, usable=False, nbytes=0)
         cloud, tree = small_gicp.preprocess_points(
-            points, downsampling_resolution=self.settings.downsampling, num_threads=1
+            points, downsampling_resolution=self.parameters["downsampling"], num_threads=1
         )
         # Points, normals, covariances (4 + 4 + 16 doubles) and the tree.
         nbytes = 4096 + 230 * cloud.size()
@@ -48,7 +47,7 @@ class _SmallGicp(KeyframeOdometry):
             *clouds,
             init_T_target_source=T_target_guess,
             max_correspondence_distance=distance,
-            max_iterations=self.settings.iterations,
+            max_iterations=self.parameters["iterations"],
             num_threads=1,
         )
         return Alignment(result.T_target_source, result.num_inliers >= MIN_POINTS)
@@ -60,6 +59,8 @@ class KeyframeGicp(_SmallGicp):
     space = ParameterSpace.of(
         max_correspondence_distance=Float(low=1.0, high=10.0, baseline=4.0, log=True),
         keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True),
+        downsampling=DOWNSAMPLING,
+        iterations=ITERATIONS,
     )
 
     def _pair(self, target: PreparedCloud, source: PreparedCloud) -> tuple[tuple[Any, ...], Any]:
@@ -73,6 +74,8 @@ class KeyframeVgicp(_SmallGicp):
     space = ParameterSpace.of(
         resolution=Float(low=0.5, high=5.0, baseline=1.0, log=True),
         keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True),
+        downsampling=DOWNSAMPLING,
+        iterations=ITERATIONS,
     )
     # The keyframe's cells, with the cloud and the resolution that they were made from.
     _cells: tuple[PreparedCloud, Any, Any] | None = None

@@ -3,7 +3,7 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -63,8 +63,21 @@ class Guarded(Faulting):
         self._running = False
 
     @property
+    def ended(self) -> bool:
+        return not self._running
+
+    @property
     def usage(self) -> Usage:
         return Usage(self._cpu, None)
+
+    @property
+    def preparation(self) -> Hashable:
+        try:
+            preparation = self._guarded(lambda: self._made().preparation)
+            hash(preparation)
+        except (_FaultError, TypeError):
+            return self  # it shares with nobody
+        return preparation
 
     def prepare(self, scan: Scan) -> Any:
         try:

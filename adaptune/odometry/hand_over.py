@@ -11,7 +11,8 @@ from adaptune.odometry.base import (
     Usage,
     WarmUp,
 )
-from adaptune.odometry.warm_up import Make, PreparedScan, RecentScans, Successor
+from adaptune.odometry.preparations import Preparations, PreparedScan
+from adaptune.odometry.warm_up import Make, RecentScans, Successor
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
@@ -22,7 +23,8 @@ class HandOver(OdometryInstance):
 
     The new instance first sees the scans of the last seconds, from the pose and the motion that
     were found for the first of them. Then its motions continue the trajectory: no pose jumps. Its
-    map is as old as the warm-up is long.
+    map is as old as the warm-up is long. One that a fault ends on the way is dropped, and the old
+    instance goes on until other parameters are selected.
 
     Parameters
     ----------
@@ -43,9 +45,9 @@ class HandOver(OdometryInstance):
         self.parameters = dict(parameters)
         self._make = make
         self._catch_up_scans = catch_up_scans
-        # All instances share what the first one learned from the first scan's layout.
-        self._first = self._current = make(self.parameters)
-        self._recent = RecentScans(warm_up, self._first)
+        self._current = make(self.parameters)
+        self._preparations = Preparations()
+        self._recent = RecentScans(warm_up)
         self._current_parameters = self.parameters
         self._successor: Successor | None = None
         self._T_odom_own = np.eye(4)
@@ -70,7 +72,9 @@ class HandOver(OdometryInstance):
         return [self._current, *([self._successor.odometry] if self._successor else [])]
 
     def prepare(self, scan: Scan) -> PreparedScan:
-        return PreparedScan.by(self._first, scan)
+        prepared = self._preparations.of(scan)
+        prepared.by(self._current)
+        return prepared
 
     def start(
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
@@ -78,14 +82,14 @@ class HandOver(OdometryInstance):
         # A successor that is being warmed up takes over.
         if self._successor is not None:
             self._replace(self._successor.odometry)
-        self._current.start(prepared.prepared, T_odom_sensor, T_previous_current)
+        self._current.start(prepared.by(self._current), T_odom_sensor, T_previous_current)
         self._T_odom_own = np.eye(4)
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
     def submit(self, prepared: PreparedScan) -> None:
         self._submitted = prepared
-        self._current.submit(prepared.prepared)
+        self._current.submit(prepared.by(self._current))
 
     def collect(self) -> Registration:
         successor = self._successor
@@ -106,7 +110,7 @@ class HandOver(OdometryInstance):
 
     def apply(self, selection: Selection) -> None:
         # Nothing changes if the instance has or will have these parameters.
-        wanted = self.parameters | selection.parameters
+        wanted = dict(selection.parameters)
         if wanted == self.parameters:
             return
         self.parameters = wanted
@@ -129,6 +133,10 @@ class HandOver(OdometryInstance):
             instance.close()
 
     def _take_over(self, successor: Successor) -> None:
+        if successor.odometry.ended and not self._current.ended:
+            self._end(successor.odometry)
+            self._successor = None
+            return
         self._replace(successor.odometry)
         T_odom_sensor, T_own_sensor = self._recent.last.T_odom_sensor, successor.T_own_sensor
         # Exactly the identity where both are the same.

@@ -1,7 +1,7 @@
 """An odometry in this process, as an instance that can be driven."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 from adaptune.geometry import Poses
@@ -41,6 +41,10 @@ class InProcess(OdometryInstance):
     @property
     def motions(self) -> Motions:
         return self._last_motion.motions
+
+    @property
+    def preparation(self) -> Hashable:
+        return self.odometry.preparation
 
     def prepare(self, scan: Scan) -> Any:
         return self.odometry.prepare(scan)

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationInfo
 
 from adaptune import hosting
+from adaptune.cores import next_core
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
 from adaptune.odometry.base import (
@@ -124,6 +125,7 @@ class Isolated(Faulting):
         What each process may use.
     """
 
+    apart = True
     _fresh = True  # each start needs a new process
 
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, limits: Limits):
@@ -135,10 +137,16 @@ class Isolated(Faulting):
         }
         self._limits = limits
         self._stream: BinaryIO | None = None
+        # Nothing else limits TBB's threads, and it sums in the order in which they finish.
+        self._core = next_core()
+
+    @property
+    def ended(self) -> bool:
+        return self._stream is None
 
     @property
     def usage(self) -> Usage:
-        return Usage(self._cpu, self._memory)
+        return Usage(self._cpu, self._memory, elsewhere=self._cpu)
 
     def prepare(self, scan: Scan) -> Scan:
         return scan  # the other process prepares
@@ -152,7 +160,14 @@ class Isolated(Faulting):
         if self._stream is None:
             if self.given_up:
                 return
-            self._stream = self._connect()
+            try:
+                self._stream = self._connect()
+            except OdometryError as error:
+                # One that has run can be gone for good.
+                if not self.faults:
+                    raise
+                self.note_fault(str(error))
+                return
             self._ask(wire.hello(**self._hello, parameters=self.parameters))
         self._ask(
             {"type": "start", "stamp": prepared.stamp},
@@ -247,8 +262,9 @@ class Isolated(Faulting):
 
     def _connect(self) -> BinaryIO:
         """A stream to a new process, which first receives a hello."""
+        bounds = self._limits.bounds._replace(core=self._core)
         try:
-            return hosting.connect(SERVICE, self.name, "converse", self._limits.bounds)
+            return hosting.connect(SERVICE, self.name, "converse", bounds)
         except hosting.HostError as error:
             raise OdometryError(str(error)) from error
 

@@ -1,26 +1,50 @@
 """Odometry that registers each scan to the last keyframe."""
 
 from abc import abstractmethod
+from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
-from adaptune.odometry.base import BaseSettings, Odometry, Registration
+from adaptune.odometry.base import BaseSettings, Description, Odometry, Registration
 from adaptune.sequence.scan import Scan
+from adaptune.space import Categorical, Integer, ParameterSet, ParameterSpace
 
 JITTER = 0.1
 """Two times between scans count as the same if they differ by no more than this share: a LiDAR
 turns more steadily than its stamps say, and a missing scan doubles the time."""
 
 
-class KeyframeSettings(BaseSettings):
-    """Settings of keyframe odometries, in metres."""
+DOWNSAMPLING = Categorical(choices=(0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0), baseline=0.5)
+"""Metres between points of a cloud. There are few values, so that sets share prepared clouds."""
+ITERATIONS = Integer(low=5, high=60, baseline=20, log=True)
+"""Of a registration, at most."""
 
-    downsampling: float = Field(0.5, ge=1e-3, le=1e3)
+
+class KeyframeSettings(BaseSettings):
+    """Settings of keyframe odometries.
+
+    Attributes
+    ----------
+    min_range : float
+        Metres.
+    downsampling : float, optional
+        Metres between the points of a cloud; a parameter that is tuned if left out.
+    iterations : int, optional
+        Of a registration, at most; a parameter that is tuned if left out.
+    """
+
     min_range: float = Field(1.0, ge=0, le=1e6)
-    iterations: int = Field(20, ge=1, le=10_000)
+    downsampling: float | None = Field(None, ge=1e-3, le=1e3)
+    iterations: int | None = Field(None, ge=1, le=10_000)
+
+    @property
+    def kept(self) -> ParameterSet:
+        """Parameters that are set, and not tuned."""
+        given = {"downsampling": self.downsampling, "iterations": self.iterations}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 class PreparedCloud(NamedTuple):
@@ -48,8 +72,27 @@ class KeyframeOdometry(Odometry):
     has a `stamp` in nanoseconds, and is `usable` or not. After Koide et al., IROS 2021.
     """
 
+    settings_type = KeyframeSettings
     live = True
     clean = True
+
+    def __init__(
+        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
+    ):
+        super().__init__(parameters, settings)
+        self.parameters |= self.settings.kept
+
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
+        described = super().describe(settings)
+        kept = {} if settings is None else settings.kept
+        tuned = {name: p for name, p in cls.space.parameters.items() if name not in kept}
+        return described._replace(space=ParameterSpace(tuned))
+
+    @property
+    def preparation(self) -> Hashable:
+        downsampling = self.parameters["downsampling"]
+        return type(self).prepare, self.settings.min_range, downsampling
 
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None

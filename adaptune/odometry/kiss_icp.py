@@ -7,6 +7,7 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 from kiss_icp.mapping import get_voxel_hash_map
+from kiss_icp.registration import get_registration
 from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
 
@@ -36,6 +37,7 @@ class Kiss(Odometry):
         max_points_per_voxel=Integer(low=1, high=50, baseline=20, log=True),
         initial_threshold=Float(low=0.2, high=5.0, baseline=2.0, log=True),
         min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True),
+        max_num_iterations=Integer(low=5, high=500, baseline=500, log=True),
     )
     settings_type = RangeSettings
     live = True
@@ -50,6 +52,7 @@ class Kiss(Odometry):
         for name, value in self.settings:
             setattr(config.data, name, value)
         config.registration.max_num_threads = 1
+        config.registration.max_num_iterations = self.parameters["max_num_iterations"]
         config.mapping.voxel_size = self.parameters["voxel_size"]
         config.mapping.max_points_per_voxel = self.parameters["max_points_per_voxel"]
         config.adaptive_threshold.initial_threshold = self.parameters["initial_threshold"]
@@ -64,6 +67,8 @@ class Kiss(Odometry):
         changed = {name for name, value in self.parameters.items() if value != before[name]}
         kiss, config = self._kiss, self._config()
         kiss.config = config
+        if "max_num_iterations" in changed:
+            kiss.registration = get_registration(config)
         if changed & {"voxel_size", "max_points_per_voxel"}:
             points = kiss.local_map.point_cloud()
             kiss.local_map = get_voxel_hash_map(config)

@@ -1,7 +1,5 @@
 """Keyframe NDT on Open3D."""
 
-from pydantic import Field
-
 from adaptune import open3d
 from adaptune.geometry import Poses
 from adaptune.odometry import keyframe
@@ -11,12 +9,6 @@ from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 
 
-class NdtSettings(keyframe.KeyframeSettings):
-    """Settings of keyframe NDT, in metres."""
-
-    iterations: int = Field(30, ge=1, le=10_000)
-
-
 class KeyframeNdt(KeyframeOdometry):
     """Scan-to-keyframe NDT (Magnusson, *The Three-Dimensional Normal-Distributions Transform*)."""
 
@@ -24,13 +16,14 @@ class KeyframeNdt(KeyframeOdometry):
         resolution=Float(low=1.0, high=10.0, baseline=4.0, log=True),
         # The paper's range begins at 0, where a logarithm has no place.
         keyframe_interval=Float(low=0.1, high=10.0, baseline=4.0, log=True),
+        downsampling=keyframe.DOWNSAMPLING,
+        iterations=keyframe.ITERATIONS.model_copy(update={"baseline": 30}),
     )
-    settings_type = NdtSettings
 
     def prepare(self, scan: Scan) -> PreparedCloud:
         o3d = open3d.load()
         points = o3d.utility.Vector3dVector(keyframe.crop(scan, self.settings.min_range))
-        cloud = o3d.geometry.PointCloud(points).voxel_down_sample(self.settings.downsampling)
+        cloud = o3d.geometry.PointCloud(points).voxel_down_sample(self.parameters["downsampling"])
         size = len(cloud.points)
         return PreparedCloud(scan.stamp, cloud, size >= MIN_POINTS, nbytes=4096 + 24 * size)
 
@@ -39,7 +32,7 @@ class KeyframeNdt(KeyframeOdometry):
     ) -> Alignment:
         registration = open3d.load().pipelines.registration
         option = registration.NormalDistributionsTransformOption(
-            voxel_size=self.parameters["resolution"], max_iteration=self.settings.iterations
+            voxel_size=self.parameters["resolution"], max_iteration=self.parameters["iterations"]
         )
         try:
             result = registration.registration_ndt(

@@ -8,6 +8,7 @@ from typing import Any, BinaryIO, Self, cast
 from pydantic import Field, model_validator
 
 from adaptune import hosting
+from adaptune.cores import available
 from adaptune.odometry import wire
 from adaptune.odometry.base import BaseSettings, Description, OdometryError
 from adaptune.odometry.isolation import Arguments, Isolated, Limits
@@ -122,6 +123,8 @@ class Process(Isolated):
                 stdin=there.fileno(),
                 stdout=there.fileno(),
                 stderr=self._written,
+                # A program may use several cores, unless this process must not.
+                core=self._core if available() == 1 else None,
             )
         return here
 

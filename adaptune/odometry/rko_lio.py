@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import MIN_POINTS, OdometryError, RangeSettings, import_extra
+from adaptune.odometry.base import (
+    MIN_POINTS,
+    Description,
+    OdometryError,
+    RangeSettings,
+    import_extra,
+)
 from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
@@ -77,6 +83,11 @@ class RkoLio(OwnFrameOdometry):
     settings_type = RkoLioSettings
     live = False
     needs_imu = True
+
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
+        _bindings()  # raises if there are none
+        return super().describe(settings)
 
     def prepare(self, scan: Scan) -> RkoLioScan:
         if scan.imu is None:

@@ -1,33 +1,20 @@
 """The scans of the last seconds, on which a new instance builds its map before it takes over."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from adaptune.geometry import Poses, invert
 from adaptune.odometry.base import OdometryInstance, WarmUp
+from adaptune.odometry.preparations import PreparedScan
 from adaptune.sequence.imu import Imu, joined
-from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
 
 Make = Callable[[ParameterSet], OdometryInstance]
 """Makes a new instance with these parameters."""
-
-
-class PreparedScan(NamedTuple):
-    """A prepared scan and its stamp in nanoseconds; the scan too, if it brings an IMU along."""
-
-    stamp: int
-    prepared: Any
-    scan: Scan | None
-
-    @classmethod
-    def by(cls, odometry: OdometryInstance, scan: Scan) -> "PreparedScan":
-        """Let an odometry prepare a scan."""
-        return cls(scan.stamp, odometry.prepare(scan), scan if scan.imu is not None else None)
 
 
 class PastScan(NamedTuple):
@@ -40,7 +27,7 @@ class PastScan(NamedTuple):
     @property
     def imu(self) -> Imu | None:
         """What the IMU measured since the scan before."""
-        return None if self.scan.scan is None else self.scan.scan.imu
+        return self.scan.scan.imu
 
 
 class RecentScans:
@@ -50,12 +37,10 @@ class RecentScans:
     ----------
     warm_up
         Which of them a new instance sees.
-    odometry
-        Prepares scans again if the IMU measurements of several are joined.
     """
 
-    def __init__(self, warm_up: WarmUp, odometry: OdometryInstance):
-        self._warm_up, self._odometry = warm_up, odometry
+    def __init__(self, warm_up: WarmUp):
+        self._warm_up = warm_up
         self._past: deque[PastScan] = deque()
         self._n_dropped = 0
 
@@ -95,10 +80,10 @@ class RecentScans:
     def _with_imu(self, past: PastScan, missed: list[Imu]) -> PastScan:
         """A scan with all IMU measurements since the last scan that the instance sees."""
         scan = past.scan.scan
-        if not missed or scan is None or scan.imu is None:
+        if not missed or scan.imu is None:
             return past
-        scan = replace(scan, imu=joined([*missed, scan.imu]))
-        return past._replace(scan=PreparedScan.by(self._odometry, scan))
+        joint = replace(scan, imu=joined([*missed, scan.imu]))
+        return past._replace(scan=past.scan.with_scan(joint))
 
     def _age(self, past: PastScan) -> float:
         return (self.last.scan.stamp - past.scan.stamp) * 1e-9
@@ -117,15 +102,34 @@ class Successor:
 
     def catch_up(self, n: int | None = None) -> None:
         """See at most `n` more scans, or all."""
-        for _ in range(len(self.waiting) if n is None else min(n, len(self.waiting))):
-            past = self.waiting.popleft()
-            self.T_own_sensor = self.odometry.register(past.scan.prepared).T_odom_sensor
-            if not np.isfinite(self.T_own_sensor).all():
-                # It begins without a past.
-                self._start(self.waiting.pop() if self.waiting else past)
-                self.waiting.clear()
-                return
+        for _ in range(len(self.waiting) if n is None else n):
+            if self.waiting:
+                self.submit()
+                self.collect()
+
+    def submit(self) -> None:
+        """Begin to register the next of the scans that wait."""
+        self._submitted = self.waiting.popleft()
+        self.odometry.submit(self._submitted.scan.by(self.odometry))
+
+    def collect(self) -> None:
+        """Wait for its pose."""
+        self.T_own_sensor = self.odometry.collect().T_odom_sensor
+        if not np.isfinite(self.T_own_sensor).all():
+            # It begins without a past.
+            self._start(self.waiting.pop() if self.waiting else self._submitted)
+            self.waiting.clear()
 
     def _start(self, past: PastScan) -> None:
-        self.odometry.start(past.scan.prepared, past.T_odom_sensor, past.T_previous_current)
+        prepared = past.scan.by(self.odometry)
+        self.odometry.start(prepared, past.T_odom_sensor, past.T_previous_current)
         self.T_own_sensor = past.T_odom_sensor
+
+
+def catch_up_together(successors: Sequence[Successor]) -> None:
+    """See all scans that wait; those at the end register while those at the beginning do."""
+    while waiting := [one for one in successors if one.waiting]:
+        for one in waiting:
+            one.submit()
+        for one in reversed(waiting):
+            one.collect()

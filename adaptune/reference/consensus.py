@@ -35,25 +35,6 @@ _SETTINGS: Mapping[str, Mapping[str, float]] = {
 }
 
 
-class _Member(InProcess):
-    """A member of the pool; every scan is prepared once for each kind of odometry."""
-
-    def __init__(self, kinds: Mapping[str, Odometry], kind: str, odometry: Odometry):
-        super().__init__(odometry)
-        self._kinds, self._kind = kinds, kind
-
-    def prepare(self, scan: Scan) -> Any:
-        return {kind: odometry.prepare(scan) for kind, odometry in self._kinds.items()}
-
-    def start(
-        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None:
-        super().start(prepared[self._kind], T_odom_sensor, T_previous_current)
-
-    def submit(self, prepared: Any) -> None:
-        super().submit(prepared[self._kind])
-
-
 class Consensus:
     """Runs the pool scan after scan.
 
@@ -74,11 +55,8 @@ class Consensus:
             made: Odometry = cls(dict(parameters), cls.settings_type(**_SETTINGS[kind]))
             return made
 
-        kinds = {kind: adapter(kind, {}) for kind, _ in POOL}
-
-        def make(parameters: Mapping[str, Any]) -> _Member:
-            kind, of = POOL[int(parameters["number"])]
-            return _Member(kinds, kind, adapter(kind, of))
+        def make(parameters: Mapping[str, Any]) -> InProcess:
+            return InProcess(adapter(*POOL[int(parameters["number"])]))
 
         sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
         self._bank = Bank(make, sets, WarmUp(seconds=_WARM_UP))

@@ -21,6 +21,7 @@ class KissIcp(Pipeline):
         max_points_per_voxel=Integer(low=1, high=50, baseline=20, log=True),
         initial_threshold=Float(low=0.2, high=5.0, baseline=2.0, log=True),
         min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True),
+        max_num_iterations=Integer(low=5, high=500, baseline=500, log=True),
     )
 
 
@@ -40,6 +41,7 @@ class CtIcp(Pipeline):
         max_dist_to_plane_ct_icp=Float(low=0.1, high=2.0, baseline=0.5, log=True),
         beta_location_consistency=Float(low=1e-5, high=0.1, baseline=1e-3, log=True),
         beta_constant_velocity=Float(low=1e-5, high=0.1, baseline=1e-3, log=True),
+        num_iters_icp=Integer(low=3, high=30, baseline=30, log=True),
     )
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
@@ -59,6 +61,7 @@ class GenzIcp(Pipeline):
         planarity_threshold=Float(low=0.02, high=1.0, baseline=0.2, log=True),
         initial_threshold=Float(low=0.2, high=5.0, baseline=2.0, log=True),
         min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True),
+        max_num_iterations=Integer(low=5, high=100, baseline=100, log=True),
     )
 
 
@@ -88,6 +91,7 @@ class Loam(GridPipeline):
         max_plane_neighbor_dist=Float(low=0.5, high=10.0, baseline=4.0, log=True),
         max_planar_feats_per_sector=Integer(low=5, high=200, baseline=50, log=True),
         num_local_map_scans=Integer(low=1, high=20, baseline=3, log=True),
+        max_icf_iterations=Integer(low=3, high=20, baseline=20, log=True),
     )
 
 
@@ -103,4 +107,5 @@ class Form(GridPipeline):
         radius=Float(low=0.3, high=3.0, baseline=1.0, log=True),
         keyscan_match_ratio=Float(low=0.02, high=0.5, baseline=0.1, log=True),
         max_num_keyscans=Integer(low=5, high=200, baseline=50, log=True),
+        max_num_rematches=Integer(low=3, high=30, baseline=30, log=True),
     )

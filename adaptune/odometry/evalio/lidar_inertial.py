@@ -105,6 +105,7 @@ class Dlio(Pipeline):
     space = ParameterSpace.of(
         vf_res=Float(low=0.1, high=1.0, baseline=0.25, log=True),
         gicp_max_corr_dist=Float(low=0.2, high=3.0, baseline=0.5, log=True),
+        gicp_max_iter=Integer(low=3, high=32, baseline=32, log=True),
         gicp_k_correspondences=Integer(low=8, high=32, baseline=16, log=True),
         keyframe_thresh_dist=Float(low=0.3, high=10.0, baseline=1.0, log=True),
         submap_knn=Integer(low=2, high=30, baseline=10, log=True),

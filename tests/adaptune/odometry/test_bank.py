@@ -1,15 +1,20 @@
+import logging
+
+import faulty
 import numpy as np
 import pytest
 import turns
+from needs import needs_evalio
 from walker import at, every, kept, makes, selected, x_of, x_on
 
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.bank import Bank
+from adaptune.odometry.evalio.base import EvalioSettings
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.hand_over import HandOver
 from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.isolation import MOST_FAULTS, Isolated, Limits
 from adaptune.odometry.keyframe import KeyframeSettings
 from adaptune.selection import Selection
 
@@ -206,3 +211,102 @@ def test_real_odometries_go_straight_on(mechanism):
     steps = invert(poses[:-1]) @ poses[1:]
     np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
     np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)
+
+
+def with_faulty(fault):
+    """A bank of a walker and an odometry in another process, with their numbers 7 and 3."""
+    walkers, _ = makes()
+
+    def make(parameters):
+        if "x" not in parameters:
+            return walkers(parameters)
+        limits = Limits(seconds=1.0, memory=1.0)
+        return Isolated("faulty:Faulty", {"x": 0.1}, faulty.Settings(fault=fault), limits)
+
+    sets = {3: {"odometry": "mine", "x": 0.1}, 7: {"speed": 0.1}}
+    return Bank(make, sets, every(2.0))
+
+
+def steps_of(bank, n):
+    """How far the bank comes along x with each of so many scans, ten a second."""
+    bank.start(bank.prepare(at(0)), np.eye(4))
+    x = [bank.register(bank.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, n)]
+    return np.diff(x)
+
+
+def test_a_member_that_a_fault_has_ended_is_told_once_and_starts_again(caplog):
+    bank = with_faulty("abort")
+    with caplog.at_level(logging.WARNING, "adaptune.odometry.bank"):
+        np.testing.assert_allclose(steps_of(bank, 20), 0.1)
+    told = [r.getMessage() for r in caplog.records if r.name == "adaptune.odometry.bank"]
+    # The warm-up meets the fault again; after that, it begins without a past.
+    assert told == [
+        "trial 3 (mine) ended: its process was ended by SIGABRT: about to go wrong; the bank goes "
+        "on without it",
+        "trial 3 (mine) is back",
+    ]
+    assert len(bank.faults) >= bank.restarts == 1
+    assert not bank.dead
+    bank.close()
+
+
+def test_one_that_cannot_start_is_out_for_good(caplog):
+    bank = with_faulty("never begins")
+    with caplog.at_level(logging.WARNING, "adaptune.odometry.bank"):
+        np.testing.assert_allclose(steps_of(bank, 90), 0.1)
+    assert bank.dead == {3}
+    assert len(bank.faults) == MOST_FAULTS
+    # Twice for every restart, with a past and without.
+    assert bank.restarts < MOST_FAULTS
+    told = [r for r in caplog.records if r.name == "adaptune.odometry.bank"]
+    assert len(told) == 1
+
+
+def test_other_processes_work_while_members_of_this_one_do():
+    calls, walkers = [], makes()[0]
+
+    class Noted(InProcess):
+        def submit(self, prepared):
+            calls.append(("submit", self.apart))
+            super().submit(prepared)
+
+        def collect(self):
+            calls.append(("collect", self.apart))
+            return super().collect()
+
+    def make(parameters):
+        one = Noted(walkers(parameters).odometry)
+        one.apart = parameters["speed"] > 1.0
+        return one
+
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
+    x_of(bank, range(2))
+    assert calls == [("submit", True), ("submit", False), ("collect", False), ("collect", True)]
+    assert [T[0, 3] for T in bank.motions.members.values()] == [1.0, 1.02]
+
+
+def test_odometries_with_global_state_are_as_if_they_were_alone():
+    needs_evalio()
+    sets = {0: {"voxel_size": 0.4}, 1: {"voxel_size": 0.8}}
+
+    def genz(parameters):
+        return Isolated("genz_icp", parameters, EvalioSettings(), Limits())
+
+    bank, moved = Bank(genz, sets, every(1.0)), []
+    alone = {trial: genz(parameters) for trial, parameters in sets.items()}
+    for i in range(12):
+        if i == 0:
+            bank.start(bank.prepare(turns.turn(0)), np.eye(4))
+            for one in alone.values():
+                one.start(one.prepare(turns.turn(0)), np.eye(4))
+            continue
+        bank.register(bank.prepare(turns.turn(i)))
+        for one in alone.values():
+            one.register(one.prepare(turns.turn(i)))
+        for trial, one in alone.items():
+            np.testing.assert_array_equal(bank.motions.members[trial], one.motions[0])
+        moved.append([T[0, 3] for T in bank.motions.members.values()])
+    assert bank.restarts == 0
+    assert not np.array_equal(*np.transpose(moved))
+    for one in (bank, *alone.values()):
+        one.close()

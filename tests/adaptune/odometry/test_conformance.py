@@ -252,9 +252,9 @@ def parameter_cases():
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())
 def test_every_parameter_takes_effect(name, parameter):
     one = space_of(name).parameters[parameter]
-    low, high = (
-        drive(make(name, {parameter: one.from_unit(u)}), prepared_drive(name)) for u in (0.0, 1.0)
-    )
+    # Each prepares for itself: what it prepares may depend on the parameter.
+    both = [make(name, {parameter: one.from_unit(u)}) for u in (0.0, 1.0)]
+    low, high = (drive(o, [o.prepare(scan(i)) for i in range(N_SCANS)]) for o in both)
     assert np.abs(low - high).max() > 1e-5
 
 

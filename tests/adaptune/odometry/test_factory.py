@@ -3,6 +3,7 @@ import sys
 
 import numpy as np
 import pytest
+from needs import needs_evalio
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.factory import OdometryFactory
@@ -28,7 +29,8 @@ def test_it_makes_what_the_name_says():
     odometry = instance.odometry
     assert type(odometry) is KeyframeGicp
     assert odometry.settings == gicp.settings == KeyframeSettings(downsampling=0.3)
-    assert odometry.parameters == KeyframeGicp.space.baseline | {"keyframe_interval": 4.0}
+    given = {"keyframe_interval": 4.0, "downsampling": 0.3}
+    assert odometry.parameters == KeyframeGicp.space.baseline | given
     # The baseline of the study's space, not the odometry's own.
     assert gicp().odometry.parameters["keyframe_interval"] == 2.0
     assert gicp.description == KeyframeGicp.describe(gicp.settings)
@@ -40,6 +42,7 @@ def test_it_makes_what_the_name_says():
 
 
 def test_what_is_not_tuned_keeps_its_setting_in_another_process():
+    needs_evalio()
     settings = {"parameters": {"num_keyframes": 16}}
     space = ParameterSpace({"b_max": Float(low=0.05, high=1.0, baseline=0.2)})
     assert factory("mad_icp", settings, space)().parameters == {"b_max": 0.2}

@@ -1,11 +1,13 @@
 from dataclasses import replace
 
+import faulty
 import numpy as np
 import pytest
 from walker import Walker, at, every, kept, makes, selected, x_of, x_on
 
 from adaptune.odometry import InProcess, WarmUp
 from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.sequence import Imu
 
 
@@ -148,3 +150,22 @@ def test_registrations_keep_their_word():
     odometry.start(odometry.prepare(at(3)), np.eye(4))
     assert not odometry.register(odometry.prepare(at(4))).registered
     assert odometry.register(odometry.prepare(at(5))).registered
+
+
+@pytest.mark.parametrize("catch_up_scans", [0, 3])
+def test_one_that_cannot_begin_does_not_take_over(catch_up_scans):
+    make, made = makes()
+
+    def make_either(parameters):
+        if "x" not in parameters:
+            return make(parameters)
+        return Isolated("faulty:Faulty", {}, faulty.Settings(fault="never begins"), Limits())
+
+    odometry = HandOver(make_either, {"speed": 1.0}, every(3.0), catch_up_scans)
+    switches = {4: {"x": 0.5}, 7: {"x": 0.5}, 9: {"speed": 1.0}, 12: {"speed": 2.0}}
+    x = x_of(odometry, range(18), switches)
+    assert np.diff(x)[:11].tolist() == [1.0] * 11
+    assert np.diff(x)[-1] == 2.0
+    # It was tried for one selection of two, from its first scan on and from the last.
+    assert 2 <= len(odometry.faults) <= 3
+    assert len(made) == 2

@@ -13,7 +13,7 @@ import turns
 from adaptune.odometry import OdometryError
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.isolation import MOST_FAULTS, Limits
 from adaptune.odometry.process import Process, ProcessSettings
 from adaptune.odometry.serving import listen
 from adaptune.selection import Selection
@@ -148,7 +148,8 @@ def test_it_is_the_same_odometry_behind_a_socket(listening, tmp_path, kind):
     where = "tcp://127.0.0.1:0" if kind == "tcp" else f"unix:{tmp_path / 'socket'}"
     settings = ProcessSettings(address=listening(where, "gicp"), settings={"downsampling": 0.4})
     described = Process.describe(settings)
-    assert described.space == KeyframeGicp.space
+    settings_of = KeyframeGicp.settings_type(downsampling=0.4)
+    assert described.space == KeyframeGicp.describe(settings_of).space
     assert described.live
     with pytest.raises(OdometryError, match="downsmapling"):
         Process.describe(settings.model_copy(update={"settings": {"downsmapling": 1}}))
@@ -246,3 +247,30 @@ def test_a_study_takes_its_space(study_file, tmp_path):
         with pytest.raises(ConfigurationError) as caught:
             load_study(study_file, [*overrides, more])
         assert words in str(caught.value)
+
+
+def test_one_whose_program_has_gone_is_a_fault(tmp_path):
+    where = tmp_path / "socket"
+    settings = ProcessSettings(address=f"unix:{where}")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(where))
+        listener.listen()
+        odometry = Process({}, settings, LIMITS)
+
+        def hang_up():
+            listener.accept()[0].close()
+
+        ending = threading.Thread(target=hang_up)
+        ending.start()
+        odometry.start(scan(0), np.eye(4))
+        ending.join()
+    assert odometry.ended
+    for _ in range(MOST_FAULTS + 5):
+        odometry.start(scan(1), np.eye(4))
+        assert np.isnan(odometry.register(scan(2)).T_odom_sensor).all()
+    assert odometry.given_up
+    assert len(odometry.faults) == MOST_FAULTS
+    assert "nothing listens at unix:" in odometry.faults[-1]
+    # A new one says what to do.
+    with pytest.raises(OdometryError, match="start the program there first"):
+        Process({}, settings, LIMITS).start(scan(0), np.eye(4))

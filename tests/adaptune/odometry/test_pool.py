@@ -1,0 +1,97 @@
+"""Several odometries in one study."""
+
+import pickle
+
+import numpy as np
+import pytest
+from street import N_SCANS, scan
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.ndt import KeyframeNdt
+from adaptune.odometry.pool import OdometryPool
+from adaptune.odometry.registry import odometry_class
+from adaptune.pooled_space import ODOMETRY
+from adaptune.selection import Selection
+from adaptune.space import SpaceError
+
+
+def factory(name, **settings):
+    cls = odometry_class(name)
+    made = cls.settings_type(**settings)
+    return OdometryFactory(name, made, cls.describe(made).space, Limits())
+
+
+def pool():
+    return OdometryPool({"gicp": factory("gicp", downsampling=0.4), "coarse": factory("ndt")})
+
+
+def test_it_makes_the_odometry_that_the_set_names():
+    both = pool()
+    gicp = both({ODOMETRY: "gicp", **both.factories["gicp"].space.baseline})
+    assert type(gicp.odometry) is KeyframeGicp
+    assert gicp.odometry.settings.downsampling == 0.4
+    ndt = both({ODOMETRY: "coarse"} | both.factories["coarse"].space.baseline | {"resolution": 2.5})
+    assert type(ndt.odometry) is KeyframeNdt
+    assert ndt.odometry.parameters["resolution"] == 2.5
+    # Without a set, the baseline of the first.
+    assert type(both().odometry) is KeyframeGicp
+    with pytest.raises(SpaceError, match="there is no odometry 'ndt'"):
+        both({ODOMETRY: "ndt"})
+    with pytest.raises(OdometryError):
+        OdometryPool({"a": factory("gicp").__class__("gipc", {}, both.space, Limits())})
+
+
+def test_it_says_what_a_study_must_know():
+    both = pool()
+    assert both.name == "gicp, coarse"
+    every = [one.description for one in both.factories.values()]
+    assert all(one.live for one in every)
+    assert not both.description.live
+    assert not both.description.needs_imu
+    assert not both.description.whole
+    assert both.description.space is both.space
+    assert both.description.warm_up.seconds == max(one.warm_up.seconds for one in every)
+    assert both.description.warm_up.stride == min(one.warm_up.stride for one in every)
+    settings = {label: one.identity for label, one in both.factories.items()}
+    assert both.identity == {"name": "gicp, coarse", "settings": settings}
+    assert {"small_gicp", "open3d"} <= set(both.versions)
+    assert not both.apart
+    assert both.allowing(user_code=True).user_code
+
+
+def test_it_pickles():
+    both = pool()
+    copy = pickle.loads(pickle.dumps(both))
+    assert copy.identity == both.identity
+    assert copy.space == both.space
+    assert copy.space.baselines == both.space.baselines
+    assert type(copy(both.space.baselines[1]).odometry) is KeyframeNdt
+
+
+@pytest.mark.parametrize("catch_up_scans", [0, 3])
+def test_a_hand_over_to_another_odometry_prepares_anew(catch_up_scans):
+    both = pool()
+    first, second = both.space.baselines
+    made = []
+
+    def make(parameters):
+        made.append(both(parameters))
+        return made[-1]
+
+    warm_up = both.description.warm_up._replace(seconds=0.5, full_rate=0.5, stride=1)
+    odometry = HandOver(make, first, warm_up, catch_up_scans)
+    poses = [np.eye(4)]
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    for i in range(1, N_SCANS):
+        if i == N_SCANS // 2:
+            odometry.apply(Selection(1, second))
+        poses.append(odometry.register(odometry.prepare(scan(i))).T_odom_sensor)
+    assert [type(one.odometry) for one in made] == [KeyframeGicp, KeyframeNdt]
+    assert made[0].preparation != made[1].preparation
+    x = np.array(poses)[:, 0, 3]
+    truth = np.linspace(0.0, np.mean(np.diff(x)) * (N_SCANS - 1), N_SCANS)
+    np.testing.assert_allclose(x, truth, atol=0.3)

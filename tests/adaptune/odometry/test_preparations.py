@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+
+from adaptune.odometry.base import Odometry, Registration, WarmUp
+from adaptune.odometry.gicp import KeyframeGicp, KeyframeVgicp
+from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.in_process import InProcess
+from adaptune.odometry.keyframe import KeyframeSettings
+from adaptune.odometry.ndt import KeyframeNdt
+from adaptune.odometry.preparations import Preparations
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
+from adaptune.space import Float, ParameterSpace
+
+
+class Cell(Odometry):
+    """Prepares scans by a parameter, and refuses those that were prepared by another value."""
+
+    space = ParameterSpace({"cell": Float(low=0.0, high=9.0, baseline=1.0)})
+    live = clean = True
+    count = 0
+
+    @property
+    def preparation(self):
+        return type(self), self.parameters["cell"]
+
+    def prepare(self, scan):
+        Cell.count += 1
+        return scan.stamp, self.parameters["cell"]
+
+    def start(self, prepared, T_odom_sensor, _T_previous_current=None):
+        self.T = np.array(T_odom_sensor)
+        assert prepared[1] == self.parameters["cell"]
+
+    def register(self, prepared):
+        assert prepared[1] == self.parameters["cell"]
+        self.T[0, 3] += 0.1
+        return Registration(self.T.copy(), True)
+
+
+@pytest.fixture(autouse=True)
+def count():
+    Cell.count = 0
+
+
+def cell(value):
+    return InProcess(Cell({"cell": value}))
+
+
+def scan(i):
+    return Scan(i * 10**8, np.ones((30, 3), np.float32))
+
+
+def test_a_scan_is_prepared_once_for_all_that_are_alike():
+    one, alike, other = cell(1.0), cell(1.0), cell(2.0)
+    shared = Preparations().of(scan(3))
+    assert shared.by(one) is shared.by(alike)
+    assert shared.by(other) == (3 * 10**8, 2.0)
+    assert Cell.count == 2
+    assert shared.stamp == 3 * 10**8
+
+
+def test_the_first_one_prepares_for_all():
+    preparations, one, alike = Preparations(), cell(1.0), cell(1.0)
+    alike.odometry.prepare = None
+    for i in range(3):
+        shared = preparations.of(scan(i))
+        shared.by(one)
+        assert shared.by(alike)[0] == i * 10**8
+
+
+def test_gicp_and_vgicp_share_clouds_of_the_same_downsampling():
+    fine = {"downsampling": 0.25}
+    assert KeyframeGicp(fine).preparation == KeyframeVgicp(fine).preparation
+    assert KeyframeGicp(fine).preparation != KeyframeGicp().preparation
+    assert KeyframeGicp(fine).preparation != KeyframeNdt(fine).preparation
+    near = KeyframeSettings(min_range=2.0)
+    assert KeyframeGicp(fine).preparation != KeyframeGicp(fine, near).preparation
+    # The number of iterations does not matter.
+    assert KeyframeGicp({"iterations": 5}).preparation == KeyframeGicp().preparation
+
+
+def test_what_a_setting_fixes_is_not_tuned():
+    settings = KeyframeSettings(downsampling=0.3)
+    assert "downsampling" not in KeyframeGicp.describe(settings).space.names
+    assert "iterations" in KeyframeGicp.describe(settings).space.names
+    assert KeyframeGicp(settings=settings).parameters["downsampling"] == 0.3
+
+
+def test_a_hand_over_may_prepare_otherwise():
+    made = HandOver(lambda p: InProcess(Cell(p)), {"cell": 1.0}, WarmUp())
+    made.start(made.prepare(scan(0)), np.eye(4))
+    for i in range(1, 5):
+        made.register(made.prepare(scan(i)))
+    made.apply(Selection(1, {"cell": 2.0}))
+    pose, registered = made.register(made.prepare(scan(5)))
+    assert registered
+    assert pose[0, 3] == pytest.approx(0.5)

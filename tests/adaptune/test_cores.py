@@ -1,0 +1,42 @@
+import os
+
+import pytest
+
+from adaptune import cores
+
+
+@pytest.fixture
+def allowed(monkeypatch):
+    """Cores of this process, of which a test may have as many as it likes."""
+    now = {2, 3, 5, 7}
+
+    def keep(_, some):
+        now.clear()
+        now.update(some)
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(now), raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", keep, raising=False)
+    return now
+
+
+def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
+    unpin = cores.pin(6)
+    assert allowed == {5}
+    assert cores.available() == 1
+    unpin()
+    assert allowed == {2, 3, 5, 7}
+
+
+def test_others_get_one_core_after_the_other(allowed):
+    some = [cores.next_core() for _ in range(8)]
+    assert some[:4] == some[4:]
+    assert set(some) == allowed
+
+
+def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
+    unpin = cores.pin(1, alone=True)
+    assert {cores.next_core() for _ in range(4)} == {2, 3, 5, 7}
+    unpin()
+    unpin = cores.pin(1)
+    assert {cores.next_core() for _ in range(4)} == allowed == {3}
+    unpin()
