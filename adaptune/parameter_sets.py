@@ -1,13 +1,13 @@
 """The parameter sets of a study: the one table that numbers them."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.space import ParameterSet, ParameterSpace, Value
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,24 @@ class ParameterSets:
         """Columns of several sets."""
         return np.array([self._columns[trial] for trial in trials], np.intp)
 
+    @property
+    def defaults(self) -> list[int]:
+        """Trial numbers of the sets that are the baseline of an odometry."""
+        return [trial for trial in self.trials if self[trial] in self.space.baselines]
+
     def find(self, parameters: ParameterSet) -> int | None:
         """Trial number of the first set with these values, the others at their baseline."""
-        whole = self.space.baseline | parameters
+        whole = self.space.complete(parameters)
         return next((t for t in self.trials if self[t] == whole), None)
 
     def subset(self, trials: Sequence[int]) -> "ParameterSets":
         """A table of some of the sets."""
         return ParameterSets(self.space, tuple(trials), tuple(self[trial] for trial in trials))
+
+
+def in_words(parameters: Mapping[str, Value]) -> str:
+    """A set in a few words, with three digits of each number."""
+    return ", ".join(
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in parameters.items()
+    )

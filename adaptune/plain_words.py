@@ -89,11 +89,11 @@ def _message(details: Sequence[Any]) -> str:
         if detail["type"] not in _WANTED:
             return _plain(str(detail["msg"]))
     # A value of the right type comes nearest.
-    wanted = [_wanted(detail) for detail in details if detail["type"] in _OF_VALUES]
-    wanted = wanted or [_wanted(detail) for detail in details]
+    nearest = [detail for detail in details if detail["type"] in _OF_VALUES] or list(details)
+    wanted = [_wanted(detail) for detail in nearest]
     if _NUMBER in wanted and _WHOLE in wanted:
         wanted.remove(_WHOLE)
-    return f"give {' or '.join(dict.fromkeys(wanted))}, not {_given(details[0])}"
+    return f"give {' or '.join(dict.fromkeys(wanted))}, not {_given(nearest[0])}"
 
 
 def _wanted(detail: Any) -> str:

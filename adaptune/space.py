@@ -176,9 +176,31 @@ class ParameterSpace:
         return tuple(self.parameters)
 
     @property
+    def logarithmic(self) -> list[str]:
+        """Those of `names` whose range is spaced evenly in ratio."""
+        return [name for name, p in self.parameters.items() if getattr(p, "log", False)]
+
+    @property
     def baseline(self) -> ParameterSet:
         """The odometry's own value of every parameter."""
         return {name: parameter.baseline for name, parameter in self.parameters.items()}
+
+    @property
+    def baselines(self) -> list[ParameterSet]:
+        """The baseline of every odometry: of the only one."""
+        return [self.baseline]
+
+    def complete(self, parameters: Mapping[str, Value]) -> ParameterSet:
+        """The whole set: what is not given is at its baseline."""
+        return self.baseline | dict(parameters)
+
+    def flat(self, parameters: ParameterSet) -> ParameterSet:
+        """The set with the names that `parameters` of this space has."""
+        return parameters
+
+    def row(self, parameters: Mapping[str, Value]) -> dict[str, Value | None]:
+        """The set as columns of a table, in the order of `names`; None where it has no value."""
+        return {name: parameters.get(name) for name in self.names}
 
     def check(self, parameters: Mapping[str, object]) -> None:
         """Raise a SpaceError for a set with missing, unknown or out-of-range parameters."""

@@ -37,8 +37,15 @@ class OdometryConfig(StrictModel):
     """
 
     name: str
+    # What the odometry is called in parameter sets and tables, if a study has several.
+    label: Name | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     parameters: Annotated[dict[str, dict[str, Any]], Field(min_length=1)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_alone(cls, data: Any) -> Any:
+        return {"name": data} if isinstance(data, str) else data
 
 
 def _known_descriptor(name: str) -> str:
@@ -83,6 +90,10 @@ def _catches_up(scans: int) -> int:
     return scans
 
 
+MOST_MEMBERS = 6
+"""Of a bank."""
+
+
 class SwitchingConfig(StrictModel):
     """How the odometry changes its parameters during a replay.
 
@@ -97,21 +108,25 @@ class SwitchingConfig(StrictModel):
     full_rate: float | None = Field(None, ge=0, le=3600)
     stride: int | None = Field(None, ge=1, le=10_000)
     catch_up_scans: Annotated[int, Field(ge=0, le=10_000), AfterValidator(_catches_up)] = 0
-    size: int = Field(4, ge=2, le=6)
+    size: int = Field(4, ge=2, le=MOST_MEMBERS)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0, le=10**9)] | dict[str, Value], ...] | None,
-        Field(min_length=2, max_length=6),
+        Field(min_length=2, max_length=MOST_MEMBERS),
     ] = None
     cores: int | None = Field(None, ge=1, le=10_000)
     memory: float = Field(16.0, gt=0, le=1e6)
 
 
 class OnlineConfig(StrictModel):
-    """How to replay: seconds between selections, selection rules, and switching."""
+    """How to replay: seconds between selections, selection rules, switching, and what it may cost.
+
+    The budget is in milliseconds of CPU time a scan, all members and live evidence together.
+    """
 
     period: float = Field(1.0, ge=0.01, le=3600)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
     switching: SwitchingConfig = SwitchingConfig()
+    budget: float | None = Field(None, gt=0, le=1e6)
 
 
 class StudyConfig(StrictModel):
@@ -120,7 +135,7 @@ class StudyConfig(StrictModel):
     ``docs/reference-study.md`` describes every key.
     """
 
-    odometry: OdometryConfig
+    odometry: OdometryConfig | Annotated[tuple[OdometryConfig, ...], Field(min_length=1)]
     sequences: dict[Name, SequenceConfig] = Field(default_factory=dict)
     courses: dict[Name, Course] = Field(default_factory=dict)
     training: tuple[str, ...] = Field(min_length=1)
@@ -131,6 +146,12 @@ class StudyConfig(StrictModel):
     isolation: Limits = Limits()
     descriptor: DescriptorConfig = DescriptorConfig()
     online: OnlineConfig = OnlineConfig()
+
+    @property
+    def odometries(self) -> dict[str, OdometryConfig]:
+        """The odometries by their labels."""
+        given = (self.odometry,) if isinstance(self.odometry, OdometryConfig) else self.odometry
+        return {one.label or one.name: one for one in given}
 
     # What a stage that adds settings of its own overrides.
 

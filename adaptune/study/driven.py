@@ -1,5 +1,6 @@
 """What `adaptune online` drives with a model, in the mode `paired`."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
+from adaptune.pooled_space import ODOMETRY
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import Mechanism, Study
@@ -17,6 +19,14 @@ MIN_RECORDINGS = 6
 """With as many, whole recordings are left out; with fewer, stretches of them."""
 BANK, ONE_SET = "bank", "one set"
 """Names of the ways to adapt."""
+BEST_DEFAULT, EQUAL_COST = "best_default", "equal_cost"
+"""Rivals: the odometry that does best with its own parameters, and the best set that costs no more
+than what is driven."""
+RIVALS = (BEST_DEFAULT, EQUAL_COST)
+RIVAL_WORDS = {
+    BEST_DEFAULT: "the best odometry with its own parameters",
+    EQUAL_COST: "the best set that costs no more",
+}
 RELIES_ON_LIVE = True
 """Whether a bank adapts where too little is known to compare it: only if it measures the errors of
 its members while it drives."""
@@ -47,7 +57,7 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     ModeError
         If the model does not go with the study's bank.
     """
-    number = f"trial {model.fixed}" + ("" if model.fixed else ", the baseline")
+    number = f"trial {named(model, model.fixed)}" + ("" if model.fixed else ", the baseline")
     fixed = f"`online` will drive the fixed set ({number})"
     if not study.rules:
         why = "no rule is named (online.rules)"
@@ -63,8 +73,11 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     if mechanism is None:
         return Driven(None, "`online` will drive `paper`, and not `paired` (online.rules).", paper)
     if mechanism == "bank":
-        members = ", ".join(map(str, bank_members(study.config.online.switching, model)))
+        trials = list(bank_members(study.config.online.switching, model))
+        members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `paired`"
+        if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
+            words += f", at {cost:.1f} ms of CPU time a scan"
         if BANK in model.expected:
             words += f", because it has the least expected loss: {_expected(model, BANK)}."
         else:
@@ -88,6 +101,12 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     else:
         why = _too_little(model)
     return Driven(None, f"{fixed} as `paired`, because {why}.", paper)
+
+
+def named(model: ErrorModel, trial: int) -> str:
+    """A trial's number, and its odometry where there are several."""
+    odometry = model.sets[trial].get(ODOMETRY)
+    return str(trial) if odometry is None else f"{trial} ({odometry})"
 
 
 def _expected(model: ErrorModel, way: str) -> str:
@@ -157,6 +176,8 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
         If the study names a set that the model does not know, or one twice, or the model was
         fitted for another bank.
     """
+    if switching.sets is None and model.budget is not None:
+        return {trial: model.sets[trial] for trial in model.bank}
     if switching.sets is None:
         size = switching.size
         complete = int((~np.isnan(model.errors).any(axis=0)).sum())

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from adaptune import __version__
 from adaptune.archive import Archive
 from adaptune.files import write_text
-from adaptune.odometry.content import descriptor_content, odometry_content
+from adaptune.odometry.content import descriptor_content
 from adaptune.sequence.fingerprint import MANY, status_key
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.study.run_folder import differences
@@ -78,7 +78,7 @@ def odometry_inputs(study: Study) -> dict[str, Any]:
     about = {
         **odometry.identity,
         "parameters": odometry.space.dump(),
-        "content": odometry_content(odometry.name, odometry.settings, odometry.module),
+        "content": odometry.content,
     }
     if odometry.apart:
         about["limits"] = study.config.isolation.model_dump()

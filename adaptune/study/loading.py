@@ -6,31 +6,21 @@ from typing import Any, NamedTuple, TypeVar
 
 from adaptune import yaml
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Description, OdometryError
-from adaptune.odometry.command import Command
-from adaptune.odometry.declaration import declare
-from adaptune.odometry.registry import is_user_class, where
 from adaptune.plain_words import Key
 from adaptune.sequence import cache
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import check_sequence
-from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
 from adaptune.study.config import StudyConfig
 from adaptune.study.learned import Added, LearnedDrives
 from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
+from adaptune.study.odometries import check_odometries, check_together
 from adaptune.study.overlaps import overlaps
 from adaptune.study.roles import settle_roles
-from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
+from adaptune.study.study import Study
 
 _MOST_BYTES = 10**6
 
 C = TypeVar("C", bound=StudyConfig)
-
-_KINDS: dict[str, type[Float | Integer | Categorical]] = {
-    "float": Float,
-    "integer": Integer,
-    "categorical": Categorical,
-}
 
 
 def read_study(
@@ -157,8 +147,7 @@ def _check(
     mistakes : list of Mistake
     """
     mistakes: list[Mistake] = []
-    if isinstance(odometry := data.get("odometry"), dict):
-        _check_odometry(odometry, mistakes, folder)
+    check_odometries(data.get("odometry"), mistakes, folder)
     origins, in_roles = settle_roles(data)
     mistakes += in_roles
     context = {"folder": folder}
@@ -168,14 +157,10 @@ def _check(
         needed = {"odometry": {"name": ""}, "training": [""]}
         config = validated_rest(config_type, data, needed, mistakes, context)
     if config is not None:
-        try:
-            described = describe_odometry(config.odometry) if sound else None
-        except OdometryError:
-            described = None
-        if described is not None:
-            mistakes += _check_imu(config, described)
-            mistakes += _check_switching(config, described)
-        space = tuned_space(config.odometry, described) if sound and described else None
+        space = None
+        if sound:
+            found, space = check_together(config)
+            mistakes += found
         mistakes += config.mistakes(space)
     sequences, courses = data.get("sequences", {}), data.get("courses", {})
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
@@ -209,86 +194,3 @@ def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
             check_sequence(config)
         except AdaptuneError as error:
             yield Mistake(("sequences", name), str(error))
-
-
-def _check_odometry(data: dict[str, Any], mistakes: list[Mistake], folder: Path) -> None:
-    """Check all that depends on the odometry; make paths in its settings absolute."""
-    name = data.get("name")
-    if not isinstance(name, str):
-        return
-    settings, key = data.get("settings") or {}, ("odometry", "settings")
-    if not isinstance(settings, dict):
-        return
-    try:
-        where(name)
-    except OdometryError as error:
-        mistakes.append(Mistake(("odometry", "name"), str(error)))
-        return
-    try:
-        declared = declare(name, settings, folder)
-        mistakes += (mistake.below(key) for mistake in declared.mistakes)
-        if declared.settings is not None:
-            data["settings"] = declared.settings.model_dump(mode="json", exclude_unset=True)
-        if (described := declared.description) is None:
-            return
-        _check_parameters(name, described.space, data.get("parameters"), mistakes)
-        if name == "command" and isinstance(tuned := data.get("parameters"), dict):
-            Command.check(declared.settings, dict.fromkeys(tuned, 0))
-    except OdometryError as error:
-        at = ("odometry", "name") if is_user_class(name) else key
-        mistakes.append(Mistake(at, str(error)))
-
-
-def _check_parameters(
-    name: str, space: ParameterSpace | None, tuned: Any, mistakes: list[Mistake]
-) -> None:
-    if space is None and not tuned:
-        message = f"define the parameters: a {name} does not know its own"
-        mistakes.append(Mistake(("odometry", "parameters"), message))
-    for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
-        key = ("odometry", "parameters", parameter)
-        if space is not None and parameter not in space.names:
-            help_ = nearest(str(parameter), space.names)
-            mistakes.append(Mistake(key, f"{name} has no parameter {parameter!r}: {help_}"))
-        elif isinstance(given, dict):
-            whole = whole_definition(space, parameter, given)
-            if str(whole.get("type")) not in _KINDS:
-                mistakes.append(Mistake(key, f"give its type, one of {', '.join(_KINDS)}"))
-            else:
-                validated(_KINDS[whole["type"]], whole, key, mistakes)
-
-
-def _check_imu(config: StudyConfig, described: Description) -> Iterable[Mistake]:
-    if not described.needs_imu:
-        return
-    needs = f"{config.odometry.name} needs an IMU"
-    for name, sequence in config.sequences.items():
-        if sequence.imu is None:
-            help_ = "name its topic and its place, imu: {topic: ..., extrinsic: ...}"
-            yield Mistake(("sequences", name), f"{needs}; {help_}")
-    for name, course in config.courses.items():
-        if course.imu is None:
-            yield Mistake(("courses", name), f"{needs}; simulate one, imu: 200")
-
-
-def _check_switching(config: StudyConfig, described: Description) -> Iterable[Mistake]:
-    online, key = config.online, ("online", "switching")
-    tuned = config.odometry.parameters or {}
-    names = tuned if described.space is None else described.space.names
-    for i, given in enumerate(online.switching.sets or ()):
-        for name in given if isinstance(given, dict) else ():
-            if name not in names:
-                message = f"there is no such parameter; {nearest(name, names)}"
-                yield Mistake((*key, "sets", i, name), message)
-    if described.whole and "rules" in online.model_fields_set and online.rules:
-        message = "a command runs whole recordings and cannot adapt; leave this out"
-        yield Mistake(("online", "rules"), message)
-    if described.whole and online.switching.mechanism != "auto":
-        message = "a command runs whole recordings and cannot change parameters; leave this out"
-        yield Mistake((*key, "mechanism"), message)
-    elif online.switching.mechanism == "live" and not described.live:
-        message = (
-            f"{config.odometry.name} cannot change its parameters between scans; choose auto, "
-            f"hand_over or bank"
-        )
-        yield Mistake((*key, "mechanism"), message)

@@ -13,12 +13,12 @@ from typing_extensions import TypeVar
 
 from adaptune.cores import available
 from adaptune.odometry.base import Description, WarmUp
-from adaptune.odometry.content import odometry_content
 from adaptune.odometry.declaration import declare
 from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.pool import Factory, OdometryPool
 from adaptune.sequence.names import OF_VIEW
 from adaptune.space import ParameterSpace
-from adaptune.study.config import OdometryConfig, StudyConfig
+from adaptune.study.config import MOST_MEMBERS, OdometryConfig, StudyConfig
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.study.run_folder import MODEL, check_folder, open_folder
 from adaptune.study.sequences import StudySequences
@@ -50,15 +50,23 @@ class Study(Generic[C_co]):
     @cached_property
     def sequences(self) -> StudySequences:
         """The sequences by name."""
-        config, described = self.config, describe_odometry(self.config.odometry)
-        layout: Any = odometry_settings(config.odometry).input if described.whole else "bag"
+        config = self.config
+        described = [(one, describe_odometry(one)) for one in config.odometries.values()]
+        # A program that runs whole recordings is the only odometry.
+        layouts = [odometry_settings(one).input for one, about in described if about.whole]
+        layout: Any = layouts[0] if layouts else "bag"
         of_study = (config.sequences, config.courses, config.views, self.folder)
-        return StudySequences(*of_study, described.needs_imu, layout)
+        needs_imu = any(about.needs_imu for _, about in described)
+        return StudySequences(*of_study, needs_imu, layout)
 
     @cached_property
-    def odometry(self) -> OdometryFactory:
-        """Makes instances of the odometry."""
-        config = self.config.odometry
+    def odometry(self) -> Factory:
+        """Makes instances of the odometry, or of any of several."""
+        odometries = self.config.odometries
+        factories = {label: self._factory(config) for label, config in odometries.items()}
+        return OdometryPool(factories) if len(factories) > 1 else next(iter(factories.values()))
+
+    def _factory(self, config: OdometryConfig) -> OdometryFactory:
         described = describe_odometry(config)
         return OdometryFactory(
             config.name,
@@ -91,6 +99,8 @@ class Study(Generic[C_co]):
         if switching.mechanism != "auto":
             return switching.mechanism
         instances = switching.size if switching.sets is None else len(switching.sets)
+        if switching.sets is None and self.config.online.budget is not None:
+            instances = MOST_MEMBERS
         cores = available() if switching.cores is None else switching.cores
         enough = instances * self.config.isolation.memory <= switching.memory
         if cores > 1 and enough:
@@ -141,11 +151,8 @@ class Study(Generic[C_co]):
     def switching_identity(self) -> dict[str, Any]:
         """Everything that the switch cost depends on, as plain data."""
         return {
-            "odometry": self.odometry.name,
-            "settings": self.odometry.settings.model_dump(mode="json"),
-            "content": odometry_content(
-                self.odometry.name, self.odometry.settings, self.odometry.module
-            ),
+            "odometry": self.odometry.identity,
+            "content": self.odometry.content,
             "sequences": {name: self._measured_on(name) for name in self.config.training},
             "mechanism": self.mechanism,
             "warm_up": self.warm_up._asdict(),
@@ -181,9 +188,13 @@ class Study(Generic[C_co]):
 
     def _resolved(self) -> dict[str, Any]:
         """The configuration with nothing left to defaults."""
-        resolved, settings = self.config.resolved(), self.odometry.settings
-        resolved["odometry"]["settings"] = settings.model_dump(mode="json")
-        resolved["odometry"]["parameters"] = self.odometry.space.dump()
+        resolved = self.config.resolved()
+        given = resolved["odometry"]
+        entries = given if isinstance(given, list) else [given]
+        for entry, config in zip(entries, self.config.odometries.values(), strict=True):
+            made = self._factory(config)
+            entry["settings"] = made.settings.model_dump(mode="json")
+            entry["parameters"] = made.space.dump()
         return resolved
 
 
@@ -210,4 +221,6 @@ def whole_definition(
     space: ParameterSpace | None, name: str, given: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Definition of a parameter: the study's values, and the odometry's own for the rest."""
-    return ({} if space is None else space.parameters[name].model_dump()) | dict(given)
+    own = {} if space is None else space.parameters[name].model_dump()
+    other = given.get("type", own.get("type")) != own.get("type")
+    return dict(given) if other else own | dict(given)

@@ -44,7 +44,7 @@ def failure(file, *overrides):
         ("odometry.settings=3", "odometry.settings: give keys with values, not 3"),
         ("odometry.name=3", "odometry.name: give text, not 3"),
         ("odometry={settings: {}}", "odometry.name: this key is missing"),
-        ("odometry=", "odometry: give keys with values, not nothing"),
+        ("odometry=", "odometry: give keys with values or a list, not nothing"),
         ("sequences=", "sequences: give keys with values, not nothing"),
         ("sequences.one=3", "sequences.one: give keys with values, not 3"),
         ("sequences.o@ne={bag: one.bag}", "sequences.o@ne: becomes the name of a file: give"),

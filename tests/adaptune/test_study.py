@@ -1,7 +1,10 @@
 import json
+import sys
 
 import pytest
+from needs import needs_evalio
 
+from adaptune.odometry.base import import_extra
 from adaptune.study.mistakes import RENAMED, ConfigurationError
 from offline.offline_study import load_study
 
@@ -13,14 +16,16 @@ def failure(file, *overrides):
 
 
 def test_switching_that_the_odometry_has_not(study_file):
+    needs_evalio()
     live = "online.switching.mechanism=live"
     assert load_study(study_file, [live]).mechanism == "live"
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     text = failure(study_file, *stiff, live)
-    assert "mad_icp cannot change its parameters between scans" in text
+    assert "mad_icp cannot change parameters between scans" in text
 
 
 def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
+    needs_evalio()
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for cores, own, mechanism in ((1, "live", "hand_over"), (2, "bank", "bank")):
         monkeypatch.setattr("adaptune.study.study.available", lambda cores=cores: cores)
@@ -29,6 +34,7 @@ def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
 
 
 def test_a_bank_has_a_budget(study_file, monkeypatch):
+    needs_evalio()
     monkeypatch.setattr("adaptune.study.study.available", lambda: 4)
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for given, mechanism in (
@@ -75,6 +81,8 @@ def test_reads_a_study(study_file, tmp_path):
     assert study.odometry({"keyframe_interval": 2.0}).odometry.parameters == {
         "max_correspondence_distance": 2.0,
         "keyframe_interval": 2.0,
+        "downsampling": 0.5,
+        "iterations": 20,
     }
 
 
@@ -332,3 +340,36 @@ def test_an_empty_section_can_be_overridden(study_file):
     file = study_file.with_name("empty.yaml")
     file.write_text(study_file.read_text() + "health:\n")
     assert load_study(file, ["health.max_speed=7"]).config.health.max_speed == 7
+
+
+def test_a_parameter_that_a_setting_fixes_is_not_tuned(study_file):
+    text = failure(study_file, "odometry.parameters.downsampling={baseline: 0.5}")
+    assert (
+        "odometry.parameters.downsampling: downsampling is fixed by settings; leave it out" in text
+    )
+
+
+@pytest.mark.parametrize("name", ["genz_icp", "rko_lio"])
+def test_an_odometry_that_is_not_installed_is_named(study_file, monkeypatch, name):
+    extra = "evalio" if name == "genz_icp" else name
+    for module in ("evalio", "evalio.pipelines", "rko_lio", "rko_lio.rko_lio_pybind"):
+        monkeypatch.setitem(sys.modules, module, None)
+    import_extra.cache_clear()
+    file = study_file.with_name("lacking.yaml")
+    text = study_file.read_text()
+    one = text[: text.index("sequences:")]
+    lines = f"odometry:\n  - name: gicp\n  - settings: {{deskew: false}}\n    name: {name}\n"
+    file.write_text(text.replace(one, lines))
+    told = failure(file)
+    import_extra.cache_clear()
+    assert told.startswith(f"{file}, line 4: odometry.1.name: {extra} cannot be imported (")
+    assert told.endswith(f"run `pip install 'adaptune[{extra}]'`")
+
+
+def test_an_odometry_whose_module_cannot_be_imported_is_named(study_file, monkeypatch):
+    monkeypatch.delitem(sys.modules, "adaptune.odometry.kiss_icp", raising=False)
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    stiff = ["odometry.name=kiss_icp", "odometry.parameters=", "odometry.settings={}"]
+    told = failure(study_file, *stiff)
+    assert "odometry.name: kiss_icp: cannot import adaptune.odometry.kiss_icp (import of " in told
+    assert "install it" in told
