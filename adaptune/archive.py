@@ -18,6 +18,8 @@ from adaptune.live.hop import Hops
 from adaptune.metrics import cap
 from adaptune.space import ParameterSet
 
+REGISTER_MS, PREPARE_MS = "register_ms", "prepare_ms"  # in `Trial.usage`
+
 
 class ArchiveError(AdaptuneError):
     """A file of the archive that is missing or damaged."""
@@ -32,7 +34,7 @@ class Frames:
     stamps : ndarray of shape (n,)
         Nanoseconds.
     T_ref_sensor : ndarray of shape (n, 4, 4)
-        Reference poses, NaN where there is none.
+        The reference, NaN where there is none.
     descriptors : ndarray of shape (n, n_features)
         float32.
     blocks : dict
@@ -40,7 +42,9 @@ class Frames:
     elevations : ndarray of shape (n,)
         float32 degrees, of each scan's lowest points, see `adaptune.descriptor.lowest_elevation`.
     hops : Hops
-        Direct registrations, one a second where they succeeded, see `adaptune.live.hop`.
+        Direct registrations, one a second at most, see `adaptune.live.hop`.
+    evidence_ms : float
+        Milliseconds of CPU time a scan that these took; NaN if not measured.
     """
 
     stamps: NDArray[np.int64]
@@ -49,6 +53,7 @@ class Frames:
     blocks: dict[str, int]
     elevations: NDArray[np.float32]
     hops: Hops = field(default_factory=lambda: Hops.of([]))
+    evidence_ms: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +65,7 @@ class Trial:
     parameters : dict
     T_odom_sensor : ndarray of shape (n, 4, 4)
     errors : ndarray of shape (n,)
-        Sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite where the track was
-        lost.
+        Sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite after a lost track.
     restarted : ndarray of shape (n,)
         Frames at which the odometry lost track and restarted at the reference.
     registered : ndarray of shape (n,)
@@ -73,7 +77,8 @@ class Trial:
     metrics : dict
         Of the whole trajectory by name, see `offline.objective`.
     usage : dict
-        CPU time and memory, which differ from run to run.
+        CPU time and memory, which differ from run to run: percent of a core, megabytes, and
+        milliseconds of CPU time a scan to register (`REGISTER_MS`) and prepare it (`PREPARE_MS`).
     repeats : tuple of dict
         If the trial was run several times, RTE and metrics of every run. Poses are then those of
         the first run, and errors the mean of the capped errors of all runs.
@@ -115,6 +120,11 @@ class Summary:
     others: dict[str, float] = field(default_factory=dict)  # other metrics by name
     repeats: Sequence[dict[str, float]] = ()  # see `Trial`
     unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
+
+    @property
+    def cost(self) -> float:
+        """Milliseconds of CPU time a scan, with preparation; NaN if unknown."""
+        return self.others.get(REGISTER_MS, np.nan) + self.others.get(PREPARE_MS, np.nan)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -175,16 +185,16 @@ class Archive:
     """The trials of a study, a file for each trial and sequence.
 
     Its folder holds ``<sequence>/frames.npz`` and ``<sequence>/<number>.npz``. The files are the
-    truth. The index of their summaries, ``index.jsonl``, only avoids opening all of them. A line
-    does not count if its file has changed or is gone. Trials without a line are read from their
-    files. All methods raise an ArchiveError where a file that they need is missing or damaged.
+    truth; the index of their summaries, ``index.jsonl``, only avoids opening them. A line does not
+    count if its file has changed or is gone; a trial without a line is read. All methods raise an
+    ArchiveError where a file that they need is missing or damaged.
 
     Parameters
     ----------
     folder
-        It may not exist yet.
+        Need not exist.
     note
-        Called before anything is written about a sequence, with its name.
+        Called with a sequence's name before anything is written about it.
     """
 
     def __init__(self, folder: Path, note: Callable[[str], None] = lambda _: None):
@@ -299,6 +309,7 @@ class Archive:
                 descriptors=compact(frames.descriptors),
                 blocks=_packed(frames.blocks),
                 elevations=frames.elevations.astype(np.float32),
+                evidence_ms=frames.evidence_ms,
                 **{f"hops_{name}": array for name, array in frames.hops._asdict().items()},
             )
 
@@ -314,6 +325,7 @@ class Archive:
                 dict(_unpacked(data["blocks"])),
                 data["elevations"],
                 Hops(*(data[f"hops_{name}"] for name in Hops._fields)),
+                float(data.get("evidence_ms", np.nan)),
             )
         except KeyError as error:
             raise ArchiveError(f"{path}: lacks {error}; run `adaptune offline`") from error
@@ -341,8 +353,7 @@ class Archive:
             return
         status, summary = path.stat(), summarise(trial)
         entry = _Entry(sequence, number, status.st_size, status.st_mtime_ns, summary)
-        index = self.folder / INDEX
-        with needing_room(index), index.open("a", encoding="utf-8") as file:
+        with needing_room(i := self.folder / INDEX), i.open("a", encoding="utf-8") as file:
             file.write(entry.dump())
         if self._finished is not None:
             self._finished.setdefault(sequence, {})[number] = summary
@@ -411,6 +422,10 @@ def _unpacked(array: NDArray[np.uint8]) -> Any:
     return json.loads(array.tobytes())
 
 
+def _damaged(path: Path, error: Exception) -> ArchiveError:
+    return ArchiveError(f"{path}: is damaged ({error}); remove it and run again")
+
+
 def _check_place(path: Path, data: Mapping[str, NDArray[Any]], place: list[Any]) -> None:
     """Refuse the file of another trial."""
     try:
@@ -419,19 +434,13 @@ def _check_place(path: Path, data: Mapping[str, NDArray[Any]], place: list[Any])
     except (KeyError, ValueError, TypeError) as error:
         raise _damaged(path, error) from error
     if found != place:
-        what = f"the whole run of trial {number}" if whole else f"trial {number}"
-        raise ArchiveError(
-            f"{path}: holds {what} on {sequence}, so it was copied over the trial of its name; "
-            f"remove it and run again"
-        )
-
-
-def _damaged(path: Path, error: Exception) -> ArchiveError:
-    return ArchiveError(f"{path}: is damaged ({error}); remove it and run again")
+        what = f"{'the whole run of ' if whole else ''}trial {number} on {sequence}"
+        why = "it was copied over the trial of its name; remove it and run again"
+        raise ArchiveError(f"{path}: holds {what}, so {why}")
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Arrays of a file: those named, or all."""
+    """The named arrays of a file, or all."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in names or file}

@@ -14,7 +14,9 @@ from adaptune.files import replacing
 # lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
 # grey, too.
 LINES: dict[str, dict[str, Any]] = {
-    "baseline": {"color": "#bbbbbb", "lw": 6.6},
+    "baseline": {"color": "#bbbbbb", "lw": 10.2},
+    "best_default": {"color": "#882255", "lw": 8.4},
+    "equal_cost": {"color": "#56c8a0", "lw": 6.6},
     "fixed": {"color": "#0072b2", "lw": 4.8},
     "paired": {"color": "#e69f00", "lw": 3.0},
     "untrained": {"color": "#7b3294", "lw": 1.2},
@@ -23,6 +25,8 @@ LINES: dict[str, dict[str, Any]] = {
 """Lines of the modes, the lowest first."""
 POINTS: dict[str, dict[str, Any]] = {
     "baseline": {"marker": "s", "color": "#999999"},
+    "best_default": {"marker": "v", "color": "#882255"},
+    "equal_cost": {"marker": "P", "color": "#56c8a0"},
     "fixed": {"marker": "*", "color": "#0072b2"},
     "one set": {"marker": "D", "color": "#d55e00"},
     "paired": {"marker": "o", "color": "#e69f00"},

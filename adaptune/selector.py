@@ -14,6 +14,7 @@ from adaptune.live.live_evidence import LiveEvidence
 from adaptune.model import RULES, BankRule, ErrorModel, make_rule
 from adaptune.model.bank_weights import (
     SMOOTHING,
+    among,
     measured_weights,
     smooth_weights,
     weighted_selection,
@@ -167,6 +168,8 @@ class Selector:
         selection = self._choose(feature)
         if self._rule.gated and self._is_foreign(self._scan):
             selection = self._without_training(selection)
+        if self.members and selection.weights is None:
+            selection = self._of_those_present(selection)
         if selection.weights is not None:
             selection = self._smoothed(selection)
         elif selection.trial != self._current:
@@ -213,11 +216,20 @@ class Selector:
         return self._weighted(selection, smooth_weights(weights)[-1])
 
     def _weighted(self, selection: Selection, weights: NDArray[np.float64]) -> Selection:
+        weights = among(weights, self._live.present())
         of_members = dict(zip(self.members, weights.tolist(), strict=True))
         weighted = weighted_selection(self._model.sets, of_members)
         return selection._replace(
             trial=weighted.trial, parameters=weighted.parameters, weights=weighted.weights
         )
+
+    def _of_those_present(self, selection: Selection) -> Selection:
+        """Replace a member that gives no poses by the first one that does."""
+        present = self._live.present()
+        if present[self.members.index(selection.trial)]:
+            return selection
+        trial = self.members[int(present.argmax())]
+        return selection._replace(trial=trial, parameters=self._model.sets[trial])
 
     def _without_training(self, selection: Selection) -> Selection:
         """What to do where the training says nothing."""

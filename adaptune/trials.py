@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from adaptune import yaml
-from adaptune.archive import Archive, Summary
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Summary
 from adaptune.errors import AdaptuneError
+from adaptune.parameter_sets import in_words
+from adaptune.pooled_space import ODOMETRY
 from adaptune.space import nearest
 from adaptune.trajectory import Trajectory, write_tum
 
@@ -34,6 +36,7 @@ _HEADINGS = {
     "ms_per_scan": "ms a scan",
     "cpu": "cpu [%]",
     "memory": "memory [MB]",
+    "cost": "cost [ms]",
 }
 """Columns as a table for reading names them."""
 _CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
@@ -48,23 +51,36 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
 
     It has number, parameters, mean error in percent (None before the trial is finished on all
     sequences), mean error on each sequence, then over all sequences how often it lost track, how
-    often its process ended and how often the health check would have found a fault, and its other
-    metrics (None if a sequence is too short for one).
+    often its process ended and how often the health check would have found a fault, its other
+    metrics (None if a sequence is too short for one), and its cost in milliseconds of CPU time a
+    scan (None if it was not measured; without the column if none was).
     """
     finished = {name: archive.finished(name) for name in names}
     # A dictionary keeps their order.
     known = {m: None for of in finished.values() for trial in of.values() for m in trial.metrics}
-    metrics = [metric for metric in known if metric != "rte"]
-    return [
-        _row(number, {name: finished[name].get(number) for name in names}, metrics)
+    metrics = [metric for metric in known if metric not in ("rte", REGISTER_MS, PREPARE_MS)]
+    sets = (trial.parameters for of in finished.values() for trial in of.values())
+    # Sets of several odometries have other parameters.
+    names_of_parameters = list(dict.fromkeys(name for parameters in sets for name in parameters))
+    found = [
+        _row(number, {n: finished[n].get(number) for n in names}, names_of_parameters, metrics)
         for number in sorted(set().union(*finished.values()))
     ]
+    if all(row["cost"] is None for row in found):
+        for row in found:
+            del row["cost"]
+    return found
 
 
-def _row(number: int, trials: Mapping[str, Summary | None], metrics: Sequence[str]) -> Row:
+def _row(
+    number: int,
+    trials: Mapping[str, Summary | None],
+    parameters: Sequence[str],
+    metrics: Sequence[str],
+) -> Row:
     there = [trial for trial in trials.values() if trial is not None]
     whole = len(there) == len(trials)
-    row: Row = {"trial": number, **there[0].parameters}
+    row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
     row["mean"] = float(np.mean([trial.mean_error for trial in there])) if whole else None
     row |= {name: trial and trial.mean_error for name, trial in trials.items()}
     row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
@@ -72,6 +88,8 @@ def _row(number: int, trials: Mapping[str, Summary | None], metrics: Sequence[st
     for metric in metrics:
         values = [t.metrics[metric] for t in there if metric in t.metrics]
         row[metric] = float(np.mean(values)) if len(values) == len(there) else None
+    cost = float(np.mean([t.cost for t in there]))
+    row["cost"] = None if np.isnan(cost) else cost
     return row
 
 
@@ -112,7 +130,19 @@ def select(
 def with_units(table: Sequence[Row], names: Sequence[str]) -> list[Row]:
     """Rows for reading: headings say what is measured on the sequences, and its unit."""
     headings = _HEADINGS | {name: f"RTE [%] {name}" for name in names}
+    if table and ODOMETRY in table[0]:
+        table = [_short(row) for row in table]
     return [{headings.get(key, key): value for key, value in row.items()} for row in table]
+
+
+def _short(row: Row) -> Row:
+    """The row with all parameters in a single column: those of several odometries are many."""
+    keys = list(row)
+    last = keys.index("mean")
+    parameters = {key: row[key] for key in keys[1:last] if row[key] is not None}
+    short = {"trial": row["trial"], ODOMETRY: parameters.pop(ODOMETRY)}
+    short["parameters"] = in_words(parameters)
+    return short | {key: row[key] for key in keys[last:]}
 
 
 def _column(table: Sequence[Row], name: str, option: str) -> str:

@@ -39,12 +39,13 @@ def online(
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
     loaded = load(study, override, folder)
     from adaptune.cores import pin
+    from adaptune.model import ErrorModel
     from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
     from online.run_replays import run_replays, run_untrained
 
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
-    unpin = pin(os.getpid())
+    unpin = pin(os.getpid(), alone=True)
     try:
         with progress() as show:
             if untrained:
@@ -53,9 +54,11 @@ def online(
                 made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
         unpin()
-    n = len(loaded.config.test) * len(ReplaySetup.of(loaded).modes)
     if untrained:
         n = len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
+    else:
+        modes = ReplaySetup.of(loaded).modes(ErrorModel.load(model or loaded.model_path))
+        n = len(loaded.config.test) * len(modes)
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)

@@ -200,5 +200,6 @@ def validate(
             console.print(report.table(title, found, caption))
     for verdict in verdicts:
         say(verdict)
-    say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
+    names = ("validation", "costs", "stretches")
+    say(f"Tables and pictures: {', '.join(f'{loaded.folder / name}.*' for name in names)}")
     say_next_online(loaded.config.test, study, override, folder)

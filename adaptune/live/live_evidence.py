@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert, rectify, rotation_angle
 from adaptune.live.hop import LENGTHS, Hop, HopCloud, register
 from adaptune.live.own_error import Link, OwnError, OwnErrors
-from adaptune.live.squares import HopErrors, LiveSquares, live_squares
+from adaptune.live.squares import SECONDS, HopErrors, LiveSquares, live_squares
 from adaptune.odometry.base import Motions
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
@@ -101,6 +101,7 @@ class LiveEvidence:
         self._last: tuple[int, Scan] | None = None
         self._T_odom_sensor = np.tile(np.eye(4), (1 + len(self.members), 1, 1))
         self._no_pose = np.zeros(1 + len(self.members), np.intp)
+        self._without = np.full(1 + len(self.members), -np.inf)
         self._metres = 0.0
         self._newest: _Anchor | None = None
         self._anchors: deque[_Anchor] = deque()
@@ -125,6 +126,7 @@ class LiveEvidence:
         )
         finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
         self._no_pose = self._no_pose + ~finite
+        self._without[~finite] = before * 1e-9
         # Without a pose, the health check lets the odometry go on; so does this.
         T[~finite] = T[0] if finite[0] else np.eye(4)
         # The first scan is where the odometry starts, whatever motion it was given.
@@ -241,7 +243,11 @@ class LiveEvidence:
         errors = found.errors()
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
+        measured = np.isfinite(errors).all(axis=1)
+        # Those that are back count as measured, not as lost.
+        self._hops = self._hops.filled(measured & np.isfinite(self._without))
         self._hops = self._hops.with_hop(errors, *ends)
+        self._without[measured] = -np.inf
         if np.isfinite(errors[0]).all():
             self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
         self._rejected = 0
@@ -265,6 +271,16 @@ class LiveEvidence:
         self._wrong = np.where(told, 0, self._wrong)
         self._no_pose = self._no_pose + told
         return frozenset(np.array(self.members, np.intp)[told[1:]].tolist())
+
+    def present(self) -> NDArray[np.bool_]:
+        """Which members may have weight, of shape (n_members,).
+
+        One that gave no pose for a scan gets weight again once a hop that begins after that scan
+        has measured it, or after `SECONDS` with poses. All may have some if none is present.
+        """
+        now = 0.0 if self._newest is None else self._newest.stamp * 1e-9
+        present = np.asarray(now - self._without[1:] > SECONDS)
+        return present if present.any() else ~present
 
     def squares(self) -> LiveSquares | None:
         """What the last hops say of the members, or of a single odometry; None without any."""

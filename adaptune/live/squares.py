@@ -36,6 +36,23 @@ class HopErrors(NamedTuple):
         )
         return added.recent(end, seconds)
 
+    def filled(self, members: NDArray[np.bool_]) -> "HopErrors":
+        """Let some members be as wrong as the worst one was, where they gave no pose.
+
+        So they are neither lost nor at an advantage over hops that say nothing of them.
+
+        Parameters
+        ----------
+        members
+            Of shape (n_members,).
+        """
+        lengths = np.linalg.norm(self.errors, axis=-1)
+        missing = np.isnan(lengths)
+        worst = np.where(missing, -1.0, lengths).argmax(axis=1)
+        of_worst = self.errors[np.arange(len(worst)), worst][:, None]
+        gaps = (missing & members)[..., None]
+        return self._replace(errors=np.where(gaps, of_worst, self.errors))
+
     def recent(self, metres: float, seconds: float) -> "HopErrors":
         """Those that count when so much was driven, at this time."""
         young = seconds - self.seconds <= SECONDS

@@ -3,9 +3,10 @@
 import numpy as np
 
 from adaptune.live.live_evidence import LiveEvidence
-from adaptune.model.bank_weights import measured_weights, weighted_selection
+from adaptune.model.bank_weights import among, measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
 from adaptune.parameter_sets import ParameterSets
+from adaptune.pooled_space import ODOMETRY, PooledSpace
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSpace
@@ -17,7 +18,8 @@ CANDIDATES = 16
 def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
     """The baseline, and sets around it that are far from each other.
 
-    The candidates are points of a scrambled Sobol sequence, moved half-way to the baseline: what
+    Of several odometries, the baselines of all come first, then sets of the first one. The
+    candidates are points of a scrambled Sobol sequence, moved half-way to the baseline: what
     the odometry's authors chose is the best guess there is. Each next set is the one that is
     farthest from those chosen before.
 
@@ -33,8 +35,12 @@ def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
     ParameterSets
         Numbered from 0, the baseline; fewer than `n` if the candidates have fewer values.
     """
-    chosen = [space.baseline]
-    if len(space):
+    chosen = space.baselines[:n]
+    if isinstance(space, PooledSpace):
+        first = next(iter(space.spaces.items()))
+        around = untrained_sets(first[1], n - len(chosen) + 1).parameters[1:]
+        chosen += [{ODOMETRY: first[0], **own} for own in around]
+    elif len(space):
         from scipy.stats import qmc  # slow to import
 
         sobol = qmc.Sobol(len(space), rng=np.random.default_rng(0))
@@ -88,6 +94,7 @@ class UntrainedSelector:
     def select(self) -> Selection:
         """Choose the weights to apply before the newest scan is registered."""
         weights = measured_weights(len(self.members), self._live.squares())
+        weights = among(weights, self._live.present())
         of_members = dict(zip(self.members, weights.tolist(), strict=True))
         return self._live.estimated(weighted_selection(self._sets, of_members))
 

@@ -10,8 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFlo
 from adaptune.live.squares import LiveSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.base import Rule, TrainingData, mean_errors
+from adaptune.model.costs import Spending
 from adaptune.model.evidence import Evidence, NearestFrames
 from adaptune.model.paired import ERROR_FLOOR
+from adaptune.odometry.agreement import share
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
 
@@ -245,6 +247,22 @@ def _untried(n_members: int) -> NDArray[np.float64]:
     return np.diag([1.0, *[DOUBT] * (n_members - 1)])
 
 
+def among(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Weights of the members that are present, adding up to 1; the others have none.
+
+    Parameters
+    ----------
+    weights
+        Of shape (n_members,).
+    present
+        Of the same shape.
+    """
+    if present.all():
+        return weights
+    shares = share(weights, present)
+    return np.asarray(shares / shares.sum())
+
+
 def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
 
@@ -328,6 +346,7 @@ def choose_members(
     sets: ParameterSets,
     fixed: int,
     size: int,
+    spending: Spending | None = None,
 ) -> list[int]:
     """Choose sets whose errors cancel each other.
 
@@ -349,6 +368,8 @@ def choose_members(
         Trial number of the fixed set.
     size
         How many to choose, if there are as many.
+    spending
+        What they may cost; anything when left out.
 
     Returns
     -------
@@ -367,9 +388,32 @@ def choose_members(
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
     chosen = [0]
     while len(chosen) < min(size, len(pool)):
-        rest = [j for j in range(len(pool)) if j not in chosen]
-        chosen.append(min(rest, key=lambda j: _root_mean_square(squares, [*chosen, j])))
+        next_one = _next_member(squares, pool, chosen, spending)
+        if next_one is None:
+            break
+        chosen.append(next_one)
     return [pool[j] for j in chosen]
+
+
+def _next_member(
+    squares: list[NDArray[np.float64]],
+    pool: Sequence[int],
+    chosen: Sequence[int],
+    spending: Spending | None,
+) -> int | None:
+    """The set that most lowers the error of those chosen, or most for its cost; None if none may.
+
+    It is a place in `pool`, as those in `chosen` are.
+    """
+    rest = [j for j in range(len(pool)) if j not in chosen]
+    members = [pool[j] for j in chosen]
+    if spending is not None:
+        rest = [j for j in rest if spending.allows([*members, pool[j]])]
+    lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
+    if spending is not None and spending.thrifty:
+        now = _root_mean_square(squares, list(chosen))
+        lowered = {j: (rms - now) / spending.price(members, pool[j]) for j, rms in lowered.items()}
+    return min(rest, key=lowered.__getitem__, default=None)
 
 
 def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:

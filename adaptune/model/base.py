@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.metrics import cap
+from adaptune.model.costs import Spending
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
 
@@ -31,7 +32,10 @@ class TrainingData:
     fixed : int
         Trial number of the fixed set.
     candidates : tuple of int, optional
-        Trial numbers of the sets to choose among, the fixed one included; all sets if None.
+        Trial numbers of the sets to choose among, the fixed one included; the rule finds them if
+        None.
+    allowed : tuple of int, optional
+        Trial numbers of the sets that a budget allows, the fixed one included; all sets if None.
     vectors : ndarray of shape (n_frames, n_candidates, 3), optional
         Errors of the candidates as vectors in the frame of the sub-trajectory's start; not finite
         where the track was lost. See `adaptune.metrics.sub_trajectory_vectors`.
@@ -44,6 +48,13 @@ class TrainingData:
     fixed: int
     candidates: tuple[int, ...] | None = None
     vectors: NDArray[np.float32] | None = None
+    allowed: tuple[int, ...] | None = None
+
+    def allows(self) -> NDArray[np.bool_]:
+        """Which sets may be chosen, of shape (n_sets,)."""
+        if self.allowed is None:
+            return np.ones(len(self.sets), np.bool_)
+        return np.isin(self.sets.trials, self.allowed)
 
     @property
     def fixed_errors(self) -> NDArray[np.float64]:
@@ -82,7 +93,7 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     return np.asarray(np.mean(means, axis=0))
 
 
-def complementary(data: TrainingData, size: int) -> list[int]:
+def complementary(data: TrainingData, size: int, spending: Spending | None = None) -> list[int]:
     """Choose sets so that at every training frame one of them does well.
 
     The search is greedy and begins with the fixed set. Each next set is the one that lowers the
@@ -94,21 +105,26 @@ def complementary(data: TrainingData, size: int) -> list[int]:
         A set that was not run on every sequence is not chosen.
     size
         Number of sets; fewer where another one would lower nothing.
+    spending
+        What a bank of them may cost; anything when left out.
 
     Returns
     -------
     list of int
         Trial numbers, the fixed set's first.
     """
-    everywhere = np.isfinite(mean_errors(data.errors, data.sequence))
+    everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
     capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
     chosen = [data.fixed]
     least = data.fixed_errors
     while len(chosen) < size:
         means = mean_errors(np.minimum(capped, least[:, None]), data.sequence)
+        now = means[data.sets.column(data.fixed)]
+        if spending is not None:
+            means = np.where([spending.allows([*chosen, t]) for t in data.sets], means, np.inf)
         best = int(np.argmin(means))
-        # A set that is chosen already, as the fixed one, lowers nothing.
-        if not means[best] < means[data.sets.column(data.fixed)]:
+        # A set that is chosen already lowers nothing.
+        if not means[best] < now:
             break
         chosen.append(data.sets.trials[best])
         least = np.minimum(least, capped[:, best])

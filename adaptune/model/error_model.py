@@ -14,6 +14,7 @@ from adaptune.archive import compact
 from adaptune.descriptor.base import DESCRIPTORS
 from adaptune.model.bank_weights import BankSettings
 from adaptune.model.base import TrainingData
+from adaptune.model.costs import Costs, Spending
 from adaptune.model.model_file import (
     DAMAGED,
     ModelError,
@@ -24,6 +25,7 @@ from adaptune.model.model_file import (
 from adaptune.model.paired import PairedSettings
 from adaptune.parameter_sets import ParameterSets
 from adaptune.plain_words import in_one_line
+from adaptune.pooled_space import load_space
 from adaptune.sequence.names import places, stretch_numbers
 from adaptune.space import ParameterSet, ParameterSpace, SpaceError
 
@@ -64,6 +66,9 @@ class _Header(BaseModel):
     provenance: dict[str, Any]
     expected: dict[str, dict[str, float]]
     validation: dict[str, Any]
+    budget: float | None = None
+    rivals: dict[str, int] = Field(default_factory=dict)
+    costs: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +119,12 @@ class ErrorModel:
         see `offline.expected_loss.Figures`; empty where too little is known to compare.
     validation : dict
         By selection rule what `adaptune validate` found, for people; empty before.
+    budget : float, optional
+        Milliseconds of CPU time a scan that may be spent, live evidence included.
+    rivals : dict
+        By name, trial numbers of what could be driven instead, see `offline.rivals`.
+    costs : Costs, optional
+        What the sets cost; None if it was not measured.
     """
 
     odometry: dict[str, Any]
@@ -135,6 +146,9 @@ class ErrorModel:
     bank_settings: BankSettings = field(default_factory=BankSettings)
     expected: dict[str, dict[str, float]] = field(default_factory=dict)
     validation: dict[str, Any] = field(default_factory=dict)
+    budget: float | None = None
+    rivals: dict[str, int] = field(default_factory=dict)
+    costs: Costs | None = None
 
     def __post_init__(self) -> None:
         if not len(self.stretch):
@@ -177,6 +191,7 @@ class ErrorModel:
             self.errors,
             self.sets,
             self.fixed,
+            allowed=self.allowed(),
         )
         if members is None:
             return data
@@ -187,6 +202,13 @@ class ErrorModel:
             )
         vectors = self.vectors[:, [self.bank.index(trial) for trial in members]]
         return replace(data, fixed=members[0], candidates=tuple(members), vectors=vectors)
+
+    def allowed(self) -> tuple[int, ...] | None:
+        """The sets that the budget allows one at a time, the fixed one included; None for all."""
+        if self.costs is None or self.budget is None:
+            return None
+        spending = Spending(self.costs, self.budget)
+        return tuple(t for t in self.sets if t == self.fixed or spending.allows([t]))
 
     def thinned(self, max_frames: int | None) -> Self:
         """Keep fewer frames, so that a selection costs less.
@@ -330,6 +352,7 @@ class ErrorModel:
             "paired": self.paired.model_dump(),
             "bank": self.bank,
             "bank_settings": self.bank_settings.model_dump(),
+            "budget": self.budget,
         }
 
     @property
@@ -343,6 +366,8 @@ class ErrorModel:
             "provenance": self.provenance,
             "expected": self.expected,
             "validation": self.validation,
+            "rivals": self.rivals,
+            "costs": None if self.costs is None else self.costs.dump(),
         }
         write_model_file(Path(path), self._header() | about, self._arrays())
 
@@ -359,7 +384,9 @@ class ErrorModel:
         try:
             content, arrays = read_model_file(path, _TYPES)
             header = dict(_Header.model_validate(content))
-            space = ParameterSpace.load(header.pop("space"))
+            space = load_space(header.pop("space"))
+            costs = header.pop("costs")
+            header["costs"] = None if costs is None else Costs.load(costs)
             sets = ParameterSets(space, tuple(header.pop("trials")), tuple(header.pop("sets")))
             arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
             for numbers in ("sequence", "stretch"):
@@ -394,8 +421,7 @@ class ErrorModel:
             raise ValueError("errors and parameter sets do not go together")
         if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):
             raise ValueError("the error vectors do not go together with the errors and the bank")
-        if set(self.bank) - set(self.sets) or len(set(self.bank)) != len(self.bank):
-            raise ValueError("the bank holds unknown sets, or one twice")
+        self._check_sets()
         if not 0 <= self.sequence.min() <= self.sequence.max() < len(self.sequences):
             raise ValueError("a frame is of no sequence")
         # Not a number is neither; both are true of most files, and make no copy of the errors.
@@ -403,5 +429,12 @@ class ErrorModel:
             raise ValueError("there are descriptors or errors that cannot be")
         if np.isnan(self.errors).all(axis=1).any():
             raise ValueError("a frame has no error at all")
+
+    def _check_sets(self) -> None:
+        """Refuse a bank or rivals that are no sets of the model, or sets of another space."""
+        if set(self.bank) - set(self.sets) or len(set(self.bank)) != len(self.bank):
+            raise ValueError("the bank holds unknown sets, or one twice")
+        if set(self.rivals.values()) - set(self.sets):
+            raise ValueError("a rival is no set of the model")
         for parameters in self.sets.parameters:
             self.sets.space.check(parameters)

@@ -205,12 +205,10 @@ class NearestNeighbours(Rule):
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Rule.predict`."""
         predicted = self.regressor_.predict_one(feature)
-        if self.data_.candidates is None:
-            return predicted
-        some = np.full_like(predicted, np.inf)
-        columns = self.data_.sets.columns(self.data_.candidates)
-        some[columns] = predicted[columns]
-        return some
+        some = self.data_.allows()
+        if self.data_.candidates is not None:
+            some &= np.isin(self.data_.sets.trials, self.data_.candidates)
+        return np.where(some, predicted, np.inf)
 
     def select(
         self,

@@ -103,7 +103,7 @@ class PairedExpectedRatio(Rule):
         if data.candidates is not None:
             return data.candidates
         if n_sets is None:
-            complete = np.isfinite(mean_errors(data.errors, data.sequence))
+            complete = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
             complete[data.sets.column(data.fixed)] = True
             return tuple(data.sets.trials[c] for c in np.flatnonzero(complete))
         return tuple(complementary(data, n_sets))

@@ -13,7 +13,9 @@ from adaptune import report
 from adaptune.metrics import cap
 from adaptune.model.base import mean_errors
 from adaptune.model.error_model import ErrorModel
-from adaptune.space import Categorical, Parameter, describe
+from adaptune.parameter_sets import in_words
+from adaptune.pooled_space import ODOMETRY
+from adaptune.space import Categorical, Parameter, ParameterSet, describe
 
 N_BEST = 5
 """Sets to show, besides the fixed one."""
@@ -44,6 +46,7 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         report.table("Parameters", _parameters(model)),
         report.table(f"The best sets of {n_sets}", _best(model), "Mean error over all sequences."),
         *_adapting(model),
+        *_spending(model),
         *_named("Where it comes from", model.provenance),
         *_validation(model),
     )
@@ -65,6 +68,25 @@ def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
     share = 100 * bank.min_fixed_share
     yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
     yield report.table(f"The bank's {len(model.bank)} members", _sets(model, model.bank))
+
+
+def _spending(model: ErrorModel) -> Iterator[RenderableType]:
+    """What a bank costs, what may be spent, and what could be driven instead."""
+    costs = model.costs
+    if costs is not None and model.bank and np.isfinite(cost := costs.adaptive(model.bank)):
+        yield Text(
+            f"The bank costs {cost:.1f} ms of CPU time a scan, {costs.evidence:.1f} ms of it for "
+            f"live evidence."
+        )
+    if model.budget is not None:
+        yield Text(f"Budget: {model.budget:g} ms of CPU time a scan.")
+    if model.rivals:
+        rows = [
+            {"rival": name} | row
+            for name, trial in model.rivals.items()
+            for row in _sets(model, [trial])
+        ]
+        yield report.table("Rivals", rows, "What could be driven without adapting.")
 
 
 def _named(title: str, data: Mapping[str, Any]) -> list[Table]:
@@ -135,13 +157,13 @@ def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
 
 
 def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
-    fixed = model.sets[model.fixed]
+    fixed = model.sets.space.flat(model.sets[model.fixed])
     return [
         {
             "parameter": name,
             "range": _range(parameter),
             "baseline": _words(parameter.baseline),
-            "fixed": _words(fixed[name]),
+            "fixed": _words(fixed.get(name, "-")),
         }
         for name, parameter in model.sets.space.parameters.items()
     ]
@@ -164,6 +186,15 @@ def _sets(model: ErrorModel, trials: Sequence[int]) -> list[dict[str, Any]]:
     return [
         {"set": f"{n}, fixed" if n == model.fixed else str(n)}
         | {"mean [%]": float(means[model.sets.column(n)])}
-        | {name: _words(value) for name, value in model.sets[n].items()}
+        | ({} if model.costs is None else {"cost [ms]": model.costs.alone(n)})
+        | _values(model.sets[n])
         for n in trials
     ]
+
+
+def _values(parameters: ParameterSet) -> dict[str, str]:
+    """Columns of a set; those of several odometries have too many for a column each."""
+    if ODOMETRY not in parameters:
+        return {name: _words(value) for name, value in parameters.items()}
+    own = {name: value for name, value in parameters.items() if name != ODOMETRY}
+    return {ODOMETRY: str(parameters[ODOMETRY]), "parameters": in_words(own)}

@@ -269,3 +269,27 @@ def test_a_selection_tells_what_was_measured(monkeypatch):
     told.error = OwnError(1.0, 0.5, 2.0)
     (one,) = selections(selector, scans[1:2], IN_A_BANK)
     assert (one.estimated_error, one.estimated_low, one.estimated_high) == (1.0, 0.5, 2.0)
+
+
+@pytest.mark.parametrize("settings", [BankSettings(), BankSettings(adapt=False)])
+def test_a_member_without_a_pose_gets_no_weight(settings):
+    selector = Selector(replace(of_two_caves(), bank_settings=settings), members=(3, 5))
+    scans, nothing = drive_cave("hdl32e", 3), np.full((4, 4), np.nan)
+    for member, other in ((3, 5), (5, 3)):
+        selector.reset()
+        (before,) = selections(selector, scans[:1], IN_A_BANK)
+        dying = IN_A_BANK._replace(members=IN_A_BANK.members | {member: nothing})
+        selections(selector, scans[1:2], dying)
+        (after,) = selections(selector, scans[2:3], IN_A_BANK)
+        assert sum(before.weights.values()) == pytest.approx(1.0)
+        assert after.weights == {member: 0.0, other: 1.0}
+        assert (after.trial, after.parameters) == (other, SETS[other])
+
+
+def test_a_member_without_a_pose_is_not_chosen():
+    selector, nothing = Selector(of_two_caves(), "paper", (3, 5)), np.full((4, 4), np.nan)
+    scans = drive_cave("hdl32e", 3)
+    dying = IN_A_BANK._replace(members={3: np.eye(4), 5: nothing})
+    chosen = selections(selector, scans[:1], IN_A_BANK) + selections(selector, scans[1:3], dying)
+    assert [one.trial for one in chosen] == [5, 3, 3]
+    assert chosen[-1].parameters == SETS[3]

@@ -63,6 +63,31 @@ def test_a_metric_that_not_all_have_is_not_told(archive):
     assert (row["rpe"], row["kitti"]) == (1.0, None)
 
 
+def test_sets_of_several_odometries_have_equal_columns(archive):
+    trial = archive.read("cave", 3)
+    other = {"odometry": "ndt", "resolution": 2.0}
+    archive.write("cave", 4, replace(trial, parameters=other))
+    table = rows(archive, ["cave"])
+    assert len({tuple(row) for row in table}) == 1
+    assert [row["resolution"] for row in table] == [None] * 4 + [2.0]
+    assert table[4]["kernel"] is None
+    assert [row["trial"] for row in select(table, ["odometry == ndt"])] == [4]
+    assert "ndt,2.0" in csv_text(table).splitlines()[-1]
+
+
+def test_the_cost_is_a_column_and_its_parts_are_none(archive):
+    trial = archive.read("cave", 3)
+    assert "cost" not in rows(archive, ["cave"])[0]
+    for name, register in (("cave", 2.0), ("street", 4.0)):
+        usage = {"register_ms": register, "prepare_ms": 5.0, "memory": 9.0}
+        archive.write(name, 4, replace(trial, usage=usage))
+    table = rows(archive, ["cave", "street"])
+    assert [row["cost"] for row in table] == [None] * 4 + [8.0]
+    assert not {"register_ms", "prepare_ms"} & set(table[4])
+    assert table[4]["memory"] == 9.0
+    assert "cost [ms]" in with_units(table, ["cave", "street"])[0]
+
+
 def test_columns_go_by_what_objectives_call_them_too():
     assert select(TABLE, ["rte < 1.5"], "rte") == select(TABLE, ["mean < 1.5"], "mean")
 

@@ -13,6 +13,7 @@ import optuna
 from optuna.storages.journal import JournalFileBackend
 
 from adaptune.archive import INDEX, Archive
+from adaptune.model import ErrorModel
 
 PAUSE = 0.5
 """Seconds; about what a driver takes to start, or to end after its last trial."""
@@ -24,10 +25,14 @@ def contents(folder: Path) -> dict[Path, object]:
     for path in sorted((folder / "trials").rglob("*.npz")):
         with np.load(path) as data:
             found[path.relative_to(folder)] = {
-                key: data[key].tobytes() for key in data if key not in ("seconds", "usage")
+                key: data[key].tobytes()
+                for key in data
+                if key not in ("seconds", "usage", "evidence_ms")
             }
-    for name in ("model.safetensors", "fixed.yaml"):
-        found[Path(name)] = (folder / name).read_bytes()
+    found[Path("fixed.yaml")] = (folder / "fixed.yaml").read_bytes()
+    # All of the model but what its sets cost.
+    model = ErrorModel.load(folder / "model.safetensors")
+    found[Path("model.safetensors")] = model.digest, model.provenance, model.expected
     return found
 
 

@@ -1,5 +1,6 @@
 """What tests need that is not in the repository."""
 
+import importlib.util
 import os
 
 import pytest
@@ -10,3 +11,9 @@ def lacking(name: str, reason: str) -> None:
     if name in os.environ.get("ADAPTUNE_REQUIRE", "").split(","):
         pytest.fail(f"ADAPTUNE_REQUIRE names {name}, but {reason}")
     pytest.skip(reason)
+
+
+def needs_evalio() -> None:
+    """Skip where evalio is not installed."""
+    if importlib.util.find_spec("evalio") is None:
+        lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")

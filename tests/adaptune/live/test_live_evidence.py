@@ -361,3 +361,59 @@ def test_what_a_hop_cannot_tell_counts_for_nothing(exactly):
     drive(live, 60, bank(1.0, 1.5))
     np.testing.assert_allclose(live.squares().products, 0.0, atol=1e-12)
     assert live.estimated(Selection(0, {})).restart == frozenset()
+
+
+def dying(dead, factors=(1.0, 1.001, 1.002)):
+    """Motions of a bank of which the last member has no pose over some scans."""
+
+    def motions(i):
+        found = bank(*factors)(i)
+        last = len(factors) - 1
+        return (
+            found
+            if i not in dead
+            else found._replace(members=found.members | {last: np.full((4, 4), np.nan)})
+        )
+
+    return motions
+
+
+def test_a_member_without_a_pose_has_no_weight_until_it_is_measured_again(exactly):  # noqa: ARG001
+    live, present, others = LiveEvidence((0, 1, 2)), {}, LiveEvidence((0, 1, 2))
+    motions, dead = bank(1.0, 1.001, 0.999), range(60, 75)
+    drive(others, 61, motions)
+    drive(live, 61, motions)
+    assert live.present().all()
+    for i in range(61, 121):
+        drive(live, 1, dying(dead, (1.0, 1.001, 0.999)), first=i)
+        drive(others, 1, motions, first=i)
+        present[i] = live.present().tolist()
+        if i == 80:
+            # What is known of the others is the same.
+            np.testing.assert_allclose(
+                live.squares().products[:2, :2], others.squares().products[:2, :2]
+            )
+    # A hop of ten metres that ends at scan 89 begins after the last scan without a pose.
+    gone = [i for i, of_members in present.items() if not of_members[2]]
+    assert gone == list(range(61, 90))
+    assert all(of_members[:2] == [True, True] for of_members in present.values())
+    squares = live.squares().products
+    assert squares[2, 2] < 0.2**2
+    assert measured_weights(3, live.squares())[2] > 0.0
+
+
+def test_a_member_that_nothing_measures_has_weight_again_after_a_while():
+    live = LiveEvidence((0, 1))
+    drive(live, 31, dying(range(20, 22), (0.0, 0.0)))
+    assert live.present().tolist() == [True, False]
+    drive(live, 291, bank(0.0, 0.0), first=31)
+    assert live.present().tolist() == [True, False]
+    drive(live, 10, bank(0.0, 0.0), first=322)
+    assert live.present().tolist() == [True, True]
+
+
+def test_where_nobody_has_a_pose_all_keep_their_weight():
+    live = LiveEvidence((0, 1))
+    nothing = np.full((4, 4), np.nan)
+    drive(live, 3, lambda _: Motions(nothing, {0: nothing, 1: nothing}))
+    assert live.present().all()

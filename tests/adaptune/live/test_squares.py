@@ -135,3 +135,15 @@ def test_measurements_without_error_and_with_nothing_but_noise_are_finite():
         assert np.isfinite(found).all()
         assert (found.diagonal() > 0.0).all()
     assert np.isfinite(blend(np.zeros((2, 2)), 3.0, LiveSquares(np.eye(2), 0.0, 1.0))).all()
+
+
+def test_where_a_member_had_no_pose_it_may_count_as_the_worst():
+    errors = np.zeros((2, 3, 3))
+    errors[:, 1, 0] = 2.0
+    errors[0, 2] = np.nan
+    found = hops(errors).filled(np.array([False, False, True]))
+    np.testing.assert_array_equal(found.errors[0, 2], [2.0, 0.0, 0.0])
+    np.testing.assert_array_equal(found.errors[1], errors[1])
+    # Others are not, and nobody is where there is nobody to compare with.
+    for known, who in ((errors, [True, True, False]), (np.full((1, 3, 3), np.nan), [True] * 3)):
+        np.testing.assert_array_equal(hops(known).filled(np.array(who)).errors, known)

@@ -8,6 +8,7 @@ from adaptune.live.live_evidence import LiveEvidence
 from adaptune.live.squares import LiveSquares
 from adaptune.live.untrained import CANDIDATES, UntrainedSelector, untrained_sets
 from adaptune.odometry.base import Motions
+from adaptune.pooled_space import ODOMETRY, PooledSpace
 from adaptune.sequence.scan import Scan
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 
@@ -81,3 +82,17 @@ def test_the_baseline_has_all_the_weight_until_others_are_confirmed(monkeypatch)
 def test_it_is_imported_fast():
     code = "import sys, adaptune.live.untrained; sys.exit('scipy.stats' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_of_several_odometries_all_baselines_are_in_the_bank():
+    other = ParameterSpace.of(voxel=Float(low=0.1, high=3.0, baseline=1.0))
+    space = PooledSpace({"first": SPACE, "second": other})
+    sets = untrained_sets(space)
+    assert sets.trials == (0, 1, 2, 3)
+    assert list(sets.parameters[:2]) == space.baselines
+    # What is left is filled up as if there was the first one alone.
+    alone = untrained_sets(SPACE, 3).parameters[1:]
+    assert sets.parameters[2:] == tuple({ODOMETRY: "first", **own} for own in alone)
+    for one in sets.parameters:
+        space.check(one)
+    assert list(untrained_sets(space, 1).parameters) == space.baselines[:1]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from model_files import assert_same, refused, rewrite, saved
 from random_models import random_model
-from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from adaptune.model import RULES, BankSettings, ErrorModel, ModelError, make_rule
-from adaptune.model.model_file import FORMAT, checksum
+from adaptune.model.model_file import FORMAT
 
 
 def test_knows_the_sensors_of_its_training():
@@ -63,45 +63,6 @@ def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
         assert len(own) == share
         gaps = np.diff([-own[0] - 1, *own, 2 * length - own[-1]])
         assert gaps.max() - gaps.min() <= 2
-
-
-def assert_same(a, b):
-    for field in dataclasses.fields(ErrorModel):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert x.dtype == y.dtype
-            np.testing.assert_array_equal(x, y)
-        elif field.name == "sets":
-            assert (x.space, x.trials) == (y.space, y.trials)
-            assert repr(x.parameters) == repr(y.parameters)
-        else:
-            assert repr(x) == repr(y)
-
-
-def saved(folder, **changes):
-    path = folder / "model.safetensors"
-    dataclasses.replace(random_model(), **changes).save(path)
-    return path
-
-
-def rewrite(path, arrays=None, text=None, **header):
-    """Change parts of a file as somebody could who knows the format."""
-    with safe_open(path, "np") as file:
-        said = json.loads(file.metadata()["adaptune"]) | (text or {})
-        parts = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    parts |= arrays or {}
-    said["header"] |= header
-    said["checksum"] = checksum(said["header"], parts)
-    parts = {name: np.ascontiguousarray(part) for name, part in parts.items()}
-    save_file(parts, path, {"adaptune": json.dumps(said)})
-
-
-def refused(path):
-    """The message, which must name the file."""
-    with pytest.raises(ModelError) as caught:
-        ErrorModel.load(path)
-    assert str(path) in str(caught.value)
-    return str(caught.value)
 
 
 def test_a_model_survives_bit_for_bit(tmp_path):

@@ -7,7 +7,9 @@ from typer.testing import CliRunner
 
 from adaptune.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
+from adaptune.model.costs import Costs, SetCost
 from adaptune.parameter_sets import ParameterSets
+from adaptune.pooled_space import ODOMETRY, PooledSpace
 from adaptune.space import Categorical, Float, ParameterSpace
 from offline.config import Limit, OfflineConfig
 
@@ -168,3 +170,40 @@ def test_a_bank_is_shown(model, tmp_path):
         assert ("The bank's 2 members" in text) == settings.adapt
         assert ("0, fixed 3.000 4 none 2 11.8 9 none" in text) == settings.adapt
         assert said in text
+
+
+def test_costs_rivals_and_a_budget_are_shown(model, tmp_path):
+    costs = Costs({0: SetCost(2.0, 3.0, 0), 1: SetCost(4.0, 3.0, 0)}, 0.5)
+    vectors = np.zeros((4, 2, 3), np.float32)
+    known = dataclasses.replace(
+        model, costs=costs, rivals={"equal_cost": 1}, budget=9.5, bank=[0, 1], vectors=vectors
+    )
+    text = shown(known, tmp_path)
+    assert "0, fixed 3.000 5.000 4 none" in text
+    assert "2 11.8 - 9 none" in text  # of unknown cost
+    assert "The bank costs 9.5 ms of CPU time a scan, 0.5 ms of it for live evidence." in text
+    assert "Budget: 9.5 ms of CPU time a scan." in text
+    assert "equal_cost 1 3.000 7.000 2 [huber]" in text
+    assert "cost [ms]" not in shown(model, tmp_path)
+
+
+def test_sets_of_several_odometries_are_shown(model, tmp_path):
+    other = ParameterSpace({"distance": Float(low=1.0, high=5.0, baseline=3.0)})
+    space = PooledSpace({"gicp": model.sets.space, "ndt": other})
+    sets = (
+        {ODOMETRY: "gicp", "distance": 4.0, "kernel": "none"},
+        {ODOMETRY: "ndt", "distance": 2.0},
+        {ODOMETRY: "gicp", "distance": 9.0, "kernel": "[huber]"},
+    )
+    pooled = dataclasses.replace(model, sets=ParameterSets(space, (0, 1, 2), sets))
+    text = shown(pooled, tmp_path)
+    for said in (
+        "odometry gicp, ndt gicp gicp",
+        "gicp.distance [1, 10] log 4 4",
+        "gicp.kernel none, [huber] none none",
+        "ndt.distance [1, 5] 3 -",
+        "0, fixed 3.000 gicp distance 4, kernel none",
+        "1 3.000 ndt distance 2",
+        "2 11.8 gicp distance 9, kernel [huber]",
+    ):
+        assert said in text, (said, text)

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from adaptune.model.bank_weights import choose_members
+from adaptune.model.base import TrainingData, complementary
+from adaptune.model.costs import Costs, SetCost, Spending
+from adaptune.parameter_sets import ParameterSets
+from adaptune.space import ParameterSpace
+
+COSTS = Costs(
+    {
+        0: SetCost(3.0, 5.0, 0),
+        4: SetCost(4.0, 5.0, 0),
+        7: SetCost(30.0, 0.0, 1),
+        9: SetCost(2.0, 9.0, 2),
+    },
+    evidence=2.5,
+)
+NONE = ParameterSpace({})
+
+
+def sets(n):
+    return ParameterSets(NONE, tuple(range(n)), tuple({} for _ in range(n)))
+
+
+def test_a_set_alone_has_no_live_evidence():
+    assert COSTS.alone(4) == 9.0
+    assert np.isnan(COSTS.alone(5))
+    assert 4 in COSTS
+    assert 5 not in COSTS
+
+
+def test_members_share_prepared_scans():
+    assert COSTS.adaptive([4]) == 11.5
+    assert COSTS.adaptive([0, 4]) == 14.5
+    assert COSTS.adaptive([0, 4, 7, 9]) == 55.5
+    assert np.isnan(COSTS.adaptive([0, 5]))
+
+
+def test_they_are_read_as_they_were_written():
+    assert Costs.load(COSTS.dump()) == COSTS
+    with pytest.raises(KeyError):
+        Costs.load({"sets": []})
+
+
+def test_a_budget_holds_for_all_together():
+    assert Spending(COSTS, 14.5).allows([0, 4])
+    assert not Spending(COSTS, 14.4).allows([0, 4])
+    assert not Spending(COSTS).allows([0, 5])  # of unknown cost
+    assert Spending(COSTS).price([0], 4) == 4.0
+    assert Spending(COSTS).price([0], 7) == 30.0
+
+
+def members(spending, size=3):
+    """Of four sets, the third cancels the first's error, and the second a half of it."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(0.0, 1.0, (50, 3)).astype(np.float32)
+    other = rng.normal(0.0, 1.0, (50, 3)).astype(np.float32)
+    vectors = {0: x, 1: -0.5 * x + other, 2: -x + 0.1 * other, 3: x + 0.2 * other}
+    errors = np.stack([np.linalg.norm(v, axis=1) for v in vectors.values()], axis=1)
+    return choose_members([vectors], [errors], sets(4), 0, size, spending)
+
+
+def costs(*register):
+    return Costs({i: SetCost(ms, 0.0, i) for i, ms in enumerate(register)}, 0.0)
+
+
+def test_members_stay_within_a_budget():
+    assert members(None)[:2] == [0, 2]
+    assert members(Spending(costs(1.0, 1.0, 9.0, 1.0), 5.0))[:2] == [0, 1]
+    assert members(Spending(costs(1.0, 9.0, 9.0, 9.0), 5.0)) == [0]
+
+
+def test_thrifty_members_gain_most_for_their_cost():
+    dear = costs(1.0, 0.1, 50.0, 40.0)
+    assert members(Spending(dear), 2) == [0, 2]
+    assert members(Spending(dear, thrifty=True), 2) == [0, 1]
+
+
+def test_complementary_sets_stay_within_a_budget():
+    errors = np.array([[2.0, 1.0, 1.2], [2.0, 3.0, 3.0]], np.float32)
+    data = TrainingData(np.empty((2, 0)), np.zeros(2, np.intp), errors, sets(3), 0)
+    assert complementary(data, 2) == [0, 1]
+    assert complementary(data, 2, Spending(costs(1.0, 9.0, 2.0), 4.0)) == [0, 2]
+    assert complementary(data, 2, Spending(costs(1.0, 9.0, 9.0), 4.0)) == [0]
