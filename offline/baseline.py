@@ -1,12 +1,15 @@
-"""Run the baseline before anything else: a setup in which it fails is stopped at once."""
+"""Run the baselines before anything else: a setup in which one fails is stopped at once."""
 
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.frame_check import contradiction
 from adaptune.odometry.isolation import MOST_FAULTS
+from adaptune.pooled_space import PooledSpace
+from adaptune.space import ParameterSet, ParameterSpace
 from offline.campaign import Progress, watched
 from offline.offline_study import OfflineStudy
 from offline.whole_runs import whole_run
@@ -27,32 +30,29 @@ def run_baseline(
 ) -> None:
     """Run the baseline from end to end on every training sequence, unless that was done before.
 
-    Nothing is stored before it has done well on all of them. Where the reference contradicts its
-    motion, a warning says what the reference looks like.
+    Of several odometries, the baseline of each. Nothing is stored before all have done well on all
+    sequences. Where the reference contradicts the motion of the first, a warning says what the
+    reference looks like.
 
     Raises
     ------
     BaselineError
-        If it fails on one of them.
+        If one fails on one of them.
     """
-    names, health = study.config.descriptor.names, study.config.health
-    tasks = [
-        Task(
-            name, (0,), (study.odometry.space.baseline,), True, not archive.has_frames(name, names)
-        )
-        for name in study.training
-        if whole_run(archive, name, 0, health) is None
-    ]
+    baselines = _by_label(study.odometry.name, study.odometry.space)
+    labels = list(baselines)
     done = []
-    for task, result in watched(workers, tasks, "baseline", progress):
-        check_baseline(study.odometry.name, task.sequence, result.trials[0])
+    for task, result in watched(workers, _tasks(study, archive, baselines), "baseline", progress):
+        check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
         done.append((task, result))
     for task, result in done:
         if result.frames is not None:
             archive.write_frames(task.sequence, result.frames)
-        archive.write(task.sequence, 0, result.trials[0], whole=True)
+    for task, result in done:
+        (number,), (run,) = task.numbers, result.trials
+        archive.write(task.sequence, number, run, whole=True)
         T_ref_sensor = archive.read_frames(task.sequence).T_ref_sensor
-        if what := contradiction(result.trials[0].T_odom_sensor, T_ref_sensor):
+        if number == 0 and (what := contradiction(run.T_odom_sensor, T_ref_sensor)):
             _log.warning(
                 "sequences.%s: the reference contradicts the odometry's motion nearly everywhere: "
                 "%s; check the file or topic (reference), the LiDAR's pose in its frame "
@@ -60,6 +60,27 @@ def run_baseline(
                 task.sequence,
                 what,
             )
+
+
+def _by_label(name: str, space: ParameterSpace) -> dict[str, ParameterSet]:
+    """The baselines by what the study calls their odometries, in the order of their trials."""
+    if isinstance(space, PooledSpace):
+        return dict(zip(space.spaces, space.baselines, strict=True))
+    return {name: space.baseline}
+
+
+def _tasks(
+    study: OfflineStudy, archive: Archive, baselines: Mapping[str, ParameterSet]
+) -> list[Task]:
+    """The whole runs that are lacking; the first of a sequence returns its frames, if they are."""
+    tasks: list[Task] = []
+    for name in study.training:
+        frames = not archive.has_frames(name, study.config.descriptor.names)
+        for number, parameters in enumerate(baselines.values()):
+            if whole_run(archive, name, number, study.config.health) is None:
+                tasks.append(Task(name, (number,), (parameters,), True, frames))
+                frames = False
+    return tasks
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:

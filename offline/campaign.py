@@ -53,7 +53,7 @@ class _Campaign:
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
-        self._stages = make_stages(self._config, study.odometry.space, self._names, archive)
+        self._stages = make_stages(study.config, study.odometry.space, self._names, archive)
         known = archive.sets()
         self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names

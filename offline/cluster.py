@@ -238,9 +238,8 @@ def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
     """The setup for workers, which may not have the recordings."""
     given = {f.name: getattr(setup.sequences, f.name) for f in dataclasses.fields(StudySequences)}
     given["folder"] = setup.sequences.folder.absolute()
-    sequences, odometry = AwaySequences(**given, digests=digests), setup.odometry
-    if odometry.program_input is not None:
-        odometry = dataclasses.replace(odometry, program_input=sequences.program_input)
+    sequences = AwaySequences(**given, digests=digests)
+    odometry = setup.odometry.reading(sequences.program_input)
     return TrialSetup(setup.settings, odometry, sequences)
 
 

@@ -12,7 +12,7 @@ from adaptune.strict import StrictModel
 from adaptune.study.config import StudyConfig
 from adaptune.study.mistakes import Mistake, validated
 from offline.samplers.check import check_class, check_sampler
-from offline.samplers.settings import NAMES, SETTINGS, SINGLE, SamplerError
+from offline.samplers.settings import FORGETFUL, NAMES, SETTINGS, SINGLE, SamplerError
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
@@ -79,6 +79,7 @@ class OfflineConfig(StrictModel):
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
     preset: Literal["paper"] | None = None
+    search: Literal["set", "bank"] | None = None
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:
@@ -113,6 +114,7 @@ class OfflineConfig(StrictModel):
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """Find mistakes in the sampler and its settings."""
+        yield from self._search_mistakes(space)
         key = ("sampler_settings",)
         if len(self.objective) > 1 and self.sampler in SINGLE:
             others = ", ".join(sorted(set(NAMES) - set(SINGLE)))
@@ -133,10 +135,32 @@ class OfflineConfig(StrictModel):
         below = check_sampler(self.sampler, self.sampler_settings, space, self.budgeted)
         yield from (mistake.below(key) for mistake in below)
 
+    def _search_mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
+        """Find samplers that cannot search among several odometries, or for a bank."""
+        n = 1 if space is None else len(space.baselines)
+        grid = "grid" in self.sampler_settings
+        if n > 1 and (self.sampler not in (*FORGETFUL, "sobol", "random") or grid):
+            message = "with several odometries, choose tpe, gp, sobol or random, without a grid"
+            yield Mistake(("sampler",), message)
+        if self.trials is not None and self.trials < n:
+            message = f"{n} odometries need {n} trials at least, to try the parameters of each"
+            yield Mistake(("trials",), message)
+        if self.search != "bank":
+            return
+        if self.sampler not in FORGETFUL:
+            yield Mistake(("search",), f"a search for a bank needs {' or '.join(FORGETFUL)}")
+        elif len(self.objective) > 1:
+            yield Mistake(("search",), "a search for a bank minimises one objective; give one")
+
+    def seeks_bank(self, space: ParameterSpace) -> bool:
+        """Whether the search is for sets that add to a bank."""
+        able = self.sampler in FORGETFUL and len(self.objective) == 1
+        return able and (self.search == "bank" or (not self.search and len(space.baselines) > 1))
+
 
 _LASTING = (
     *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
-    *("objective", "limits", "runs", "repeats", "augment", "pruning"),
+    *("objective", "limits", "runs", "repeats", "augment", "pruning", "search"),
 )
 """Settings that may not change when a study is resumed."""
 

@@ -9,6 +9,7 @@ import numpy as np
 from adaptune.model import ErrorModel
 from adaptune.study.config import SwitchingConfig
 from offline.labelled import LabelledData
+from offline.rivals import driven_cost, rivals
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose
 
 _log = logging.getLogger(__name__)
@@ -58,6 +59,8 @@ def fit(
         stretch=np.concatenate([s.stretch for s in sequences]),
         paired=DO_NOT_ADAPT,
         bank_settings=NO_BANK,
+        budget=data.budget,
+        costs=data.costs,
     )
 
 
@@ -77,6 +80,7 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
     bank = named_members(model, switching, complete) or switching.size
     chosen = choose(complete, bank, fixed=model.fixed)
     members = chosen.members or [model.fixed]
+    found = rivals(complete, driven_cost(complete, chosen, model.fixed))
     return replace(
         model,
         paired=chosen.one_set,
@@ -88,6 +92,7 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
             way: {key: float(value) for key, value in figures._asdict().items()}
             for way, figures in chosen.expected.items()
         },
+        rivals={name: trial for name, trial in found.items() if trial != model.fixed},
     )
 
 

@@ -1,6 +1,6 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -8,21 +8,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive, Frames, Summary
-from adaptune.descriptor import averaged
-from adaptune.metrics import cap, span
-from adaptune.model import ModelError, TrainingData
-from adaptune.model.bank_weights import POOL
+from adaptune.metrics import cap
+from adaptune.model import TrainingData
 from adaptune.model.base import mean_errors
+from adaptune.model.costs import Costs, Spending
 from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.names import origin, places, stretch_numbers
 from adaptune.study.driven import MIN_RECORDINGS
-from offline.bank_simulation import BankSimulation, error_vectors, motions_from_archive
-from offline.config import Metric, OfflineStudyConfig
-from offline.objective import choose_fixed, few, margin, mean_value, repeated, weighted
-from offline.search import owner
-from offline.stretches import Extent, cut, part_of, stretches_of_view
-from offline.whole_runs import mean_values, read_whole_runs, whole_errors, whole_values
+from offline.bank_simulation import BankSimulation
+from offline.objective import affordable, choose_fixed, margin, mean_value
+from offline.stretches import Extent, part_of
+from offline.whole_runs import mean_values
 
 if TYPE_CHECKING:
     from adaptune.descriptor.pca import ScaledPCA
@@ -129,11 +125,15 @@ class LabelledData(NamedTuple):
 
     sequences: Sequence[LabelledSequence]
     sets: ParameterSets  # the columns of their errors
+    costs: Costs | None = None  # of the sets, as far as they are known
+    # Milliseconds of CPU time a scan that may be spent, live evidence included.
+    budget: float | None = None
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
         """The same with some of the sets."""
         columns = self.sets.columns(trials)
-        return LabelledData([s.subset(columns) for s in self.sequences], self.sets.subset(trials))
+        few = [s.subset(columns) for s in self.sequences]
+        return self._replace(sequences=few, sets=self.sets.subset(trials))
 
     def complete(self) -> "LabelledData":
         """The same with the sets that were run on all sequences, on every frame."""
@@ -167,7 +167,7 @@ class LabelledData(NamedTuple):
                 continue
             if by_recording:
                 others = [s for s in self.sequences if s.recording != one.recording]
-                folds.append((one, LabelledData(others, self.sets)))
+                folds.append((one, self._replace(sequences=others)))
             else:
                 folds += [self._without(one, int(n)) for n in np.unique(one.stretch)]
         return [(one, others) for one, others in folds if others.sequences]
@@ -182,7 +182,7 @@ class LabelledData(NamedTuple):
             for s in self.sequences
         ]
         known = [s for s in others if len(s.errors)]
-        return one.left_out(number), LabelledData(known, self.sets)
+        return one.left_out(number), self._replace(sequences=known)
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch, of shape (n_frames,); views share their numbers."""
@@ -198,7 +198,7 @@ class LabelledData(NamedTuple):
         kept = np.isin(number, rng.choice(known, min(size, len(known)), replace=False))
         ends = np.cumsum([len(s.errors) for s in self.sequences])[:-1]
         parts = zip(self.sequences, np.split(kept, ends), strict=True)
-        return LabelledData([s.frames(of) for s, of in parts if of.any()], self.sets)
+        return self._replace(sequences=[s.frames(of) for s, of in parts if of.any()])
 
     def bounds(self) -> dict[int, float]:
         """The objective of every set in trials on these sequences, see `Verdict.bound`."""
@@ -220,12 +220,29 @@ class LabelledData(NamedTuple):
         return {n: value for n, value in values.items() if n in self.sets}
 
     def fixed(self) -> int:
-        """Trial number of the fixed set, see `offline.objective.choose_fixed`.
+        """Trial number of the fixed set: the best within the budget, see `best`."""
+        return self.best(self.within(np.inf if self.budget is None else self.budget))
+
+    def within(self, budget: float) -> list[int]:
+        """Trial numbers of the sets that alone cost no more milliseconds a scan; all if infinite.
+
+        Raises
+        ------
+        AdaptuneError
+            If there is none.
+        """
+        if self.costs is None or not np.isfinite(budget):
+            return list(self.sets)
+        return affordable(self.costs, list(self.sets), budget)
+
+    def best(self, trials: Collection[int]) -> int:
+        """Trial number of the best of some sets, see `offline.objective.choose_fixed`.
 
         Where no candidate but the baseline has whole runs on all these sequences, the trials alone
         decide.
         """
-        bounds, whole = self.bounds(), self.whole()
+        bounds = {n: bound for n, bound in self.bounds().items() if n in trials}
+        whole = {n: value for n, value in self.whole().items() if n in trials}
         if set(whole) - {0}:
             return choose_fixed(whole, bounds)
         return min(bounds, key=lambda n: bounds[n])
@@ -242,9 +259,17 @@ class LabelledData(NamedTuple):
             self.stretches(),
             np.concatenate([s.errors for s in self.sequences]),
             self.sets,
-            self.fixed(),
+            fixed := self.fixed(),
+            allowed=self.allowed(fixed),
         )
         return data, pca
+
+    def allowed(self, fixed: int) -> tuple[int, ...] | None:
+        """The sets that the budget allows one at a time, the fixed one included; None for all."""
+        if self.costs is None or self.budget is None:
+            return None
+        spending = Spending(self.costs, self.budget)
+        return tuple(t for t in self.sets if t == fixed or spending.allows([t]))
 
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
@@ -280,165 +305,3 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
     """
     _, first, number = np.unique(period, return_index=True, return_inverse=True)
     return first, number
-
-
-def labelled_data(
-    archive: Archive,
-    run: Mapping[str, Sequence[int]],
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-    window: int,
-    recorded_in: Callable[[str], str],
-) -> LabelledData:
-    """Read the labelled data set of a study.
-
-    Parameters
-    ----------
-    archive
-        The trials.
-    run
-        For each training sequence, the trials that count there.
-    sets
-        The sets to read about.
-    config
-        Of the study.
-    window
-        Number of descriptors that are averaged.
-    recorded_in
-        The recording of a sequence, by its name.
-
-    Raises
-    ------
-    ModelError
-        If a trial is missing.
-    """
-    for name, counted in run.items():
-        if missing := set(counted) - set(archive.finished(name)):
-            raise ModelError(
-                f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
-                f"fitted to; run `adaptune offline` again"
-            )
-    read = [_labelled(archive, name, set(run[name]), sets, config, window) for name in run]
-    number = np.repeat(np.arange(len(read)), [len(s.errors) for s, _, _ in read])
-    means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
-    # With a sequence left out, others than now may be among the best. To read the poses of
-    # thousands of trials would take long.
-    order = np.argsort(means, kind="stable")[: 2 * POOL]
-    eligible = {sets.trials[c] for c in order if np.isfinite(means[c])}
-    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
-    eligible |= {trial for trial in named if trial is not None}
-    slots = archive.slots()
-    owners = [owner(slots, trial) for trial in sets]
-    labelled = []
-    for sequence, frames, known in read:
-        name, length = sequence.name, config.sub_trajectory
-        vectors = {
-            trial: error_vectors(frames, archive.read(name, trial), length)[known]
-            for trial in eligible.intersection(sets).intersection(run[name])
-        }
-        own = [one is not None and origin(one) == origin(name) for one in owners]
-        found = replace(sequence, own=np.array(own, bool), vectors=vectors)
-        labelled.append(replace(found, recorded_in=recorded_in(name)))
-    return LabelledData(_with_cuts(_with_whole_runs(archive, labelled, sets, config)), sets)
-
-
-def _with_whole_runs(
-    archive: Archive,
-    labelled: Sequence[LabelledSequence],
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-) -> list[LabelledSequence]:
-    """Add what is known of the whole runs of the candidates for the fixed set."""
-    rivals = few(LabelledData(labelled, sets).bounds())
-    runs = read_whole_runs(archive, [s.name for s in labelled], rivals, config.health)
-    whole = whole_values(config.offline, runs)
-    # Whether the objective on some frames follows from the errors there.
-    by_frames = set(config.offline.objective[0]) == {"rte"}
-    found = []
-    for s in labelled:
-        of = whole[s.name]
-        if by_frames and s.extent is not None:
-            errors = whole_errors(archive, s.name, of, s.extent.frames)
-            found.append(replace(s, whole=of, whole_errors=errors, by_frames=True))
-        else:
-            found.append(replace(s, whole=of))
-    return found
-
-
-def _with_cuts(sequences: Sequence[LabelledSequence]) -> list[LabelledSequence]:
-    """Cut recordings into stretches, and views as their recordings are."""
-    cuts: dict[str, NDArray[np.intp]] = {}
-    extents: dict[str, Extent] = {}
-    for s in sequences:
-        if s.extent is not None and s.simulation is not None:
-            cuts[s.name] = cut(s.simulation.T_ref_sensor, s.extent)
-            extents[s.name] = s.extent
-    found = []
-    for s in sequences:
-        of = origin(s.name)
-        if of == s.name or of not in cuts:
-            # A view without its recording is cut by itself.
-            found.append(replace(s, cuts=cuts.get(s.name)))
-        else:
-            numbers = stretches_of_view(extents[s.name], extents[of], cuts[of])
-            found.append(replace(s, cuts=numbers))
-    return found
-
-
-def _labelled(
-    archive: Archive,
-    name: str,
-    run: Collection[int],
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-    window: int,
-) -> tuple[LabelledSequence, Frames, NDArray[np.bool_]]:
-    """A labelled sequence without error vectors, its frames, and which of them are labelled."""
-    frames = archive.read_frames(name)
-    errors = archive.read_errors(name, list(sets))
-    # Trials that were run for another budget do not count.
-    errors[:, [trial not in run for trial in sets]] = np.nan
-    # Whether there is a sub-trajectory depends on the reference alone.
-    known = np.asarray(~np.isnan(errors).all(axis=1))
-    period, objective = config.online.period, config.offline.objective[0]
-    described = averaged(frames.descriptors, frames.stamps, window, period)
-    periods_since = ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64)
-    summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
-    values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
-    simulation = BankSimulation(
-        frames.stamps,
-        frames.T_ref_sensor,
-        described,
-        periods_since,
-        config.sub_trajectory,
-        config.lost_track,
-        frames.hops,
-        motions_from_archive(archive, name, frames),
-    )
-    labelled = LabelledSequence(
-        name,
-        periods_since[known],
-        described[known],
-        errors[known],
-        blocks=frames.blocks,
-        baseline=archive.read(name, 0).errors[known],
-        values=np.array(values),
-        repeats=_repeats(summaries, objective),
-        block=span(frames.T_ref_sensor, config.sub_trajectory),
-        elevation=float(np.nanmedian(frames.elevations)),
-        simulation=simulation,
-        extent=Extent.of(frames.T_ref_sensor, known, config.sub_trajectory),
-    )
-    return labelled, frames, known
-
-
-def _repeats(
-    summaries: Sequence[Summary | None], objective: Mapping[Metric, float]
-) -> NDArray[np.float64] | None:
-    """The objective in every run of repeated trials, of shape (n_sets, n_repeats), or None."""
-    n_repeats = max((len(s.repeats) for s in summaries if s is not None), default=0)
-    if not n_repeats:
-        return None
-    missing = [np.nan] * n_repeats
-    rows = [missing if s is None else repeated(objective, s.repeats) for s in summaries]
-    return np.array(rows)

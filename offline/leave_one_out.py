@@ -5,8 +5,9 @@ errors that were recorded for the sets they choose are looked up, period by peri
 runs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,9 +19,17 @@ from adaptune.metrics import bootstrap, cap
 from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
 from adaptune.model.base import complementary
 from adaptune.model.paired import ERROR_FLOOR
-from adaptune.study.driven import MIN_RECORDINGS, ONE_SET, PER_STRETCH, expected_in_words
+from adaptune.study.driven import (
+    MIN_RECORDINGS,
+    ONE_SET,
+    PER_STRETCH,
+    RIVAL_WORDS,
+    RIVALS,
+    expected_in_words,
+)
 from offline.expected_loss import Figures, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
+from offline.rivals import driven_cost, rivals
 from offline.tuning import (
     MOST_FOLDS,
     Policy,
@@ -66,6 +75,8 @@ class LeftOut(NamedTuple):
     block: int = 1  # frames of a sub-trajectory
     stretch: NDArray[np.intp] | None = None  # (n,): of each frame; one stretch when left out
     recording: str = ""  # that it is a part of; it alone when left out
+    # For every mode the milliseconds of CPU time a scan that it costs, as far as they are known.
+    costs: Mapping[str, float] = MappingProxyType({})
 
     @property
     def stretches(self) -> NDArray[np.intp]:
@@ -91,7 +102,10 @@ def joined(parts: Sequence[LeftOut]) -> LeftOut:
     n_frames = [len(part.familiarity) for part in parts]
     return LeftOut(
         first.name,
-        {mode: np.concatenate([part.errors[mode] for part in parts]) for mode in first.errors},
+        {
+            mode: np.concatenate([part.errors[mode] for part in parts])
+            for mode in _of_all(part.errors for part in parts)
+        },
         {
             mode: float(np.average([part.adapted[mode] for part in parts], weights=n_frames))
             for mode in first.adapted
@@ -101,7 +115,20 @@ def joined(parts: Sequence[LeftOut]) -> LeftOut:
         first.block,
         np.concatenate([part.stretches for part in parts]),
         first.recording,
+        {
+            mode: float(np.average([part.costs[mode] for part in parts], weights=n_frames))
+            for mode in _of_all(part.costs for part in parts)
+        },
     )
+
+
+def _of_all(parts: Iterable[Mapping[str, object]]) -> list[str]:
+    """The modes that are known of every part, in the order of the first.
+
+    A rival may be unknown where something is left out, if its cost was measured elsewhere only.
+    """
+    every = list(parts)
+    return [mode for mode in every[0] if all(mode in one for one in every)]
 
 
 @dataclass
@@ -117,7 +144,7 @@ class Validation:
     recordings: list[str] = field(init=False)  # of each stretch
 
     def __post_init__(self) -> None:
-        modes = list(self.left_out[0].errors)
+        modes = _of_all(one.errors for one in self.left_out)
         means = {
             mode: np.array([s.errors[mode].mean() for s in self.left_out]) + ERROR_FLOOR
             for mode in modes
@@ -143,9 +170,13 @@ class Validation:
         """The first of them."""
         return (*self.modes, RULES[0])[0]
 
-    def figures(self, mode: str) -> Figures:
-        """What is expected of a mode elsewhere."""
-        return figures(self.logs[mode], self.recordings)
+    def figures(self, mode: str, other: str = "fixed") -> Figures:
+        """What is expected of a mode elsewhere, compared with another one."""
+        return figures(self.logs[mode] - self.logs[other], self.recordings)
+
+    def cost(self, mode: str) -> float:
+        """Mean cost of a mode in milliseconds of CPU time a scan; NaN if it is unknown."""
+        return float(np.mean([one.costs.get(mode, np.nan) for one in self.left_out]))
 
     def summary(self, mode: str) -> dict[str, float]:
         """Its figures, and the ratio of the mean errors."""
@@ -182,6 +213,17 @@ class Validation:
         if rule == PAIRED and self.bank:
             return f"{what}: {expected}, with {share:.0f} % of the weight on other sets than fixed."
         return f"{what}: {expected}, adapting {share:.0f} % of the time."
+
+    def against_rivals(self) -> list[str]:
+        """How `PAIRED` compares with its rivals, a sentence for each."""
+        return [
+            f"Compared with {RIVAL_WORDS[rival]}, `{PAIRED}` has {f.geometric:.2f} times its error "
+            f"(95 % interval {f.low:.2f}-{f.high:.2f}), at {self.cost(PAIRED):.1f} ms of CPU time "
+            f"a scan against {self.cost(rival):.1f}."
+            for rival in RIVALS
+            if rival in self.logs and PAIRED in self.logs
+            for f in [self.figures(PAIRED, rival)]
+        ]
 
 
 def leave_one_out(
@@ -292,6 +334,8 @@ def leave_out(
             errors[ONE_SET], adapted[ONE_SET] = instead
         driven = _simulate(sequence, others, data, pca, chosen) if chosen.bank.adapt else instead
         errors[PAIRED], adapted[PAIRED] = driven
+    costs, of_rivals = _rivals(others, chosen, data.fixed, adapted)
+    errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
     errors |= _oracles(capped, of_periods[period])
     few = data.sets.columns(complementary(data, MOST_SETS))
@@ -306,7 +350,22 @@ def leave_out(
         sequence.block,
         sequence.stretch,
         sequence.recording,
+        costs,
     )
+
+
+def _rivals(
+    others: LabelledData, chosen: Policy | None, fixed: int, adapted: Collection[str]
+) -> tuple[dict[str, float], dict[str, int]]:
+    """What the modes cost, as far as it is known, and the rivals' trials."""
+    if chosen is None or others.costs is None:
+        return {}, rivals(others, np.nan)
+    costs = others.costs
+    driven = driven_cost(others, chosen, fixed)
+    found = rivals(others, driven)
+    of = {"baseline": costs.alone(0), "fixed": costs.alone(fixed)}
+    of |= {PAIRED: driven} if PAIRED in adapted else {}
+    return of | {name: costs.alone(trial) for name, trial in found.items()}, found
 
 
 def _rules(one_set: PairedSettings) -> dict[str, Maker]:

@@ -26,6 +26,7 @@ from adaptune.archive import Frames, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
 from adaptune.metrics import absolute_error, kitti_error, relative_error
+from adaptune.model.costs import ROUNDING, Costs
 from adaptune.space import ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 
@@ -243,6 +244,31 @@ def few(bounds: Mapping[int, float]) -> list[int]:
     finite = [n for n, bound in bounds.items() if np.isfinite(bound)]
     best = sorted(finite, key=lambda n: bounds[n])[:CANDIDATES]
     return best if 0 in best or 0 not in bounds else [*best, 0]
+
+
+def affordable(costs: Costs, trials: Sequence[int], budget: float) -> list[int]:
+    """The trials whose sets alone cost no more milliseconds of CPU time a scan.
+
+    Raises
+    ------
+    AdaptuneError
+        If there is none.
+    """
+    if all(np.isnan(costs.alone(n)) for n in trials):
+        raise AdaptuneError(
+            "online.budget: the trials are of an older adaptune, which did not measure what they "
+            "cost; run `adaptune offline --again`"
+        )
+    few = [n for n in trials if costs.alone(n) <= budget + ROUNDING]
+    if not few:
+        cheapest = min(trials, key=lambda n: np.nan_to_num(costs.alone(n), nan=np.inf))
+        raise AdaptuneError(
+            f"online.budget: {budget:g} ms of CPU time a scan is less than the cheapest of "
+            f"{len(trials)} parameter sets takes, {costs.alone(cheapest):.1f} ms (trial "
+            f"{cheapest}); allow more, or add cheaper sets (a coarser downsampling, fewer "
+            f"iterations, another odometry)"
+        )
+    return few
 
 
 def choose_fixed(whole: Mapping[int, float], trials: Mapping[int, float]) -> int:

@@ -1,5 +1,6 @@
 """Pictures of the offline stage: Pareto fronts, and the sequences left out."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,12 +8,33 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.drawing import LINES, POINTS, as_png_and_svg, log_scale, picture
+from adaptune.drawing import LINES, OTHERS, POINTS, as_png_and_svg, log_scale, picture
+from offline.objective import pareto_front
 
 RATIO = "error over the fixed set's [-]"
 _FEWER = {"marker": "v", "color": "#cc79a7", "ls": "--"}
+_FAILS = 5.0
+"""Ratio to the fixed set's error above which a set is not drawn."""
 _SPREAD = 20.0
 """Largest over least value from which on an axis is logarithmic."""
+
+
+THRIFTY = "bank, thrifty"
+"""A bank whose next member gains most for its cost."""
+CANCELLING = "bank"
+
+
+class Point(NamedTuple):
+    """Something that could be driven."""
+
+    what: str  # an odometry's set, a bank, or a mode
+    name: str  # the trial's number, or the number of members
+    cost: float  # milliseconds of CPU time a scan
+    ratio: float  # geometric mean over the recordings of the ratio to the fixed set's error
+
+    def row(self) -> dict[str, Any]:
+        """The row of a table."""
+        return {"what": self.what, "name": self.name, "ms a scan": self.cost, "ratio": self.ratio}
 
 
 def draw_front(
@@ -137,3 +159,40 @@ def _draw_sizes(axes: Any, found: LeftOutResults) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f"number of {', or '.join(number)} [-]")
     axes.set_title("with more to choose from" + (" (95 % intervals)" if len(number) > 1 else ""))
+
+
+def draw_frontier(path: Path, title: str, points: Sequence[Point], budget: float | None) -> None:
+    """Draw error against cost of sets, banks and modes; `path` is that of the PNG."""
+    kinds = [p.what for p in points if p.what not in POINTS]
+    banks = [what for what in (CANCELLING, THRIFTY) if what in kinds]
+    sets = [p for p in points if p.what in set(kinds) - set(banks)]
+    with picture(as_png_and_svg(path), 8.0, 5.5) as figure:
+        axes = figure.subplots()
+        odometries = dict.fromkeys(p.what for p in sets)
+        looks = zip(odometries, itertools.cycle(OTHERS), itertools.cycle("os^vDPX"), strict=False)
+        for what, color, marker in looks:
+            mine = [(p.cost, p.ratio) for p in sets if p.what == what]
+            axes.plot(*zip(*mine, strict=True), marker, ms=5, color=color, alpha=0.8, label=what)
+        front = pareto_front(np.array([(p.cost, p.ratio) for p in sets]).reshape(-1, 2))
+        line = np.array([(sets[i].cost, sets[i].ratio) for i in front]).reshape(-1, 2).T
+        axes.plot(*line, drawstyle="steps-post", color="#999999", lw=1.0, label="front of the sets")
+        for what, style in zip(banks, ("-", "--"), strict=False):
+            of = [p for p in points if p.what == what]
+            costs, ratios = [p.cost for p in of], [p.ratio for p in of]
+            axes.plot(costs, ratios, f"k{style}", marker=".", lw=1.2, label=f"{what}: 2, 3, ...")
+        for point in points:
+            if point.what in POINTS:
+                # A star is mostly empty.
+                size = 18 if POINTS[point.what]["marker"] == "*" else 11
+                look: Any = {"ms": size, "mec": "white", "ls": ""} | POINTS[point.what]
+                axes.plot(point.cost, point.ratio, label=point.what, zorder=5, **look)
+        if budget is not None:
+            axes.axvline(budget, color="#d55e00", lw=1.0, ls=":", label="budget")
+        axes.axhline(1.0, color="#0072b2", lw=0.8)
+        axes.set(xlabel="CPU time a scan [ms]", ylabel=RATIO, title=f"{title}: error against cost")
+        # Sets that fail are not compared.
+        ratios = [p.ratio for p in points]
+        axes.set_ylim(0.9 * min(ratios), min(1.1 * max(ratios), _FAILS))
+        log_scale(axes, "x")
+        log_scale(axes)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")

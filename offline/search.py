@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import count, islice
+from itertools import count, islice, zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +10,12 @@ import numpy as np
 from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.budget import max_trials, spent
-from offline.config import OfflineConfig
+from offline.config import OfflineConfig, OfflineStudyConfig
 from offline.objective import Verdict, best_by_trials, judge, sampler_results, weighted
+from offline.portfolio import Portfolio
 from offline.pruning import estimate, survivors
 from offline.samplers import make_sampler
-from offline.samplers.base import Sampler
+from offline.samplers.base import Sampler, key
 
 Finished = Mapping[str, Mapping[int, Summary]]
 """By sequence, the finished trials by their numbers."""
@@ -50,6 +51,7 @@ class Search:
         finished: Finished,
         known: Mapping[int, ParameterSet],
         slot: int = 0,
+        portfolio: Portfolio | None = None,
     ):
         self.sequences = list(sequences)
         self.verdicts: list[Verdict] = []
@@ -62,6 +64,7 @@ class Search:
         self._limit = max_trials(config)
         self._finished = finished
         self._known, self._slot = known, slot
+        self._portfolio = portfolio
         self._alive: list[int] = []
         self._sets: dict[int, ParameterSet] = {}
 
@@ -100,7 +103,7 @@ class Search:
         if first and self._config.pruning != "none":
             self.order = self._hardest_first()
         if len(self._sets) < len(self.numbers):
-            proposed = self._sampler.propose(sampler_results(self.verdicts))
+            proposed = self._proposed()
             new = [s for s in proposed if s not in self._sets.values()]
             unknown = [n for n in self.numbers if n not in self._sets]
             self._sets |= zip(unknown, new, strict=False)
@@ -110,6 +113,21 @@ class Search:
             return False
         self._alive = list(self.numbers)
         return True
+
+    def _proposed(self) -> list[ParameterSet]:
+        """The next batch: sets that promise little error, and sets that promise to add to a bank.
+
+        The first points serve both.
+        """
+        results = sampler_results(self.verdicts)
+        if self._portfolio is None or len(results) < self._config.initial:
+            return self._sampler.propose(results)
+        worth = self._portfolio(self._closed)
+        valued = [one._replace(value=loss) for one, loss in zip(results, worth, strict=True)]
+        of_bank, alone = self._sampler.propose(valued), self._sampler.propose(results)
+        every = [s for pair in zip_longest(of_bank, alone) for s in pair if s is not None]
+        distinct = list({key(s): s for s in every}.values())
+        return distinct[: self._config.batch]
 
     def missing(self, m: int) -> dict[str, list[int]]:
         """Trials of the batch still to be run, for each of the first `m` sequences."""
@@ -206,13 +224,20 @@ class Stage(NamedTuple):
 
 
 def make_stages(
-    config: OfflineConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
+    study: OfflineStudyConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
 ) -> list[Stage]:
     """Make the searches of a study over some sequences, in their order."""
+    config, size = study.offline, study.online.switching.size
+
+    def portfolio(of: Sequence[str]) -> Portfolio | None:
+        seeks = config.seeks_bank(space)
+        return Portfolio(archive, of, study.sub_trajectory, size) if seeks else None
+
     finished, known = {name: archive.finished(name) for name in names}, archive.sets()
     stages = []
     if config.sets != "own":
-        shared = Search(partial(make_sampler, space, config), config, names, finished, known)
+        sampler = partial(make_sampler, space, config)
+        shared = Search(sampler, config, names, finished, known, portfolio=portfolio(names))
         stages.append(Stage([shared], alone=False))
     if config.sets != "shared":
         slots, own = archive.slots(names), []
@@ -220,7 +245,8 @@ def make_stages(
             seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
             seed = {"seed": int(seeds.generate_state(1)[0])}
             sampler = partial(make_sampler, space, config.model_copy(update=seed))
-            own.append(Search(sampler, config, [name], finished, known, slots[name]))
+            of = (slots[name], portfolio([name]))
+            own.append(Search(sampler, config, [name], finished, known, *of))
         stages.append(Stage(own, alone=True))
     return stages
 

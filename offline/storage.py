@@ -99,18 +99,19 @@ class Mirror(ABC):
     ) -> None:
         from optuna.trial import TrialState, create_trial
 
-        distributions = {n: distribution(p) for n, p in self._space.parameters.items()}
+        every = {n: distribution(p) for n, p in self._space.parameters.items()}
         known = self._known(mirror)
         for number in numbers:
             if number in known:
                 continue
             trial = row(number)
             finite = np.isfinite(trial.values).all()
+            parameters = self._space.flat(trial.parameters)
             mirror.add_trial(
                 create_trial(
                     state=TrialState.COMPLETE if finite else TrialState.FAIL,
-                    params=trial.parameters,
-                    distributions=distributions,
+                    params=parameters,
+                    distributions={name: every[name] for name in parameters},
                     values=trial.values if finite else None,
                     user_attrs={_NUMBER: number} | dict(trial.attributes),
                     constraints=dict(trial.constraints),
@@ -207,7 +208,7 @@ class DatabaseMirror(Mirror):
         """Refuse a database that holds another study of this name."""
         known = self._known(self._mirror)
         common = known.keys() & finished.keys()
-        if known and (not common or any(known[n] != finished[n] for n in common)):
+        if known and (not common or any(known[n] != self._space.flat(finished[n]) for n in common)):
             raise StorageError(
                 f"{self._where}: holds {len(known)} trials of another study named {self._name}; "
                 f"give this study a folder of another name (--folder), or remove that one with "

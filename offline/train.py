@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,14 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune import report, yaml
-from adaptune.archive import Archive
+from adaptune.archive import Archive, Summary
 from adaptune.cores import available
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
-from adaptune.parameter_sets import ParameterSets
+from adaptune.parameter_sets import ParameterSets, in_words
 from adaptune.sequence.config import NO_REFERENCE
 from adaptune.sequence.names import origin
+from adaptune.space import ParameterSpace
 from adaptune.study.inputs import InputNotes, digest, resume
 from adaptune.study.references import (
     ensure_references,
@@ -33,6 +34,7 @@ from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig
 from offline.objective import (
     Verdict,
+    affordable,
     best_by_trials,
     candidates,
     choose_fixed,
@@ -44,11 +46,15 @@ from offline.offline_study import OfflineStudy
 from offline.pictures import draw_front
 from offline.search import Finished
 from offline.trial import TrialSettings, TrialSetup
+from offline.trial_costs import measured_costs
 from offline.whole_runs import WholeRuns, mean_values, rivalry, run_whole, whole_values
 from offline.workers import Workers
 
 COARSE = 0.6
 """A reference whose error is more than this share of the best set's hardly tells sets apart."""
+
+COST = "cost [ms]"
+"""Column of CPU time a scan, preparation included."""
 
 _log = logging.getLogger(__name__)
 
@@ -74,7 +80,7 @@ class Training(NamedTuple):
             for mode in ("baseline", "fixed")
         )
         sets, n = self.model.sets, len(self.rows)
-        baseline = f"Parameters of the baseline: {_short(sets.space.baseline)}"
+        baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
         if self.fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
@@ -88,10 +94,17 @@ class Training(NamedTuple):
             *self.references,
             *self.doubts,
             f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
-            f"Parameters of the fixed set: {_short(sets[self.fixed])}",
+            f"Parameters of the fixed set: {in_words(sets[self.fixed])}{self._cost}",
             baseline,
             *([self.remark] if self.remark else []),
         ]
+
+    @property
+    def _cost(self) -> str:
+        """What the fixed set costs, if it is known."""
+        costs = self.model.costs
+        ms = np.nan if costs is None else costs.alone(self.fixed)
+        return f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
 
     @property
     def doubts(self) -> list[str]:
@@ -108,13 +121,6 @@ class Training(NamedTuple):
             f"{', '.join(coarse)}: it pulls ratios towards 1, and sets that differ by less cannot "
             f"be told apart. A longer sub_trajectory may help."
         ]
-
-
-def _short(parameters: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in parameters.items()
-    )
 
 
 def train(
@@ -158,18 +164,17 @@ def train(
     with _workers(study, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = run_batches(study, archive, workers, progress)
-        best = candidates(config, verdicts)
-        sets = {n: verdicts[n].parameters for n in sorted({0, *best})}
+        best = candidates(config, _affordable(study, archive, verdicts))
+        # Rivals may cost more.
+        rivals = {*candidates(config, verdicts), *_every_set(study, verdicts).defaults}
+        sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, verdicts, fixed)
     finished = _finished(study, archive, verdicts)
-    means = {
-        name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
-        for name, trials in finished.items()
-    }
+    means = {name: _means(trials, verdicts) for name, trials in finished.items()}
     write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
-    table = _trial_rows(config, verdicts, finished)
+    table = _trial_rows(config, study.odometry.space, verdicts, finished)
     report.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
@@ -177,6 +182,11 @@ def train(
     report.write_rows(study.folder, "training", rows)
     judged = estimates_beside_intervals(study, study.training)
     return Training(model, means, fixed, rows, remark, judged)
+
+
+def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:
+    """Mean errors of trials in percent, NaN of those that were not run."""
+    return [trials[n].mean_error if n in trials else np.nan for n in numbers]
 
 
 def _finished(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]) -> Finished:
@@ -199,6 +209,24 @@ def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
     ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
 
 
+def _every_set(study: OfflineStudy, verdicts: Mapping[int, Verdict]) -> ParameterSets:
+    parameters = tuple(verdict.parameters for verdict in verdicts.values())
+    return ParameterSets(study.odometry.space, tuple(verdicts), parameters)
+
+
+def _affordable(
+    study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]
+) -> dict[int, Verdict]:
+    """The trials whose sets stay within the budget, if there is one."""
+    budget = study.config.online.budget
+    if budget is None:
+        return dict(verdicts)
+    names = study.training
+    run = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in names}
+    costs = measured_costs(archive, run, _every_set(study, verdicts), study.odometry)
+    return {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
+
+
 def _fixed(
     config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeRuns
 ) -> tuple[int, str | None]:
@@ -215,7 +243,7 @@ def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    odometry = replace(study.odometry, user_code=True)
+    odometry = study.odometry.allowing(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = config.memory * 1e9
     return Cluster(setup, study.training, memory, cluster) if cluster else Workers(setup, n, memory)
@@ -266,10 +294,15 @@ def _evidence(
     settings = (config.sub_trajectory, config.lost_track, study.window, config.online.period)
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible]
-    about = [provenance, trials, settings, switching, feasible, fixed, list(study.training)]
+    budget = config.online.budget
+    about = [provenance, trials, settings, switching, budget, feasible, fixed, list(study.training)]
     found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
     for name in study.training:
-        found.update(archive.frames_path(name).read_bytes())
+        frames = archive.read_frames(name)
+        described = (frames.stamps, frames.T_ref_sensor, frames.descriptors, frames.elevations)
+        # Not the time that hops took, which differs from run to run.
+        for array in (*described, *frames.hops):
+            found.update(np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
 
 
@@ -283,14 +316,19 @@ def _fit(
     """Fit the error model to the trials of all sets that keep the limits."""
     # They import scikit-learn and compiled code.
     from offline.fit import fit, tuned
-    from offline.labelled import labelled_data
+    from offline.labelling import labelled_data
 
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
-    parameters = tuple(verdict.parameters for verdict in feasible.values())
-    sets = ParameterSets(study.odometry.space, tuple(feasible), parameters)
+    sets = _every_set(study, feasible)
     run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
     data = labelled_data(
-        archive, run, sets, study.config, study.window, study.sequences.recorded_in
+        archive,
+        run,
+        sets,
+        study.config,
+        study.window,
+        study.sequences.recorded_in,
+        study.odometry,
     )
     length = study.config.sub_trajectory
     model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
@@ -299,13 +337,17 @@ def _fit(
 
 
 def _trial_rows(
-    config: OfflineConfig, verdicts: Mapping[int, Verdict], finished: Finished
+    config: OfflineConfig,
+    space: ParameterSpace,
+    verdicts: Mapping[int, Verdict],
+    finished: Finished,
 ) -> dict[int, dict[str, Any]]:
     """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
     rows: dict[int, dict[str, Any]] = {}
     for n, verdict in verdicts.items():
         runs = [finished[name][n] for name in verdict.sequences]
-        row = rows[n] = {"trial": n, **verdict.parameters}
+        row = rows[n] = {"trial": n, **space.row(verdict.parameters)}
+        row[COST] = float(np.mean([run.cost for run in runs]))
         if config.metrics != {"rte"}:
             judged = zip(config.objective, verdict.values, strict=True)
             row |= {label(weights): value for weights, value in judged}
@@ -330,7 +372,7 @@ def _training_rows(
     whole: WholeRuns,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
-    rows, config = [], study.config.offline
+    rows, config, space = [], study.config.offline, study.odometry.space
     judged = estimates_of(study, finished)
     for name, runs in finished.items():
         stored = judged.get(origin(name))
@@ -349,7 +391,10 @@ def _training_rows(
                 "_reference": "given" if stored is None else "estimated",
                 "_reference_error": stored and stored.error(study.config.sub_trajectory),
             }
-            | {f"_own best {key}": value for key, value in verdicts[best].parameters.items()}
+            | {
+                f"_own best {key}": value
+                for key, value in space.row(verdicts[best].parameters).items()
+            }
         )
     return rows
 

@@ -2,30 +2,32 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import sequence
-from adaptune.archive import Frames, Trial
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames, Trial
 from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
 from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
 from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses, invert, steps
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
-from adaptune.odometry.base import OdometryInstance, prepared_bytes
-from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck, unhealthy
+from adaptune.odometry.pool import Factory
 from adaptune.sequence.recorded import RecordedSequence
 from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
-from offline.hops import measured_hops
+from offline.hops import with_measured_hops
 from offline.objective import trajectory_metrics
+from offline.prepared import SharedScan, SharedScans
 from offline.trial_run import DrivenRun, TrialRun
 
 Advance = Callable[[int, int], None]
@@ -67,14 +69,12 @@ class TrialSettings:
 class PreparedSequence:
     """A sequence that is read, prepared and described once, for all trials of a worker.
 
-    Prepared scans that exceed `memory` bytes are read again on every pass.
-
     Attributes
     ----------
     name : str
     frames : Frames
-    nbytes : int
-        Bytes that the prepared scans take.
+    shared : SharedScans
+        The prepared scans, which take `memory` bytes at most.
 
     Errors of its reference name it by `key`.
 
@@ -88,7 +88,7 @@ class PreparedSequence:
         self,
         name: str,
         scans: sequence.Sequence,
-        odometry: OdometryFactory,
+        odometry: Factory,
         settings: TrialSettings,
         memory: float,
         advance: Advance = lambda *_: None,
@@ -97,10 +97,9 @@ class PreparedSequence:
         key = key or f"sequences.{name}"
         self.name = name
         self._scans = scans
-        self._make = partial(odometry, isolated=settings.isolated)
+        self.shared = SharedScans(scans, memory)
+        self._baseline = partial(odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
-        self._kept: list[Any] = []
-        self.nbytes = 0
         reference = _reference(key, scans, settings)
         with _of_sequence(name):
             describe = Describer(settings.descriptors)
@@ -111,13 +110,8 @@ class PreparedSequence:
             with _of_sequence(name):
                 descriptors.append(describe(scan))
             elevations.append(lowest_elevation(scan))
-            if full:
-                continue
-            prepared = self._prepare(scan)
-            full = self.nbytes + prepared_bytes(prepared) > memory
             if not full:
-                self._kept.append(prepared)
-                self.nbytes += prepared_bytes(prepared)
+                full = self._prepare(len(stamps) - 1, scan)
         if not enough:
             raise AdaptuneError(
                 f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points; check "
@@ -134,26 +128,29 @@ class PreparedSequence:
 
     def measured_frames(self, advance: Advance = lambda *_: None) -> Frames:
         """The frames with the hops between them, for which the scans are read again."""
-        return replace(self.frames, hops=measured_hops(self._scans, self.frames, advance))
+        return with_measured_hops(self._scans, self.frames, advance)
 
-    def __iter__(self) -> Iterator[Any]:
-        yield from self._kept
-        if len(self._kept) < len(self.frames.stamps):
-            for i, scan in enumerate(self._scans):
-                if i >= len(self._kept):
-                    yield self._prepare(scan)
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the prepared scans take."""
+        return self.shared.nbytes
 
-    def _prepare(self, scan: sequence.Scan) -> Any:
+    def __iter__(self) -> Iterator[SharedScan]:
+        yield from islice(self.shared, len(self.frames.stamps))
+
+    def _prepare(self, i: int, scan: sequence.Scan) -> bool:
+        """Prepare a scan for the baseline; whether there is no room for another."""
         try:
             if self._odometry is None:
-                self._odometry = self._make()
-            return self._odometry.prepare(scan)
+                self._odometry = self._baseline()
+            self.shared.prepared(i, lambda: scan, self._odometry)
         except Exception as error:
             raise AdaptuneError(
                 f"sequences.{self.name}: the odometry fails with its own parameters, the baseline, "
                 f"when it is to prepare a scan: {in_a_line(error)}; mend the odometry "
                 f"(odometry in the study), and run the same command again"
             ) from error
+        return self.shared.n_kept(self._odometry) <= i
 
 
 def _watched(scans: Iterable[Any], n: int, advance: Advance) -> Iterator[Any]:
@@ -259,7 +256,7 @@ def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
 
 def run_trials(
     settings: TrialSettings,
-    odometry: OdometryFactory,
+    odometry: Factory,
     scans: PreparedSequence,
     sets: Sequence[ParameterSet],
     whole: bool = False,
@@ -287,20 +284,24 @@ def run_trials(
     # For every set every repeat, and for every repeat every piece.
     runs = [[repeat(s) for _ in range(settings.repeats)] for s in sets]
     each = [run for of_set in runs for of_repeat in of_set for run in of_repeat]
-    for i, prepared in enumerate(_watched(scans, len(frames.stamps), advance)):
+    for i, scan in enumerate(_watched(scans, len(frames.stamps), advance)):
         for run in each:
             if run.begin <= i < run.end:
-                run.step(i, prepared)
+                run.step(i, scan)
     return [
-        _mean(s, [_trial(settings, s, frames, pieces) for pieces in of_set])
+        _mean(s, [_trial(settings, s, scans, pieces) for pieces in of_set])
         for s, of_set in zip(sets, runs, strict=True)
     ]
 
 
 def _trial(
-    settings: TrialSettings, parameters: ParameterSet, frames: Frames, pieces: Sequence[TrialRun]
+    settings: TrialSettings,
+    parameters: ParameterSet,
+    scans: PreparedSequence,
+    pieces: Sequence[TrialRun],
 ) -> Trial:
     """Make one trial of pieces: each frame belongs to the last piece that begins before it."""
+    frames = scans.frames
     n = len(frames.stamps)
     T_odom_sensor = np.empty((n, 4, 4))
     errors, seconds = np.empty(n), np.empty(n)
@@ -338,7 +339,7 @@ def _trial(
         seconds,
         tuple(fault for run in pieces for fault in run.faults),
         trajectory_metrics(frames, T_odom_sensor, lost_steps),
-        _usage(cpu, (frames.stamps[-1] - frames.stamps[0]) * 1e-9, pieces),
+        _usage(cpu, scans, pieces),
         unhealthy=dict(driven.unhealthy)
         if driven
         else unhealthy(settings.health, T_steps, frames.stamps, registered),
@@ -346,9 +347,14 @@ def _trial(
     )
 
 
-def _usage(cpu: float, duration: float, pieces: Sequence[TrialRun]) -> dict[str, float]:
-    """Percent of a core, and megabytes where the odometry has a process of its own."""
-    usage = {"cpu": 100.0 * cpu / duration}
+def _usage(cpu: float, scans: PreparedSequence, pieces: Sequence[TrialRun]) -> dict[str, float]:
+    """What a trial used, see `Trial`."""
+    stamps = scans.frames.stamps
+    usage = {
+        "cpu": 100.0 * cpu / ((stamps[-1] - stamps[0]) * 1e-9),
+        REGISTER_MS: 1e3 * cpu / len(stamps),
+        PREPARE_MS: pieces[0].prepare_ms(scans.shared),
+    }
     memory = [run.usage.memory for run in pieces]
     if known := [megabytes for megabytes in memory if megabytes is not None]:
         usage["memory"] = max(known)
@@ -380,7 +386,7 @@ class TrialSetup:
     """Everything that a process needs to run trials."""
 
     settings: TrialSettings
-    odometry: OdometryFactory
+    odometry: Factory
     sequences: StudySequences
 
     def prepare(

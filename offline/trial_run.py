@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from adaptune.geometry import Poses, invert, steps
 from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import Tracker
+from offline.prepared import SharedScan, SharedScans
 
 
 class TrialRun:
@@ -53,11 +53,15 @@ class TrialRun:
         """What the odometry used."""
         return Usage(0.0, None) if self._odometry is None else self._odometry.usage
 
-    def step(self, i: int, prepared: Any) -> None:
+    def prepare_ms(self, scans: SharedScans) -> float:
+        """Mean CPU time that it took to prepare a scan."""
+        return 0.0 if self._odometry is None else scans.milliseconds(self._odometry)
+
+    def step(self, i: int, scan: SharedScan) -> None:
         """Register the scan of frame `i`."""
         if not self._failure:
             try:
-                self._step(i, prepared)
+                self._step(i, scan)
             except Exception as error:
                 self._failure = (in_a_line(error),)
         if self._failure:
@@ -67,15 +71,17 @@ class TrialRun:
         self._odometry = self._make()
         return self._odometry
 
-    def _step(self, i: int, prepared: Any) -> None:
+    def _step(self, i: int, scan: SharedScan) -> None:
         if i == self.begin:
             T = self._T_ref_sensor[i]
             T = np.eye(4) if np.isnan(T[0, 0]) else T
-            self._started().start(prepared, T)
+            odometry = self._started()
+            odometry.start(scan.by(odometry), T)
             self.T_odom_sensor[i] = T
             return
+        assert self._odometry is not None
         odometry = self._odometry
-        assert odometry is not None
+        prepared = scan.by(odometry)
         begin = time.perf_counter()
         T, self.registered[i] = odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
@@ -121,13 +127,14 @@ class DrivenRun(TrialRun):
         self.unhealthy = Counter[str]()
         self._stamps, self._health = frames.stamps.tolist(), health
 
-    def _step(self, i: int, prepared: Any) -> None:
+    def _step(self, i: int, scan: SharedScan) -> None:
         if i == 0:
             self._tracker = Tracker(self._started(), self._health)
-        scan = self._tracker.register_prepared(self._stamps[i], prepared)
-        self.T_odom_sensor[i], self.registered[i] = scan.T_odom_sensor, scan.registered
-        self.seconds[i] = scan.register_seconds if i else 0.0
-        self.unhealthy.update([scan.unhealthy] if scan.unhealthy else [])
+        prepared = scan.by(self._tracker.odometry)
+        found = self._tracker.register_prepared(self._stamps[i], prepared)
+        self.T_odom_sensor[i], self.registered[i] = found.T_odom_sensor, found.registered
+        self.seconds[i] = found.register_seconds if i else 0.0
+        self.unhealthy.update([found.unhealthy] if found.unhealthy else [])
 
     def _step_without_pose(self, i: int) -> None:
         super()._step_without_pose(i)

@@ -22,6 +22,8 @@ from adaptune.model.bank_weights import (
     smooth_weights,
 )
 from adaptune.model.base import complementary, mean_errors
+from adaptune.model.costs import Spending
+from adaptune.study.config import MOST_MEMBERS
 from adaptune.study.driven import BANK, ONE_SET, RELIES_ON_LIVE
 from offline.expected_loss import Figures, expected_loss, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
@@ -59,8 +61,8 @@ ROUNDING = 1e-6
 DO_NOT_ADAPT = PairedSettings(adapt=False)
 NO_BANK = BankSettings(adapt=False)
 
-Chooser = Callable[[LabelledData, int, int], list[int]]
-"""Chooses a bank's members on sequences, for a fixed set, so many."""
+Chooser = Callable[[LabelledData, int, int, Spending | None], list[int]]
+"""Chooses a bank's members on sequences, for a fixed set, so many, for what they may cost."""
 
 
 class Policy(NamedTuple):
@@ -104,7 +106,8 @@ def choose(
     if most is not None and len(folds) > most:
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
     fixed = data.fixed() if fixed is None else fixed
-    choosers = _choosers(bank) if _has_motions(data) else {}
+    choosers = _choosers(bank, data) if _has_motions(data) else {}
+    one_set = one_set and _may_measure(data, fixed)
     banks = {way: make(data, fixed) for way, make in choosers.items()}
     banks = {way: members for way, members in banks.items() if len(members) > 1}
     members = next(iter(banks.values()), [])
@@ -174,7 +177,16 @@ def _has_motions(data: LabelledData) -> bool:
     return all(s.simulation is not None for s in data.sequences)
 
 
-def _choosers(bank: int | Sequence[int]) -> dict[str, Callable[[LabelledData, int], list[int]]]:
+def _may_measure(data: LabelledData, fixed: int) -> bool:
+    """Whether the budget allows live evidence beside the fixed set."""
+    if data.costs is None or data.budget is None:
+        return True
+    return Spending(data.costs, data.budget).allows([fixed])
+
+
+def _choosers(
+    bank: int | Sequence[int], data: LabelledData
+) -> dict[str, Callable[[LabelledData, int], list[int]]]:
     """By name, the ways to choose a bank's members."""
     if not isinstance(bank, int):
         named = list(bank)
@@ -182,10 +194,22 @@ def _choosers(bank: int | Sequence[int]) -> dict[str, Callable[[LabelledData, in
     if bank < 2:
         return {}
 
-    def of_size(way: Chooser) -> Callable[[LabelledData, int], list[int]]:
-        return lambda data, fixed: way(data, fixed, bank)
+    def of_size(
+        way: Chooser, size: int = bank, spending: Spending | None = None
+    ) -> Callable[[LabelledData, int], list[int]]:
+        return lambda data, fixed: way(data, fixed, size, spending)
 
-    return {name: of_size(way) for name, way in WAYS.items()}
+    if data.costs is None or data.budget is None:
+        return {name: of_size(way) for name, way in WAYS.items()}
+    # A budget may be spent on more members, on dearer ones, or on those that gain most for it.
+    spending = Spending(data.costs, data.budget)
+    thrifty = spending._replace(thrifty=True)
+    ways = {
+        f"{name}, {n}": of_size(way, n, spending)
+        for name, way in WAYS.items()
+        for n in dict.fromkeys((bank, MOST_MEMBERS))
+    }
+    return ways | {"thrifty": of_size(cancelling_members, MOST_MEMBERS, thrifty)}
 
 
 def _logs(
@@ -263,7 +287,9 @@ def _paired_errors(
         yield capped[np.arange(len(capped)), chosen[period]]
 
 
-def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
+def cancelling_members(
+    data: LabelledData, fixed: int, size: int, spending: Spending | None = None
+) -> list[int]:
     """Choose a bank's members, the fixed set first, whose errors cancel: see `choose_members`."""
     vectors, errors = [], []
     for s in data.sequences:
@@ -271,10 +297,12 @@ def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
             frames = s.stretch == number
             vectors.append({trial: of_trial[frames] for trial, of_trial in s.vectors.items()})
             errors.append(s.errors[frames])
-    return choose_members(vectors, errors, data.sets, fixed, size)
+    return choose_members(vectors, errors, data.sets, fixed, size, spending)
 
 
-def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int]:
+def complementary_members(
+    data: LabelledData, fixed: int, size: int, spending: Spending | None = None
+) -> list[int]:
     """Choose a bank's members, the fixed set first, one of which does well at every frame.
 
     They are sought among the best sets, see `complementary`. Where another one would lower nothing,
@@ -289,8 +317,13 @@ def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int
     few = data.sets.subset([fixed, *pool])
     columns = data.sets.columns(few.trials)
     features = np.empty((len(errors), 0))
-    chosen = complementary(TrainingData(features, number, errors[:, columns], few, fixed), size)
-    return [*chosen, *(trial for trial in pool if trial not in chosen)][:size]
+    of_few = TrainingData(features, number, errors[:, columns], few, fixed)
+    chosen = complementary(of_few, size, spending)
+    for trial in pool:
+        fits = spending is None or spending.allows([*chosen, trial])
+        if len(chosen) < size and trial not in chosen and fits:
+            chosen.append(trial)
+    return chosen
 
 
 WAYS: dict[str, Chooser] = {

@@ -16,7 +16,9 @@ from adaptune.study.driven import Driven, driven
 from adaptune.study.inputs import check_model
 from adaptune.study.references import estimates_beside_intervals
 from offline.curves import bank_curve, learning_curve
-from offline.labelled import LabelledData, labelled_data
+from offline.frontier import frontier
+from offline.labelled import LabelledData
+from offline.labelling import labelled_data
 from offline.leave_one_out import (
     PAIRED,
     Interval,
@@ -25,7 +27,8 @@ from offline.leave_one_out import (
     leave_one_out,
 )
 from offline.offline_study import OfflineStudy
-from offline.pictures import LeftOutResults, draw_validation
+from offline.pictures import LeftOutResults, draw_frontier, draw_validation
+from offline.tuning import BANK_SETTINGS
 from offline.whole_runs import rivalry
 
 _log = logging.getLogger(__name__)
@@ -54,8 +57,8 @@ def validate(
     Parameters
     ----------
     study
-        A study that the offline stage has finished. Its folder receives ``validation`` (CSV, JSON
-        and pictures) and ``stretches`` (CSV, JSON), and its model the summary.
+        A study that the offline stage has finished. Its folder receives ``validation`` and
+        ``costs`` (CSV, JSON and pictures) and ``stretches`` (CSV, JSON), and its model the summary.
     curve
         Compute, too, what fewer training stretches would gain (``learning``).
     sizes
@@ -79,7 +82,7 @@ def validate(
         validation = leave_one_out(data, None, partial(progress, "parts left out"), bank)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online.words}") from error
-    rows = _rows(validation)
+    rows = _rows(validation, _rate(data))
     report.write_rows(study.folder, "validation", rows)
     report.write_rows(study.folder, "stretches", _stretch_rows(validation))
     learning = banks = []
@@ -90,11 +93,29 @@ def validate(
         banks = bank_curve(data, partial(progress, "sizes of banks"))
         report.write_rows(study.folder, "banks", banks)
     _draw(study, validation, learning, banks)
+    _write_frontier(study, model, data, validation, progress)
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
     said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
     said += estimates_beside_intervals(study, study.training)
     return Validated(validation, rows, learning, banks, said)
+
+
+def _write_frontier(
+    study: OfflineStudy,
+    model: ErrorModel,
+    data: LabelledData,
+    validation: Validation,
+    progress: Callable[[str, int, int], None],
+) -> None:
+    """Write and draw error against cost, where costs are known."""
+    settings = None
+    if validation.bank:
+        settings = model.bank_settings if model.bank_adapts else BANK_SETTINGS[0]
+    points = frontier(data, validation, settings, partial(progress, "banks of other sizes"))
+    if points:
+        report.write_rows(study.folder, "costs", [point.row() for point in points])
+        draw_frontier(study.folder / "costs.png", study.name, points, study.config.online.budget)
 
 
 def _draw(
@@ -134,7 +155,7 @@ def _verdicts(study: OfflineStudy, online: Driven, validation: Validation) -> li
     """What `adaptune online` will drive, then the estimate for it, then for what else it drives."""
     said = [online.words]
     if "paired" in study.rules:
-        said.append(validation.verdict(PAIRED))
+        said += [validation.verdict(PAIRED), *validation.against_rivals()]
     said.append(baseline_in_words(validation))
     if "paper" not in study.rules:
         return said
@@ -162,7 +183,13 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     run = {name: list(sets) for name in model.sequences}
     archive = Archive(study.folder / "trials")
     data = labelled_data(
-        archive, run, sets, study.config, study.window, study.sequences.recorded_in
+        archive,
+        run,
+        sets,
+        study.config,
+        study.window,
+        study.sequences.recorded_in,
+        study.odometry,
     )
     if not set(data.whole()) - {0} and model.fixed != 0:
         _log.warning(
@@ -186,8 +213,23 @@ def _checked_model(study: OfflineStudy) -> ErrorModel:
     return model
 
 
-def _rows(validation: Validation) -> list[dict[str, Any]]:
-    """Ratios to the fixed set's error, and the intervals of the default rule's."""
+def _rate(data: LabelledData) -> float:
+    """Scans a second."""
+    stamps = [s.simulation.stamps for s in data.sequences if s.simulation is not None]
+    seconds = sum(float(of[-1] - of[0]) * 1e-9 for of in stamps)
+    return sum(map(len, stamps)) / seconds if seconds else np.nan
+
+
+def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
+    """Ratios to the fixed set's error, intervals of the default rule's, and costs.
+
+    Parameters
+    ----------
+    validation
+        What was left out.
+    rate
+        Scans a second, by which costs become cores.
+    """
     default = validation.default
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
@@ -203,6 +245,11 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
     for i, sequence in enumerate(validation.left_out):
         of = {mode: float(validation.ratios[mode][i]) for mode in modes}
         add(sequence.name, sequence.errors["fixed"].mean(), of, sequence.interval(default))
+    costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
+    if np.isfinite(list(costs.values())).any():
+        add("ms a scan", costs["fixed"], costs, None)
+        cores = {mode: 1e-3 * rate * cost for mode, cost in costs.items()}
+        add("cores", cores["fixed"], cores, None)
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         ends = summaries[default]["low"], summaries[default]["high"]

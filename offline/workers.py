@@ -18,7 +18,6 @@ from adaptune.archive import Frames, Trial
 from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.hosting import verdict
-from adaptune.odometry.registry import is_user_class
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
@@ -202,8 +201,8 @@ class Sequences:
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = self._apart = setup
-        if setup.odometry.user_code and is_user_class(setup.odometry.name):
-            self._apart = replace(setup, odometry=replace(setup.odometry, user_code=False))
+        if setup.odometry.user_code and setup.odometry.has_user_class:
+            self._apart = replace(setup, odometry=setup.odometry.allowing(user_code=False))
         self._memory = memory
         self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 

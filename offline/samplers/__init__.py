@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from adaptune.pooled_space import PooledSpace
 from adaptune.space import ParameterSpace
 from offline.samplers.settings import is_user_sampler
 
@@ -16,6 +17,10 @@ def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
     from offline.samplers.hosted import HostedSampler
     from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
 
+    if isinstance(space, PooledSpace):
+        from offline.samplers.pooled import PooledSampler
+
+        return PooledSampler(space, config, make_sampler)
     own: dict[str, type[Sampler]] = {
         "grid": GridSampler,
         "random": RandomSampler,

@@ -13,7 +13,12 @@ from offline.objective import SamplerResult
 from offline.samplers.annealing import AnnealingSampler
 from offline.samplers.base import Sampler, Tried, key
 from offline.samplers.points import sobol_points
-from offline.samplers.settings import AnnealingSettings, SamplerError, optuna_sampler
+from offline.samplers.settings import (
+    FORGETFUL,
+    AnnealingSettings,
+    SamplerError,
+    optuna_sampler,
+)
 from offline.storage import distribution
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -25,8 +30,6 @@ CONSTRAINED = (
     optuna.samplers.NSGAIIISampler,
 )
 """Samplers that take constraints."""
-FORGETFUL = ("tpe", "gp")
-"""Samplers that keep no notes: they continue from any list of trials."""
 _ATTEMPTS = 32
 _ROUNDED = 1e-6
 """By how much a proposal may exceed its range."""

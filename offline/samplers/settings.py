@@ -24,6 +24,8 @@ OPTUNA = {
 NAMES = ("annealing", "grid", "random", "sobol", *OPTUNA)
 SINGLE = ("annealing", "cmaes")
 """Samplers that minimise one objective only."""
+FORGETFUL = ("tpe", "gp")
+"""Samplers that keep no notes: they continue from any list of trials."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
 SERVICE = hosting.Service("offline.samplers.hosted")

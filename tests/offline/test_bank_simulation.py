@@ -205,6 +205,7 @@ class Recorded(Odometry):
     live = clean = False
 
     def __init__(self, parameters, trials):
+        super().__init__(parameters)
         self.steps = steps(trials[int(parameters["number"])].T_odom_sensor)
 
     def prepare(self, scan):

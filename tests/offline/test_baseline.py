@@ -5,13 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from needs import needs_evalio
 
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
 from offline import baseline
-from offline.baseline import BaselineError, check_baseline
+from offline.baseline import BaselineError, check_baseline, run_baseline
 from offline.offline_study import load_study
 from offline.train import train
+from offline.trial import TrialSettings, TrialSetup
+from offline.workers import Workers
 
 FEW = ["offline.trials=3", "offline.initial=3", "offline.workers=1"]
 
@@ -118,3 +121,50 @@ def test_the_baseline_wins_where_trials_flatter(study_file, tmp_path):
         assert (
             row["baseline, whole run"] == row["fixed, whole run"] == pytest.approx(row["baseline"])
         )
+
+
+def study_of_two(study_file, folder, second):
+    """The study with a stumbling odometry and another."""
+    return load_study(study_file, [f"odometry=[{{name: 'stumbling:Stumbling'}}, {second}]"], folder)
+
+
+def run_baselines(study):
+    """Run the baselines, and return the archive."""
+    archive = Archive(study.folder / "trials")
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    with Workers(setup, 1, 1e9) as workers:
+        run_baseline(study, archive, workers, lambda *_: None)
+    return archive
+
+
+def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkeypatch):
+    second = "{name: 'stumbling:Apart', label: apart, settings: {step: 0.31}}"
+    study = study_of_two(study_file, tmp_path / "study", second)
+    archive = run_baselines(study)
+    for name in ("one", "two"):
+        for number, parameters in enumerate(study.odometry.space.baselines):
+            assert archive.read(name, number, whole=True).parameters == parameters
+        assert len(archive.read_frames(name).stamps) == 40
+    # One that is lacking is run alone.
+    monkeypatch.setattr(baseline, "check_baseline", lambda *told: ran.append(told[:2]))
+    ran = []
+    archive.trial_path("two", 1, whole=True).unlink()
+    run_baselines(study)
+    assert ran == [("apart", "two")]
+
+
+def test_any_odometry_that_fails_stops_the_campaign(study_file, tmp_path):
+    second = "{name: 'stumbling:Apart', label: lame, settings: {fault: register}}"
+    study = study_of_two(study_file, tmp_path / "study", second)
+    with pytest.raises(BaselineError, match=r"sequences\.(one|two): lame fails .*no licence"):
+        train(study)
+    assert not list(study.folder.rglob("*.npz"))
+
+
+def test_an_odometry_that_refuses_the_clouds_stops_the_campaign(study_file, tmp_path):
+    needs_evalio()
+    study = study_of_two(study_file, tmp_path / "study", "loam")
+    told = r"sequences\.(one|two): loam fails .*which laser measured each point.*a `ring` field"
+    with pytest.raises(BaselineError, match=told):
+        train(study)
+    assert not list(study.folder.rglob("*.npz"))

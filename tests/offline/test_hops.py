@@ -3,7 +3,7 @@ import pytest
 from rooms import scan_at, street
 
 from adaptune.archive import Frames
-from offline.hops import measured_hops
+from offline.hops import with_measured_hops
 
 STEP = 1.0
 WORLD = street()
@@ -27,7 +27,8 @@ def scans(of):
 
 def test_hops_are_those_of_the_sensor():
     of, told = frames(42), []
-    hops = measured_hops(scans(of), of, lambda done, n: told.append((done, n)))
+    measured = with_measured_hops(scans(of), of, lambda done, n: told.append((done, n)))
+    hops = measured.hops
     # Once a second, from the newest scan whose motion is known.
     assert hops.end.tolist() == [9, 19, 29, 39]
     assert hops.start.tolist() == [4, 9, 19, 29]
@@ -35,12 +36,13 @@ def test_hops_are_those_of_the_sensor():
     np.testing.assert_allclose(hops.T_start_end[:, 1:3, 3], 0.0, atol=0.03)
     assert told[0] == (1, 42)
     assert told[-1] == (42, 42)
+    assert measured.evidence_ms > 0.0
 
 
 def test_where_the_reference_is_unknown_nothing_is_measured():
     of = frames(32)
     of.T_ref_sensor[11] = np.nan
-    hops = measured_hops(scans(of), of)
+    hops = with_measured_hops(scans(of), of).hops
     assert hops.end.tolist() == [9, 19, 29]
     # None leads over it.
     assert hops.start[1] > 11
@@ -50,6 +52,6 @@ def test_where_the_reference_is_unknown_nothing_is_measured():
 @pytest.mark.parametrize("n", [1, 4])
 def test_a_short_sequence_has_none(n):
     of = frames(n)
-    hops = measured_hops(scans(of), of)
+    hops = with_measured_hops(scans(of), of).hops
     assert len(hops.end) == 0
     assert hops.T_start_end.shape == (0, 4, 4)

@@ -184,13 +184,13 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     validation, rows, learning, banks, verdicts = validate(study, curve=True, sizes=True)
     assert verdicts[0] == driven(study, ErrorModel.load(study.model_path)).words
     assert all(np.isnan(one.familiarity).all() for one in validation.left_out)
-    ends = ["geometric", "arithmetic", "worst tenth", "worst"]
+    ends = ["ms a scan", "cores", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
     assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
     # Four sub-trajectories tell nothing; a dozen would.
     assert rows[0]["paired, 95 %"] is None
     summary = validation.summary("paired")
-    assert rows[2]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert rows[3]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert [row["stretches"] for row in learning] == [1]
     n_sets = len(ErrorModel.load(study.model_path).sets)

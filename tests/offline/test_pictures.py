@@ -4,7 +4,15 @@ from pictures import is_white, share_of, texts
 
 from adaptune.drawing import LINES, POINTS
 from offline.objective import label
-from offline.pictures import LeftOutResults, draw_front, draw_validation
+from offline.pictures import (
+    CANCELLING,
+    THRIFTY,
+    LeftOutResults,
+    Point,
+    draw_front,
+    draw_frontier,
+    draw_validation,
+)
 
 VALUES = np.array([[0.5, 9.0], [0.7, 5.0], [4.0, 2.0], [30.0, 7.0]])
 MARKED = {"baseline": (4.0, 2.0), "fixed": (0.5, 9.0)}
@@ -107,3 +115,46 @@ def test_every_sequence_is_named(tmp_path, n):
     found = results(["fixed", "paired"], ratios={"paired": np.linspace(0.5, 2.0, n)})
     draw_validation(tmp_path / "v.png", "study", found._replace(sequences=names))
     assert set(names) <= set(texts(tmp_path / "v.png"))
+
+
+def points():
+    rng = np.random.default_rng(0)
+    sets = [
+        Point(what, str(i), cost * rng.uniform(0.8, 1.2), rng.uniform(0.8, 2.5))
+        for what, cost in (("gicp", 6.0), ("kiss_icp", 40.0))
+        for i in range(12)
+    ]
+    banks = [
+        Point(what, str(n), share * 20.0 * n, 0.9 / np.sqrt(n))
+        for what, share in ((CANCELLING, 1.0), (THRIFTY, 0.7))
+        for n in (2, 3, 4)
+    ]
+    modes = (("baseline", 6.0, 2.1), ("best_default", 38.0, 1.6), ("equal_cost", 45.0, 0.95))
+    modes = (*modes, ("fixed", 40.0, 1.0), ("paired", 60.0, 0.52))
+    return [*sets, *banks, *(Point(mode, mode, cost, ratio) for mode, cost, ratio in modes)]
+
+
+def test_error_against_cost_is_drawn(tmp_path):
+    path = tmp_path / "costs.png"
+    draw_frontier(path, "six", points(), 70.0)
+    said = texts(path)
+    labels = ["gicp", "kiss_icp", "front of the sets", "budget", *MARKED, "paired"]
+    labels += ["best_default", "equal_cost", f"{CANCELLING}: 2, 3, ...", f"{THRIFTY}: 2, 3, ..."]
+    for text in ("CPU time a scan [ms]", "six: error against cost", *labels):
+        assert said.count(text) == 1, text
+    assert {"1", "10", "50"} <= set(said)
+    assert is_white(path)
+    for mode in ("baseline", "best_default", "equal_cost", "fixed", "paired"):
+        assert share_of(path, POINTS[mode]["color"]) > 0.01, mode
+
+
+def test_what_there_is_not_is_not_in_the_legend(tmp_path):
+    path = tmp_path / "costs.png"
+    few = [p for p in points() if p.what in ("gicp", "fixed")]
+    draw_frontier(path, "six", [*few, Point("gicp", "99", 5.0, 80.0)], None)
+    said = texts(path)
+    assert {"gicp", "fixed"} <= set(said)
+    assert not {"budget", "paired", "bank: 2, 3, ..."} & set(said)
+    assert "50" not in said  # a set that fails
+    draw_frontier(path, "six", [p for p in points() if p.what in POINTS], None)
+    assert "gicp" not in texts(path)

@@ -66,13 +66,19 @@ def test_parameters_are_told_once_where_no_set_beat_the_baseline(trained):
 
 def test_frames_that_are_damaged_or_removed_are_made_again(trained):
     frames = trained.folder / "trials/one/frames.npz"
-    before = frames.read_bytes()
-    frames.write_bytes(before[:100])
+    before = timeless(frames)
+    frames.write_bytes(frames.read_bytes()[:100])
     train(trained)
-    assert frames.read_bytes() == before
+    assert timeless(frames) == before
     frames.unlink()
     train(trained)
-    assert frames.read_bytes() == before
+    assert timeless(frames) == before
+
+
+def timeless(frames):
+    """The arrays of a file of frames, without the time that their evidence took."""
+    with np.load(frames) as arrays:
+        return {name: arrays[name].tobytes() for name in arrays if name != "evidence_ms"}
 
 
 def test_a_damaged_trial_is_named(trained):

@@ -17,7 +17,7 @@ from adaptune.space import Categorical, ParameterSpace
 from adaptune.study.mistakes import ConfigurationError
 from offline.campaign import run_batches
 from offline.config import OfflineConfig
-from offline.labelled import labelled_data
+from offline.labelling import labelled_data
 from offline.leave_one_out import leave_one_out
 from offline.objective import best_by_trials
 from offline.offline_study import load_study
@@ -67,7 +67,7 @@ def run(study):
 
 def stages_of(study):
     space, archive = study.odometry.space, Archive(study.folder / "trials")
-    return make_stages(study.config.offline, space, study.training, archive)
+    return make_stages(study.config, space, study.training, archive)
 
 
 def owner_of(archive, number):
@@ -225,7 +225,13 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     )
     seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
     data = labelled_data(
-        archive, seen, sets, study.config, study.window, study.sequences.recorded_in
+        archive,
+        seen,
+        sets,
+        study.config,
+        study.window,
+        study.sequences.recorded_in,
+        study.odometry,
     )
     assert np.isnan(data.sequences[0].errors).any()
     complete = data.complete()

@@ -1,6 +1,7 @@
 """The mirror of a study's trials in Optuna's storages."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import optuna
@@ -8,7 +9,10 @@ import postgres
 import pytest
 from optuna.storages.journal import JournalFileBackend
 
+from adaptune.pooled_space import PooledSpace
+from adaptune.space import Float, Integer, ParameterSpace
 from adaptune.study.mistakes import ConfigurationError
+from offline.config import OfflineConfig
 from offline.offline_study import load_study
 from offline.storage import JOURNAL, MirrorRow, StorageError, open_mirror
 
@@ -106,6 +110,29 @@ def test_what_is_no_number_is_a_failed_trial(study):
     mirror_of(study, {}).report(range(1), lambda n: row(n)._replace(values=(float("nan"),)))
     (trial,) = in_journal(study).get_trials()
     assert trial.state == optuna.trial.TrialState.FAIL
+
+
+def test_trials_of_several_odometries_have_their_own_parameters_alone(tmp_path):
+    """In Optuna's words: parameters are conditional on the odometry."""
+    distance = Float(low=0.1, high=10.0, baseline=1.0, log=True)
+    space = PooledSpace(
+        {
+            "gicp": ParameterSpace.of(distance=distance, passes=Integer(low=1, high=9, baseline=3)),
+            "ndt": ParameterSpace.of(distance=distance),
+        }
+    )
+    run = SimpleNamespace(folder=tmp_path / "mirrored")
+    run.folder.mkdir()
+    for n in (1, 2):  # at first, and when resumed
+        mirror = open_mirror(run.folder, OfflineConfig(), space, {})
+        mirror.report(range(n), lambda number: MirrorRow(space.baselines[number], (1.0,)))
+    trials = in_journal(run).get_trials()
+    assert [trial.params for trial in trials] == [
+        {"odometry": "gicp", "gicp.distance": 1.0, "gicp.passes": 3},
+        {"odometry": "ndt", "ndt.distance": 1.0},
+    ]
+    assert all(trial.distributions.keys() == trial.params.keys() for trial in trials)
+    assert trials[1].distributions["ndt.distance"].log
 
 
 @pytest.fixture

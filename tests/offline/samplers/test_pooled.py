@@ -1,0 +1,213 @@
+"""The samplers of several odometries, which must do what every sampler does."""
+
+import collections
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptune.pooled_space import ODOMETRY, PooledSpace
+from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from offline.config import OfflineConfig
+from offline.samplers import make_sampler
+
+SPACE = PooledSpace(
+    {
+        "gicp": ParameterSpace.of(
+            distance=Float(low=0.1, high=10.0, baseline=1.0, log=True),
+            passes=Integer(low=1, high=40, baseline=20),
+        ),
+        "ndt": ParameterSpace.of(distance=Float(low=0.5, high=20.0, baseline=4.0, log=True)),
+        "kiss": ParameterSpace.of(voxel=Float(low=0.1, high=3.0, baseline=1.0)),
+    }
+)
+
+
+def error(parameters):
+    if parameters[ODOMETRY] == "gicp":
+        return 0.5 + abs(parameters["distance"] - 2.0)
+    return 20.0 + (parameters.get("distance") or parameters["voxel"])
+
+
+def run(config, n_batches, known=()):
+    sampler = make_sampler(SPACE, config)
+    history = list(known)
+    for _ in range(n_batches):
+        history += [(s, error(s)) for s in sampler.propose(history)]
+    return history
+
+
+@pytest.fixture(params=["tpe", "sobol", "random"])
+def config(request):
+    return OfflineConfig(sampler=request.param, batch=8, initial=12, seed=5)
+
+
+def labels(history):
+    return [s[ODOMETRY] for s, _ in history]
+
+
+def test_sets_are_of_the_space_and_differ(config):
+    history = run(config, 5)
+    assert len(history) == 40
+    for parameters, _ in history:
+        SPACE.check(parameters)
+    assert len({repr(sorted(s.items())) for s, _ in history}) == 40
+
+
+def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
+    history = run(config, 2)
+    assert [s for s, _ in history[:3]] == SPACE.baselines
+    assert labels(history[:8]) == ["gicp", "ndt", "kiss"] * 2 + ["gicp", "ndt"]
+    assert min(collections.Counter(labels(history)).values()) >= 4
+
+
+def test_batches_smaller_than_the_pool_still_begin_with_every_baseline():
+    small = OfflineConfig(sampler="sobol", batch=2, initial=4, seed=5)
+    assert [s for s, _ in run(small, 2)[:3]] == SPACE.baselines
+
+
+def test_the_best_odometry_gets_the_largest_share(config):
+    counts = collections.Counter(labels(run(config, 6)[16:]))
+    assert counts["gicp"] > max(counts["ndt"], counts["kiss"]) > 0
+
+
+@pytest.mark.parametrize("known", [0, 1, 3])
+def test_resumes_exactly(config, known):
+    history = run(config, 4)
+    assert run(config, 4 - known, history[: 8 * known]) == history
+
+
+def test_another_seed_gives_other_sets(config):
+    other = config.model_copy(update={"seed": 6})
+    assert run(other, 1)[3:] != run(config, 1)[3:]
+
+
+def test_where_one_has_nothing_left_the_others_go_on():
+    space = PooledSpace(
+        {
+            "few": ParameterSpace.of(kernel=Categorical(choices=("a", "b"), baseline="a")),
+            "many": ParameterSpace.of(x=Float(low=0.0, high=1.0, baseline=0.5)),
+        }
+    )
+    sampler = make_sampler(space, OfflineConfig(sampler="sobol", batch=8, initial=8))
+    history = []
+    for _ in range(2):
+        history += [(s, 1.0) for s in sampler.propose(history)]
+    counts = collections.Counter(labels(history))
+    assert counts == {"few": 2, "many": 14}
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"sampler": "annealing"}, "sampler"),
+        ({"sampler": "random", "sampler_settings": {"grid": {}}}, "sampler"),
+        ({"trials": 2}, "trials"),
+        ({"sampler": "sobol", "search": "bank"}, "search"),
+        ({"search": "bank", "objective": ["rte", "ape"]}, "search"),
+    ],
+)
+def test_what_several_odometries_cannot_be_searched_with(settings, key):
+    found = list(OfflineConfig(**settings)._search_mistakes(SPACE))
+    assert [mistake.key for mistake in found] == [(key,)]
+
+
+def test_several_odometries_are_searched_for_a_bank():
+    alone = SPACE.spaces["gicp"]
+    assert OfflineConfig().seeks_bank(SPACE)
+    assert not OfflineConfig().seeks_bank(alone)
+    assert OfflineConfig(search="bank").seeks_bank(alone)
+    assert not OfflineConfig(search="set").seeks_bank(SPACE)
+    assert not OfflineConfig(sampler="sobol").seeks_bank(SPACE)
+
+
+@given(
+    n=st.integers(2, 6),
+    batch=st.integers(6, 20),
+    errors=st.lists(st.floats(0.0, 9.0), min_size=6, max_size=6),
+)
+def test_batches_are_split_by_rank_and_nobody_is_left_out(n, batch, errors):
+    of = {str(i): error for i, error in enumerate(errors[:n])}
+    space = PooledSpace(dict.fromkeys(of, SPACE.spaces["kiss"]))
+    sampler = make_sampler(space, OfflineConfig(sampler="random", batch=batch, initial=batch))
+    history = [(s, of[s[ODOMETRY]]) for s in sampler.propose([])]
+    proposed = [s[ODOMETRY] for s in sampler.propose(history)]
+    # A search for a bank takes half of them.
+    assert set(proposed[: max(n, batch // 2)]) == set(of)
+    counts = collections.Counter(proposed)
+    assert counts.total() == batch
+    ranked = [counts[label] for label in sorted(of, key=of.__getitem__)]
+    assert min(ranked) >= 1
+    assert ranked == sorted(ranked, reverse=True)
+
+
+@pytest.mark.parametrize("batch", [4, 8, 16])
+def test_a_finite_pool_is_tried_to_its_end(config, batch):
+    few, many = (ParameterSpace.of(n=Integer(low=1, high=n, baseline=1)) for n in (3, 17))
+    # Python takes 1 and True for equal.
+    equal = ParameterSpace.of(kernel=Categorical(choices=(1, True, "x"), baseline=1))
+    space = PooledSpace({"few": few, "many": many, "equal": equal})
+    sampler = make_sampler(space, config.model_copy(update={"batch": batch, "initial": 6}))
+    history = []
+    while sets := sampler.propose(history):
+        history += [(s, 1.0) for s in sets]
+        if len(sets) < batch:
+            break
+    assert len(history) == len({repr(s) for s, _ in history}) == 23
+
+
+def test_begins_with_the_sobol_points_of_each():
+    """Also where the initial points cannot be divided evenly."""
+    of = [OfflineConfig(sampler=s, batch=7, initial=14, seed=5) for s in ("tpe", "sobol")]
+    a, b = (run(config, 3) for config in of)
+    assert a[:14] == b[:14]
+    assert a[14:] != b[14:]
+
+
+def test_alike_odometries_begin_with_other_points():
+    space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
+    sets = make_sampler(space, OfflineConfig(sampler="sobol", batch=16)).propose([])[2:]
+    voxels = [{s["voxel"] for s in sets if s[ODOMETRY] == label} for label in space.spaces]
+    assert len(voxels[0]) == len(voxels[1]) == 7
+    assert not voxels[0] & voxels[1]
+
+
+def test_of_several_objectives_the_first_splits_the_batches():
+    config = OfflineConfig(objective=["rte", "rpe"], batch=8, initial=8, seed=5)
+    sampler, history = make_sampler(SPACE, config), []
+    for _ in range(4):
+        history += [(s, (error(s), -error(s))) for s in sampler.propose(history)]
+    counts = collections.Counter(labels(history[8:]))
+    assert counts["gicp"] > max(counts["ndt"], counts["kiss"]) > 0
+    assert make_sampler(SPACE, config).propose(history[:16]) == [s for s, _ in history[16:24]]
+
+
+def late_sets(limit):
+    """The last sets of two alike odometries; a smaller voxel is better."""
+    space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
+    sampler, history = make_sampler(space, OfflineConfig(batch=9, initial=18, seed=5)), []
+    for _ in range(8):
+        history += [(s, s["voxel"], limit(s)) for s in sampler.propose(history)]
+    return [s for s, *_ in history[45:]]
+
+
+def test_samplers_are_told_of_limits():
+    free = late_sets(lambda _: ())
+    bound = late_sets(lambda s: (1.0 - s["voxel"],))
+    small = [sum(s["voxel"] < 0.9 for s in sets) for sets in (free, bound)]
+    assert small[1] < 0.6 * small[0]
+
+
+def test_sets_that_break_limits_earn_no_share():
+    """What one of them does best, it may not do."""
+    late = late_sets(lambda s: (1.0 if s[ODOMETRY] == "one" else -1.0,))
+    assert collections.Counter(s[ODOMETRY] for s in late) == {"one": 9, "other": 18}
+
+
+def test_says_the_same_when_asked_again(config):
+    history = run(config, 3)
+    sampler = make_sampler(SPACE, config)
+    assert sampler.propose(history) == sampler.propose(history)
+    assert sampler.propose(history[:16]) == [s for s, _ in history[16:]]
+    with pytest.raises(ValueError, match="15 is not a multiple"):
+        sampler.propose(history[:15])

@@ -1,0 +1,132 @@
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from labelled_places import TRIALS, labelled, two_kinds, with_motions
+
+from adaptune.errors import AdaptuneError
+from adaptune.model import BankSettings, PairedSettings
+from adaptune.model.costs import Costs, SetCost
+from adaptune.parameter_sets import ParameterSets
+from adaptune.pooled_space import ODOMETRY, PooledSpace
+from adaptune.space import Float, ParameterSpace
+from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST
+from offline.frontier import frontier
+from offline.leave_one_out import PAIRED, leave_one_out
+from offline.pictures import draw_frontier
+from offline.rivals import driven_cost, rivals
+from offline.tuning import NO_BANK, Policy
+
+ONE = ParameterSpace({"x": Float(low=0.0, high=9.0, baseline=1.0)})
+POOL = PooledSpace({"gicp": ONE, "ndt": ONE})
+SETS = ParameterSets(
+    POOL,
+    TRIALS,
+    tuple(
+        {ODOMETRY: odometry, "x": x}
+        for odometry, x in [("gicp", 1.0), ("ndt", 1.0), ("gicp", 2.0), ("ndt", 3.0), ("gicp", 4.0)]
+    ),
+)
+COSTS = Costs({t: SetCost(float(10 * i + 1), 1.0, i) for i, t in enumerate(TRIALS)}, 3.0)
+
+
+def data(sequences, **more):
+    return labelled(sequences)._replace(sets=SETS, costs=COSTS, **more)
+
+
+@pytest.fixture
+def places():
+    """Trial 4, the third, is the best over all; the fourth is the worst."""
+    return two_kinds(np.random.default_rng(0))
+
+
+def test_the_best_default_is_the_best_of_the_odometries_baselines(places):
+    found = rivals(data(places), 100.0)
+    means = np.mean([s.errors.mean(axis=0) for s in places], axis=0)
+    assert found[BEST_DEFAULT] == TRIALS[int(np.argmin(means[:2]))]
+    # One odometry's is the baseline.
+    assert BEST_DEFAULT not in rivals(labelled(places)._replace(costs=COSTS), 100.0)
+
+
+def test_the_rival_of_equal_cost_costs_no_more(places):
+    assert rivals(data(places), 100.0)[EQUAL_COST] == TRIALS[2]
+    assert rivals(data(places), 12.0)[EQUAL_COST] in TRIALS[:2]
+    assert EQUAL_COST not in rivals(data(places), np.nan)
+    with pytest.raises(AdaptuneError, match=r"online.budget: 1 ms .* 2.0 ms \(trial 0\)"):
+        rivals(data(places), 1.0)
+
+
+def test_what_is_driven_costs_what_all_of_it_costs(places):
+    members = [TRIALS[2], TRIALS[0]]
+    bank = Policy(PairedSettings(adapt=False), BankSettings(), members, {})
+    assert driven_cost(data(places), bank, TRIALS[2]) == 21.0 + 1.0 + 1.0 + 1.0 + 3.0
+    fixed = Policy(PairedSettings(adapt=False), NO_BANK, members, {})
+    assert driven_cost(data(places), fixed, TRIALS[2]) == 22.0
+    one = Policy(PairedSettings(n_sets=2), NO_BANK, members, {})
+    assert driven_cost(data(places), one, TRIALS[2]) > 22.0
+    assert np.isnan(driven_cost(labelled(places), bank, TRIALS[2]))
+
+
+def test_a_budget_bounds_the_fixed_set_and_what_is_selected(places):
+    assert data(places).fixed() == TRIALS[2]
+    cheap = data(places, budget=15.0)
+    assert cheap.fixed() in TRIALS[:2]
+    # Live evidence does not fit beside the second one.
+    assert data(places, budget=12.0).allowed(TRIALS[1]) == TRIALS[:2]
+    assert data(places).allowed(TRIALS[1]) is None
+    unknown = Costs({t: SetCost(np.nan, np.nan, 0) for t in TRIALS}, np.nan)
+    with pytest.raises(AdaptuneError, match="older adaptune"):
+        data(places, budget=12.0)._replace(costs=unknown).fixed()
+
+
+@pytest.fixture(scope="module")
+def validation():
+    rng = np.random.default_rng(7)
+    known = data([with_motions(f"s{i}", rng, 150) for i in range(7)])
+    return known, leave_one_out(known, {}, bank=2)
+
+
+def test_rivals_are_left_out_too(validation):
+    _, found = validation
+    assert {BEST_DEFAULT, EQUAL_COST, PAIRED} <= set(found.ratios)
+    assert found.cost("baseline") == 2.0
+    assert found.cost(PAIRED) > found.cost("fixed")
+    assert found.cost(EQUAL_COST) <= found.cost(PAIRED)
+    said = found.against_rivals()
+    assert len(said) == 2
+    assert "of CPU time a scan against" in said[0]
+    assert "ms" in said[1]
+
+
+def test_without_costs_there_is_no_rival_of_equal_cost(validation):
+    known, _ = validation
+    found = leave_one_out(known._replace(costs=None), {}, bank=0)
+    assert EQUAL_COST not in found.ratios
+    assert np.isnan(found.cost("fixed"))
+    assert frontier(known._replace(costs=None), found, None) == []
+
+
+def test_error_against_cost(validation, tmp_path):
+    known, found = validation
+    points = frontier(known, found, BankSettings())
+    sets = [p for p in points if p.what in ("gicp", "ndt")]
+    assert [p.cost for p in sets] == [COSTS.alone(t) for t in TRIALS]
+    banks = [p for p in points if p.what == "bank"]
+    assert [p.name for p in banks] == ["2", "3", "4", "5"]
+    assert all(a.cost < b.cost for a, b in itertools.pairwise(banks))
+    modes = {p.what: p for p in points}
+    assert modes["fixed"].ratio == 1.0
+    assert modes[PAIRED].ratio == pytest.approx(np.exp(np.log(found.ratios[PAIRED]).mean()))
+    draw_frontier(tmp_path / "costs.png", "test", points, 30.0)
+    text = (tmp_path / "costs.svg").read_text()
+    assert all(label in text for label in ("gicp", "ndt", "paired", "budget", "CPU time"))
+
+
+def test_a_bank_stays_within_the_budget():
+    rng = np.random.default_rng(7)
+    rich = data([replace(with_motions(f"s{i}", rng, 150)) for i in range(7)])
+    fixed = rich.costs.alone(rich.fixed())
+    for budget in (fixed, 40.0, 200.0):
+        found = leave_one_out(rich._replace(budget=budget), {}, bank=2)
+        assert found.cost(PAIRED) <= budget + 1e-6
