@@ -1,6 +1,6 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,11 @@ from adaptune import report
 from adaptune.drawing import LINES
 from adaptune.geometry import invert
 from adaptune.model import ErrorModel
+from adaptune.study.driven import RIVAL_WORDS, RIVALS
 from adaptune.study.inputs import check_model
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
-from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
+from online.modes import BASELINE, UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.replay_picture import Track, draw_replays
 from online.run_replays import shared_identity
 from online.statistics import (
@@ -61,11 +62,6 @@ def compare(study: Study) -> list[ComparisonRow]:
     setup = ReplaySetup.of(study)
     names, modes = _replayed(study, setup)
     _check_replays(study, setup, names, modes)
-    logarithmic = [
-        name
-        for name, parameter in setup.odometry.space.parameters.items()
-        if getattr(parameter, "log", False)
-    ]
     rows: list[ComparisonRow] = []
     for name in names:
         folder = study.folder / "replays" / name
@@ -78,7 +74,7 @@ def compare(study: Study) -> list[ComparisonRow]:
             study.config.sub_trajectory,
             {mode: _track(replay, reference) for mode, replay in replays.items()},
             None if reference.trajectory is None else _seen_from(reference.trajectory),
-            logarithmic,
+            setup.odometry.space.logarithmic,
             reference.estimated,
         )
     if len({row.sequence for row in rows if row.rte is not None}) > 1:
@@ -104,14 +100,16 @@ def _replayed(study: Study, setup: ReplaySetup) -> tuple[tuple[str, ...], tuple[
         return any((folder / "replay.json").exists() for folder in folders)
 
     names, without_model = study.config.test, sequences_without_model(study)
-    of_model = [mode for mode in setup.modes if mode not in WITHOUT_MODEL]
+    rivals = [rival for rival in RIVALS if all(any_of([name], [rival]) for name in names)]
+    modes = (BASELINE, *rivals, "fixed", *setup.rules)
+    of_model = [mode for mode in modes if mode not in WITHOUT_MODEL]
     if not any_of(names, of_model) and any_of(without_model, [UNTRAINED]):
         return without_model, WITHOUT_MODEL
     if not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if all(any_of([name], [UNTRAINED]) for name in names):
-        return names, tuple(sorted({*setup.modes, UNTRAINED}, key=list(LINES).index))
-    return names, setup.modes
+        return names, tuple(sorted({*modes, UNTRAINED}, key=list(LINES).index))
+    return names, modes
 
 
 def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
@@ -169,7 +167,8 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
         said.append(f"Mean RTE of {_where(rows[-1])}: {found}.")
     if "fixed" in last and "baseline" in last and (verdict := _of_baseline(last["baseline"])):
         said.append(verdict)
-    adaptive = [row for mode, row in last.items() if mode not in ("baseline", "fixed")]
+    single = ("baseline", "fixed", *RIVALS)
+    adaptive = [row for mode, row in last.items() if mode not in single]
     if differing := [row for row in adaptive if _counts(row)]:
         each = (
             f"`{row.mode}` is {'better' if row.ratio < 1.0 else 'worse'}, with {_times(row)}"
@@ -183,11 +182,31 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
             f"{rows[-1].sequence} is too short for intervals: whether {' or '.join(unknown)} "
             f"differs from the {_YARDSTICKS[rows[-1].yardstick]} is not known."
         )
-    return said + _judges(rows) + _estimates(rows) + _losses(rows) + _restarts(rows)
+    return (
+        said
+        + _against_rivals(last)
+        + _judges(rows)
+        + _estimates(rows)
+        + _losses(rows)
+        + _restarts(rows)
+    )
 
 
 _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 """What a mode that others are compared with is called in a sentence."""
+
+
+def _against_rivals(last: Mapping[str, ComparisonRow]) -> list[str]:
+    """How `paired` compares with its rivals, in error and in cost."""
+    paired = last.get("paired")
+    if paired is None or paired.ratio is None or paired.cpu_ms is None:
+        return []
+    return [
+        f"Compared with {RIVAL_WORDS[rival]}, `paired` has {paired.ratio / row.ratio:.2f} times "
+        f"its error, at {paired.cpu_ms:.1f} ms of CPU time a scan against {row.cpu_ms:.1f}."
+        for rival in RIVALS
+        if (row := last.get(rival)) is not None and row.ratio and row.cpu_ms is not None
+    ]
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The modes of a replay: baseline, fixed, adaptive by each selection rule, and untrained."""
+"""The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and untrained."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,14 +8,14 @@ from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import OdometryInstance, WarmUp
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.pool import Factory
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selector import Selector
 from adaptune.sequence.part import part_name
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import ModeError, bank_members, mechanism_of
+from adaptune.study.driven import RIVALS, ModeError, bank_members, mechanism_of
 from adaptune.study.study import Mechanism, Study
 
 BASELINE, UNTRAINED = "baseline", "untrained"
@@ -34,7 +34,7 @@ class Mode(NamedTuple):
 class ReplaySetup:
     """What a replay depends on, besides the recording and the model."""
 
-    odometry: OdometryFactory
+    odometry: Factory
     rules: tuple[str, ...]  # selection rules to compare
     switching: SwitchingConfig
     mechanism: Mechanism  # how the odometry changes its parameters
@@ -43,6 +43,7 @@ class ReplaySetup:
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     switch_cost: float  # what a switch must promise, as a share of the fixed set's error
     descriptors: tuple[str, ...]  # those that the study names
+    budget: float | None = None  # milliseconds of CPU time a scan
 
     @classmethod
     def of(cls, study: Study) -> Self:
@@ -58,16 +59,22 @@ class ReplaySetup:
             config.lost_track,
             study.switch_cost(),
             config.descriptor.names,
+            config.online.budget,
         )
 
-    @property
-    def modes(self) -> tuple[str, ...]:
-        """What is compared with a model: baseline, fixed, and each selection rule."""
-        return (BASELINE, "fixed", *self.rules)
+    def modes(self, model: ErrorModel) -> tuple[str, ...]:
+        """What is compared with a model: baseline, rivals, fixed, and each selection rule."""
+        rivals = [rival for rival in RIVALS if rival in model.rivals]
+        return (BASELINE, *rivals, "fixed", *self.rules)
 
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.descriptors, path)
+        if model.budget != self.budget:
+            raise ModeError(
+                f"online.budget: {path} was fitted for another budget; run `adaptune offline` "
+                f"again, which fits it to the finished trials"
+            )
         if self.mechanism == "bank":
             bank_members(self.switching, model)
 
@@ -117,13 +124,13 @@ class ReplaySetup:
         return about | {"model": digest, "switching": settings}
 
     def parameters(self, mode: str, model: ErrorModel | None = None) -> ParameterSet | None:
-        """The parameters of baseline and fixed, which stay; None for adaptive modes."""
+        """The parameters of modes that keep them; None for adaptive modes."""
         if mode == BASELINE:
             return self.odometry.space.baseline
-        if mode != "fixed":
+        if mode != "fixed" and mode not in RIVALS:
             return None
         model = needed(mode, model)
-        return model.sets[model.fixed]
+        return model.sets[model.rivals[mode] if mode in RIVALS else model.fixed]
 
     def start(
         self, mode: str, model: ErrorModel | None = None, sequence: str | None = None

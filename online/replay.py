@@ -10,13 +10,17 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.cores import resident_megabytes
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Motions, OdometryInstance
+from adaptune.odometry.base import Motions, OdometryInstance, Usage
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
+
+_SAMPLED = 10
+"""Scans from one look at the memory to the next."""
 
 _log = logging.getLogger(__name__)
 
@@ -55,6 +59,8 @@ class Replay:
     choices: list[Choice]
     seconds: float  # the whole replay, reading included
     unhealthy: dict[str, int]  # how often the health check found what
+    cpu_ms: float  # milliseconds of CPU time a scan, in all processes, without reading it
+    memory: float  # most megabytes of all processes
 
 
 class Schedule:
@@ -99,8 +105,7 @@ def replay(
 ) -> Replay:
     """Replay a recording, as fast as it goes and always the same way.
 
-    A selection is made at the first scan and then at the first scan of every further period, from
-    that scan and before it is registered.
+    Selections are made as `Schedule` says, from a scan and before it is registered.
 
     Parameters
     ----------
@@ -126,11 +131,12 @@ def replay(
     OdometryError
         If the odometry cannot change its parameters.
     """
-    begin = time.perf_counter()
     schedule, tracker = Schedule(period), Tracker(odometry, health)
     steps: list[RegisteredScan] = []
     choices: list[Choice] = []
+    meter = _Meter()
     for scan in scans:
+        meter.begin()
         if selector is not None:
             selector.observe(scan.stamp, scan, odometry.motions)
             if schedule.due(scan.stamp):
@@ -141,10 +147,39 @@ def replay(
                 odometry.apply(selection)
                 selector.measure()
         steps.append(tracker.register(scan))
+        meter.end()
         progress()
     if not steps:
         raise AdaptuneError("there is no scan to replay; check start, stop and views")
-    return _recorded(steps, choices, time.perf_counter() - begin)
+    return _recorded(steps, choices, meter, odometry.usage)
+
+
+class _Meter:
+    """Measures CPU time and memory, scan by scan."""
+
+    def __init__(self) -> None:
+        self._cpu = self._memory = 0.0
+        self._n = 0
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Since this was made."""
+        return time.perf_counter() - self._started
+
+    def begin(self) -> None:
+        self._begin = time.process_time()
+
+    def end(self) -> None:
+        self._cpu += time.process_time() - self._begin
+        if self._n % _SAMPLED == 0:
+            self._memory = max(self._memory, resident_megabytes())
+        self._n += 1
+
+    def used(self, odometry: Usage) -> tuple[float, float]:
+        """Milliseconds a scan, and megabytes, with what the odometry used in other processes."""
+        ms = 1e3 * (self._cpu + odometry.elsewhere) / self._n
+        return ms, self._memory + (odometry.memory or 0.0)
 
 
 def _tell_of_loss(choices: list[Choice], what: str) -> None:
@@ -157,7 +192,9 @@ def _tell_of_loss(choices: list[Choice], what: str) -> None:
         _log.warning("%s: the %s %s at %.1f s", what, who, does, seconds)
 
 
-def _recorded(steps: list[RegisteredScan], choices: list[Choice], seconds: float) -> Replay:
+def _recorded(
+    steps: list[RegisteredScan], choices: list[Choice], meter: _Meter, usage: Usage
+) -> Replay:
     stamps, poses, registered, unhealthy, prepare, register = zip(*steps, strict=True)
     return Replay(
         Trajectory(np.array(stamps, np.int64), np.array(poses)),
@@ -166,6 +203,7 @@ def _recorded(steps: list[RegisteredScan], choices: list[Choice], seconds: float
         np.array(prepare),
         np.array(register),
         choices,
-        seconds,
+        meter.seconds,
         dict(Counter(what for what in unhealthy if what is not None)),
+        *meter.used(usage),
     )

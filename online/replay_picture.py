@@ -93,7 +93,9 @@ def draw_replays(
     panels: list[tuple[float, Callable[[Any], None]]] = []
     if any(np.isfinite(track.errors).any() for track in tracks.values()):
         panels.append((2.4, partial(_draw_errors, tracks=tracks, length=length)))
-    for name in next(iter(tracks.values())).choices:
+    # Sets of several odometries have other parameters; a bank's weights are drawn instead.
+    single = [track.choices for track in tracks.values() if not track.weights]
+    for name in (name for name in single[0] if all(name in choices for choices in single)):
         log = name in logarithmic
         panels.append((1.0, partial(_draw_parameter, tracks=tracks, name=name, log=log)))
     for mode, track in tracks.items():
@@ -174,16 +176,23 @@ def _draw_errors(axes: Any, tracks: Mapping[str, Track], length: float) -> None:
 
 def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool) -> None:
     """What was applied of a parameter; a bank applies that of each of its members."""
-    named = any(isinstance(v, str) for track in tracks.values() for v in track.choices[name])
-    for mode, track in tracks.items():
-        if not track.weights:
-            values = [plain(v) if named and v != str(v) else v for v in track.choices[name]]
-            axes.step(track.span, [*values, values[-1]], where="post", **LINES[mode])
+    single = {mode: track for mode, track in tracks.items() if not track.weights}
+    named = any(isinstance(v, str) for track in single.values() for v in track.choices[name])
+    for mode, track in single.items():
+        values = [_name(v) if named else v for v in track.choices[name]]
+        axes.step(track.span, [*values, values[-1]], where="post", **LINES[mode])
     # A line at a bound does not lie on the frame.
     axes.margins(y=0.15)
     if log:
         log_scale(axes)
     axes.set_ylabel(name.replace("_", "\n"), fontsize="small")
+
+
+def _name(value: Any) -> str:
+    """A value among names; the set of another odometry may have none."""
+    if isinstance(value, str):
+        return value or "-"
+    return "-" if np.isnan(value) else plain(value)
 
 
 def _draw_estimated(axes: Any, mode: str, track: Track, length: float, true: str) -> None:

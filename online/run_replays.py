@@ -70,7 +70,7 @@ def run_replays(
     setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
-    of = _Modes(setup, setup.modes, model, model_path)
+    of = _Modes(setup, setup.modes(model), model, model_path)
     return _replay_all(study, study.config.test, of, again, progress)
 
 

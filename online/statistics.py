@@ -23,7 +23,7 @@ from adaptune.metrics import (
 )
 from adaptune.reference.stored import StoredEstimate
 from adaptune.trajectory import Trajectory, read_tum
-from online.stored_replays import StoredReplay
+from online.stored_replays import ReplaySummary, StoredReplay
 
 ALL = "all"
 """In place of a sequence, all of them."""
@@ -154,6 +154,9 @@ class ComparisonRow:
     lost_seconds: float = 0.0  # how long the bank was lost
     reference: str = "given"  # `given`, `estimated` or `none`
     reference_error: float | None = None  # percent, of an estimated one
+    cpu_ms: float | None = None  # milliseconds of CPU time a scan
+    cores: float | None = None  # that this takes at the sensor's rate
+    memory_mb: float | None = None  # most megabytes of all processes
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
@@ -170,6 +173,9 @@ class ComparisonRow:
             LOST: self.lost_seconds,
             "restarts": self.restarts,
             "switches": self.switches,
+            "ms a scan": self.cpu_ms,
+            "cores": self.cores,
+            "memory [MB]": self.memory_mb,
             REFERENCE: self.reference,
             "_reference_error": self.reference_error,
             "_poor_scans": self.poor_scans,
@@ -260,9 +266,19 @@ def compare_modes(
                 summary.lost_seconds,
                 reference.kind,
                 reference.error,
+                summary.cpu_ms,
+                _cores(summary),
+                summary.memory_mb,
             )
         )
     return rows
+
+
+def _cores(summary: ReplaySummary) -> float | None:
+    """CPU time over the recording's duration."""
+    if summary.cpu_ms is None or not summary.duration_s:
+        return None
+    return 1e-3 * summary.cpu_ms * summary.scans / summary.duration_s
 
 
 def allowing_for(
@@ -349,6 +365,17 @@ def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
                 estimated=float(np.mean(estimated)) if estimated else None,
                 lost_seconds=sum(row.lost_seconds for row in mine),
                 reference=" and ".join(sorted({row.reference for row in mine})),
+                cpu_ms=_mean([row.cpu_ms for row in mine]),
+                cores=_mean([row.cores for row in mine]),
+                memory_mb=max(
+                    (m for row in mine if (m := row.memory_mb) is not None), default=None
+                ),
             )
         )
     return made
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Mean of those that are known."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

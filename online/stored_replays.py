@@ -59,6 +59,8 @@ class ReplaySummary(BaseModel):
     lost_seconds: float = 0.0  # how long the bank was lost
     # Percent: mean of the odometry's own error as it was measured without ground truth.
     mean_estimated_error: float | None = None
+    cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
+    memory_mb: float | None = None  # most megabytes of all processes
     model_file: str | None  # of the model that it was made with; None if it needed none
     about: ReplayIdentity
 
@@ -184,6 +186,8 @@ def write_replay(
         selections=len(replay.choices),
         lost_seconds=round(_lost_seconds(replay), 3),
         mean_estimated_error=_mean_estimated(replay),
+        cpu_ms=round(replay.cpu_ms, 3),
+        memory_mb=round(replay.memory, 1),
         model_file=None if model_file is None else str(model_file.resolve()),
         about=about,
     )
@@ -213,7 +217,9 @@ _SELECTION = (
 
 
 def _write_selections(path: Path, replay: Replay) -> None:
-    names = list(replay.choices[0].selection.parameters) if replay.choices else []
+    # Sets of several odometries have other parameters.
+    every = (name for choice in replay.choices for name in choice.selection.parameters)
+    names = list(dict.fromkeys(every))
     rows = []
     for stamp, selection, seconds in replay.choices:
         numbers = (
@@ -230,7 +236,7 @@ def _write_selections(path: Path, replay: Replay) -> None:
             [stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)]
             + [" ".join(f"{trial}:{weight:.3f}" for trial, weight in weights)]
             + [f"{1e3 * seconds:.3f}"]
-            + [selection.parameters[name] for name in names]
+            + [selection.parameters.get(name, "") for name in names]
         )
     _write_csv(path, [*_SELECTION, *names], rows)
 
@@ -289,8 +295,9 @@ def _columns(path: Path) -> dict[str, list[str]]:
 
 
 def _numbers(values: Sequence[str]) -> list[Any]:
+    """Numbers if all are, NaN where the set of another odometry has no value; texts otherwise."""
     try:
-        return [float(value) for value in values]
+        return [float(value or "nan") for value in values]
     except ValueError:
         return list(values)
 

@@ -14,9 +14,9 @@ from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.hand_over import HandOver
 from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.pool import Factory
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
@@ -180,9 +180,7 @@ def _read(study: Study, name: str, seconds: float) -> Recording:
     return Recording(name, scans, T_ref_sensor, study.config.sub_trajectory)
 
 
-def _mechanisms(
-    odometry: OdometryFactory, warm_up: WarmUp, catch_up_scans: int
-) -> dict[str, Mechanism]:
+def _mechanisms(odometry: Factory, warm_up: WarmUp, catch_up_scans: int) -> dict[str, Mechanism]:
     """Each mechanism that the odometry can have, by name; the first never switches."""
 
     def same(_: ParameterSet) -> OdometryInstance:

@@ -1,5 +1,6 @@
 import csv
 import json
+import time
 from pathlib import Path
 
 import drives
@@ -9,7 +10,7 @@ import pytest
 from adaptune.errors import AdaptuneError
 from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.odometry.bank import Bank
-from adaptune.odometry.base import Odometry, OdometryError, Registration, WarmUp
+from adaptune.odometry.base import Odometry, OdometryError, Registration, Usage, WarmUp
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.in_process import InProcess
@@ -18,7 +19,7 @@ from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 from adaptune.trajectory import read_tum
 from online.replay import Schedule, replay
-from online.stored_replays import ReplayIdentity, write_replay
+from online.stored_replays import ReplayIdentity, StoredReplay, write_replay
 
 
 class Scripted(Odometry):
@@ -288,3 +289,56 @@ def test_no_selection_is_lost_to_rounding(period):
     every = round(period * 10)
     due = [i for i in range(6000) if schedule.due(i * 10**8)]
     assert due == list(range(0, 6000, every))
+
+
+def test_what_a_replay_costs_is_measured_without_reading(tmp_path):
+    class Busy(Scripted):
+        def register(self, prepared):
+            spend(0.003)
+            return super().register(prepared)
+
+    class Elsewhere(InProcess):
+        usage = Usage(cpu=1.0, memory=1000.0, elsewhere=0.5)
+
+    def reading(of):
+        for scan in of:
+            spend(0.02)
+            yield scan
+
+    result = replay(reading(scans(np.arange(20) / 10)), InProcess(Busy()), HEALTH)
+    assert 2.5 < result.cpu_ms < 12.0
+    assert 20.0 < result.memory < 20_000.0
+    other = replay(scans(np.arange(20) / 10), Elsewhere(Busy()), HEALTH)
+    # Half a second in other processes, for twenty scans.
+    assert 27.0 < other.cpu_ms < 40.0
+    assert other.memory > 1000.0
+    write_replay(tmp_path, other, ABOUT, None)
+    summary = json.loads((tmp_path / "replay.json").read_text())
+    assert summary["cpu_ms"] == round(other.cpu_ms, 3)
+    assert summary["memory_mb"] == round(other.memory, 1)
+
+
+def spend(seconds):
+    """Spend CPU time."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+
+
+def test_selections_of_several_odometries_are_stored_with_gaps(tmp_path):
+    sets = [
+        {"odometry": "a", "speed": 1.0, "kernel": "huber"},
+        {"odometry": "b", "points": 3},
+    ]
+
+    class Any(InProcess):
+        def apply(self, selection):
+            """Take it as it is."""
+
+    result = replay(scans(np.arange(21) / 10), Any(Scripted()), HEALTH, Chooser(sets))
+    write_replay(tmp_path, result, ABOUT, None)
+    choices = StoredReplay.read(tmp_path).choices
+    assert choices["odometry"] == ["b", "a", "b"]
+    np.testing.assert_array_equal(choices["speed"], [np.nan, 1.0, np.nan])
+    np.testing.assert_array_equal(choices["points"], [3.0, np.nan, 3.0])
+    assert choices["kernel"] == ["", "huber", ""]

@@ -60,6 +60,25 @@ def test_restarts_are_marked_and_explained_once(tmp_path):
     assert drawn(tmp_path, tracks)[1].count("restarted by the health check") == 1
 
 
+def test_sets_of_several_odometries_leave_gaps(tmp_path):
+    mixed = track(
+        choices={
+            "odometry": ["gicp", "ndt"],
+            "max_distance": [0.9, np.nan],
+            "kernel": ["huber", ""],
+            "resolution": [np.nan, 2.0],
+        }
+    )
+    other = track(
+        choices={"odometry": ["gicp"] * 2, "max_distance": [0.7] * 2, "kernel": ["-"] * 2}
+    )
+    said = drawn(tmp_path, {"baseline": other, "fixed": other, "paired": mixed})[1]
+    assert {"gicp", "ndt", "huber", "-", "odometry"} <= set(said)
+    # Not all modes have one.
+    assert "resolution" not in said
+    assert "nan" not in said
+
+
 def test_a_bank_has_its_weights_drawn_and_no_parameters(tmp_path):
     of_bank = track(
         choices={"max_distance": [77.0, 77.0], "kernel": ["alone", "alone"]},

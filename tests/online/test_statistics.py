@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -95,3 +97,20 @@ def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
     assert found.standard.kitti[2:] == want[2:]
     assert pooled([row("a", None)])[0].standard is None
     assert np.isnan(pooled([row("a", StandardErrors(1.0, 0.1, short))])[0].standard.kitti[0])
+
+
+def test_what_a_mode_costs_is_in_its_columns():
+    cells = replace(row("a", None), cpu_ms=12.5, cores=0.125, memory_mb=300.0).columns()
+    assert (cells["ms a scan"], cells["cores"], cells["memory [MB]"]) == (12.5, 0.125, 300.0)
+    old = row("a", None).columns()
+    assert old["ms a scan"] is old["cores"] is old["memory [MB]"] is None
+    costs = [(10.0, 0.1, 200.0), (20.0, 0.3, 400.0)]
+    rows = [
+        replace(row(name, None), cpu_ms=ms, cores=cores, memory_mb=mb)
+        for name, (ms, cores, mb) in zip("ab", costs, strict=True)
+    ]
+    (of_all,) = pooled(rows)
+    assert of_all.cpu_ms == pytest.approx(15.0)
+    assert of_all.cores == pytest.approx(0.2)
+    assert of_all.memory_mb == 400.0
+    assert pooled([row("a", None), row("b", None)])[0].cpu_ms is None

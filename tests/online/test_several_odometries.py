@@ -1,0 +1,114 @@
+"""A study of two odometries from its trials to its comparison."""
+
+import csv
+import json
+
+import pytest
+from drives import STUDY
+
+from adaptune import yaml
+from adaptune.archive import Archive
+from adaptune.model import ErrorModel
+from adaptune.pooled_space import ODOMETRY, PooledSpace
+from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, driven
+from offline.offline_study import load_study
+from offline.train import train
+from offline.validate import validate
+from online.comparison import compare, remarks, tables
+from online.run_replays import run_replays
+
+ODOMETRIES = """\
+odometry:
+  - {name: gicp, settings: {min_range: 0.5, iterations: 10}}
+  - {name: vgicp, settings: {min_range: 0.5, iterations: 10}}
+"""
+
+
+@pytest.fixture(scope="module")
+def load(study_file, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("several")
+    rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
+    path = folder / "several.yaml"
+    path.write_text(ODOMETRIES + rest + "online: {rules: [paired], switching: {mechanism: bank}}\n")
+    return lambda *overrides: load_study(path, list(overrides), folder / "study")
+
+
+@pytest.fixture(scope="module")
+def trained(load):
+    study = load()
+    return study, train(study)
+
+
+def test_the_trials_range_over_both(trained):
+    study, training = trained
+    sets = training.model.sets
+    assert isinstance(sets.space, PooledSpace)
+    assert sets.defaults == [0, 1]
+    assert {s[ODOMETRY] for s in sets.parameters} == {"gicp", "vgicp"}
+    archive = Archive(study.folder / "trials")
+    for name in study.training:
+        # The baselines of both have whole runs.
+        for trial in (0, 1):
+            assert archive.read(name, trial, whole=True).parameters == sets[trial]
+            assert archive.finished(name)[trial].cost > 0.0
+        assert archive.read_frames(name).evidence_ms > 0.0
+    rows = list(csv.DictReader((study.folder / "trials.csv").open()))
+    assert all((row["resolution"] == "") == (row[ODOMETRY] == "gicp") for row in rows)
+    assert all(float(row["cost [ms]"]) > 0.0 for row in rows)
+    fixed = yaml.Document((study.folder / "fixed.yaml").read_text()).data
+    assert fixed == sets[training.model.fixed]
+
+
+def test_the_model_knows_what_its_sets_cost(trained):
+    study, training = trained
+    model = ErrorModel.load(study.model_path)
+    assert model.costs == training.model.costs
+    assert set(model.costs.sets) == set(model.sets)
+    numbers = [model.costs.sets[t].preparation for t in model.sets]
+    downsampling = [model.sets[t]["downsampling"] for t in model.sets]
+    # Both odometries share prepared clouds.
+    assert (
+        len(set(numbers))
+        == len(set(downsampling))
+        == len({*zip(numbers, downsampling, strict=True)})
+    )
+    assert f"({model.sets[model.fixed][ODOMETRY]})" in driven(study, model).words
+
+
+def test_it_is_validated_against_its_rivals(trained):
+    study, _ = trained
+    found = validate(study)
+    (last,) = [row for row in found.rows if row["left out"] == "ms a scan"]
+    assert last["paired"] > 0.0
+    assert BEST_DEFAULT in last
+    assert EQUAL_COST in last
+    assert any("the best odometry with its own parameters" in said for said in found.verdicts)
+    points = json.loads((study.folder / "costs.json").read_text())
+    assert {point["what"] for point in points} >= {"gicp", "vgicp", "bank", "paired", "fixed"}
+    assert (study.folder / "costs.png").exists()
+
+
+def test_it_is_replayed_and_compared(trained):
+    study, training = trained
+    modes = {"baseline", "fixed", "paired", *training.model.rivals}
+    assert run_replays(study, study.model_path) == len(modes)
+    rows = compare(study)
+    assert {row.mode for row in rows} == modes
+    assert all(row.cpu_ms > 0.0 and row.cores > 0.0 and row.memory_mb > 0.0 for row in rows)
+    assert tables(rows, 3.0)
+    assert len([said for said in remarks(rows) if "CPU time" in said]) == len(training.model.rivals)
+    assert run_replays(study, study.model_path) == 0
+
+
+def test_another_budget_runs_no_trial(trained, load):
+    _, training = trained
+    costs = training.model.costs
+    cheapest = min(costs.alone(trial) for trial in training.model.sets)
+    study = load(f"online.budget={1.01 * cheapest}")
+    before = len(list(study.folder.glob("trials/*/*.npz")))
+    model = train(study).model
+    # The whole run of another fixed set may be added.
+    assert len(list(study.folder.glob("trials/*/*[0-9].npz"))) <= before
+    assert costs.alone(model.fixed) <= 1.01 * cheapest
+    assert model.budget == pytest.approx(1.01 * cheapest)
+    assert not model.bank_adapts
