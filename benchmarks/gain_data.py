@@ -1,7 +1,8 @@
 """The courses of `gain.py`, and what odometries do on them with several parameter sets."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,14 @@ from adaptune.simulation.simulate import simulate
 from adaptune.space import ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 from offline.config import OfflineConfig
-from offline.hops import measured_hops
+from offline.hops import with_measured_hops
 from offline.labelled import LabelledData, LabelledSequence
+from offline.prepared import SharedScan, SharedScans
 from offline.samplers import make_sampler
 from offline.trial import TrialSettings, run_trials
 
+MEMORY = 3e9
+"""Bytes of prepared scans."""
 ODOMETRIES = ("gicp", "ndt")
 N_SETS = 16
 KINDS = ("cave", "street", "open", "garden")
@@ -60,19 +64,21 @@ def training_courses(seed: int, length: float) -> dict[str, Course]:
 
 
 def factory_of(name: str) -> OdometryFactory:
-    """An odometry with its default settings, all of whose parameters are tuned."""
+    """An odometry with the settings of the published experiments; two parameters are tuned."""
     cls: Any = odometry_class(name)
-    return OdometryFactory(name, {}, cls.space, Limits())
+    settings = cls.settings_type(downsampling=0.5, iterations=30 if name == "ndt" else 20)
+    return OdometryFactory(name, settings, cls.describe(settings).space, Limits())
 
 
-class Prepared:
-    """Prepared scans of a course, in place of `offline.trial.PreparedSequence`."""
+class SharedCourse:
+    """Scans of a course, in place of `offline.trial.PreparedSequence`."""
 
-    def __init__(self, name: str, prepared: list[Any], frames: Frames):
-        self.name, self._prepared, self.frames = name, prepared, frames
+    def __init__(self, name: str, scans: Iterable[Any], frames: Frames):
+        self.name, self.frames = name, frames
+        self.shared = SharedScans(scans, MEMORY)
 
-    def __iter__(self) -> Iterator[Any]:
-        return iter(self._prepared)
+    def __iter__(self) -> Iterator[SharedScan]:
+        return islice(self.shared, len(self.frames.stamps))
 
 
 def run(path: Path, course: Course, odometry: str, seed: int) -> None:
@@ -88,10 +94,9 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     factory, settings = factory_of(odometry), TrialSettings()
     config = OfflineConfig(sampler="sobol", batch=N_SETS, seed=seed)
     sets = make_sampler(factory.space, config).propose([])
-    one = factory()
-    prepared: Any = Prepared(path.stem, [one.prepare(scan) for scan in scans], frames)
-    hops = measured_hops(scans, frames)
-    trials = run_trials(settings, factory, prepared, sets)
+    frames = with_measured_hops(scans, frames)
+    course_scans: Any = SharedCourse(path.stem, scans, frames)
+    trials = run_trials(settings, factory, course_scans, sets)
     length = settings.sub_trajectory
     vectors = [error_vectors(frames, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]
@@ -105,7 +110,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
             errors=np.stack([trial.errors for trial in trials], axis=1).astype(np.float32),
             vectors=np.stack(vectors, axis=1),
             motions=motions.astype(np.float32),
-            **{f"hops_{name}": array for name, array in hops._asdict().items()},
+            **{f"hops_{name}": array for name, array in frames.hops._asdict().items()},
         )
 
 
