@@ -4,11 +4,11 @@ import os
 import shutil
 import signal
 import time
-from pathlib import Path
 
 import drives
 import numpy as np
 import pytest
+from kills import contents
 
 from adaptune import yaml
 from adaptune.archive import Archive
@@ -19,18 +19,6 @@ from adaptune.study.mistakes import ConfigurationError
 from offline.offline_study import load_study
 from offline.train import train
 from offline.workers import WorkerError, Workers
-
-
-def files(folder):
-    """Contents of all that must not depend on who ran it, or when."""
-    contents = {}
-    for path in sorted((folder / "trials").rglob("*.npz")):
-        with np.load(path) as data:
-            contents[path.relative_to(folder)] = {
-                key: data[key].tobytes() for key in data if key not in ("seconds", "usage")
-            }
-    contents[Path("model.safetensors")] = (folder / "model.safetensors").read_bytes()
-    return contents
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +92,7 @@ def test_number_of_workers_changes_nothing(trained, study_file, tmp_path):
     study, _ = trained
     alone = load_study(study_file, ["offline.workers=1"], tmp_path / "study")
     train(alone)
-    assert files(alone.folder) == files(study.folder)
+    assert contents(alone.folder) == contents(study.folder)
 
 
 def test_more_trials_go_on_where_fewer_stopped(trained, study_file, tmp_path):
@@ -116,7 +104,7 @@ def test_more_trials_go_on_where_fewer_stopped(trained, study_file, tmp_path):
     train(load_study(study_file, [], folder))
     assert {p: p.stat().st_mtime_ns for p in before} == before
     # The whole runs of the smaller study's fixed set are not the larger one's.
-    ours, theirs = files(folder), files(study.folder)
+    ours, theirs = contents(folder), contents(study.folder)
     assert {k: ours[k] for k in theirs} == theirs
 
 
@@ -150,7 +138,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
 
     train(again, kill)
     assert len(spawned) > 2
-    assert files(again.folder) == files(study.folder)
+    assert contents(again.folder) == contents(study.folder)
 
 
 def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatch):

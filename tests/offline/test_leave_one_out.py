@@ -190,7 +190,7 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     # Four sub-trajectories tell nothing; a dozen would.
     assert rows[0]["paired, 95 %"] is None
     summary = validation.summary("paired")
-    assert rows[3]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert rows[4]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert [row["stretches"] for row in learning] == [1]
     n_sets = len(ErrorModel.load(study.model_path).sets)
