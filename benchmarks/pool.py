@@ -10,13 +10,17 @@ hours a world on one core, and resumes. `more-SEED.json` in the folder may hold 
 Left out: one course after the other; fixed set, bank and rivals are chosen on the other 23. Driven:
 chosen on all 24, and replayed on mixed courses of other worlds, with the health check. The script
 prints ratios of mean errors over 25 m, and what each mode costs. With `--budget`, what is driven
-costs that many milliseconds of CPU time a scan at most; `fixed` is what the fixed set costs.
+costs that many milliseconds of CPU time a scan at most; `fixed` is what the fixed set costs. With
+`--driven --kill ODOMETRY`, only the bank is driven, once as it is and once with that odometry's
+process killed before every scan of the second half.
 """
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,13 +31,16 @@ from pool_data import LENGTH, pool, pooled_data, run_course
 from replays import ORDERS, mean_error
 
 from adaptune.descriptor.ndt_histogram import N_FEATURES
+from adaptune.hosting import server
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import WarmUp
 from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.isolation import SERVICE
 from adaptune.selector import Selector
+from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.simulate import SimulatedScan, simulate
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, RIVALS, named
 from offline.expected_loss import figures
@@ -103,10 +110,7 @@ def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, Replay]]:
     found = {}
     for mode in [*trials, PAIRED]:
         if mode == PAIRED:
-            sets = {trial: model.sets[trial] for trial in model.bank}
-            bank = Bank(make, sets, WarmUp())
-            result = replay(scans, bank, HealthCheck(), Selector(model, PAIRED, list(sets)))
-            bank.close()
+            result = drive_bank(model, scans)
         else:
             alone = make(model.sets[trials[mode]])
             result = replay(scans, alone, HealthCheck())
@@ -115,7 +119,40 @@ def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, Replay]]:
     return found
 
 
-def driven(data: LabelledData, seed: int, every: slice) -> None:
+def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> Replay:
+    """Replay scans with the model's bank."""
+    sets = {trial: model.sets[trial] for trial in model.bank}
+    bank = Bank(pool(), sets, WarmUp())
+    result = replay(scans, bank, HealthCheck(), Selector(model, PAIRED, list(sets)))
+    bank.close()
+    return result
+
+
+def drive_killed(model: ErrorModel, course: Course, odometry: str) -> str:
+    """Errors of the bank as it is, and with a member killed in the second half."""
+    scans = list(simulate(course))
+    as_it_is = mean_error(scans, drive_bank(model, scans))
+    result = drive_bank(model, killing(scans, odometry))
+    killed, restarts = mean_error(scans, result), result.restarted.sum()
+    return f"bank {as_it_is:.3f} %, {odometry} killed {killed:.3f} % ({restarts} restarts)"
+
+
+def killing(scans: list[SimulatedScan], odometry: str) -> Iterator[Scan]:
+    """Scans, and an end to an odometry's processes before each of the second half."""
+    for i, scan in enumerate(scans):
+        if 2 * i >= len(scans):
+            for watcher in _children(server(SERVICE, odometry).process.pid):
+                for process in _children(watcher):
+                    os.kill(process, signal.SIGKILL)
+        yield scan
+
+
+def _children(process: int) -> list[int]:
+    path = Path(f"/proc/{process}/task/{process}/children")
+    return [int(child) for child in path.read_text().split()]
+
+
+def driven(data: LabelledData, seed: int, every: slice, kill: str | None) -> None:
     """Replay courses of other worlds."""
     model = model_of(data)
     members = ", ".join(named(model, trial) for trial in model.bank)
@@ -124,6 +161,9 @@ def driven(data: LabelledData, seed: int, every: slice) -> None:
     print(f"fixed {named(model, model.fixed)}, rivals {rivals}", flush=True)
     for i in range(len(ORDERS))[every]:
         course = Course(scenes=ORDERS[i], length=DRIVEN_LENGTH, seed=1000 * seed + 500 + i)
+        if kill:
+            print(f"{seed} driven {i} {' '.join(ORDERS[i])}: {drive_killed(model, course, kill)}")
+            continue
         row = ", ".join(
             f"{mode} {error:.3f} % at {result.cpu_ms:.0f} ms ({result.restarted.sum()} restarts)"
             for mode, (error, result) in drive(model, course).items()
@@ -141,6 +181,7 @@ def main() -> None:
     parser.add_argument("--budget", help="milliseconds of CPU time a scan, or `fixed`")
     parser.add_argument("--driven", action="store_true", help="replay other courses")
     parser.add_argument("--every", default="0:8", help="which of them, as in 0:4")
+    parser.add_argument("--kill", metavar="ODOMETRY", help="kill a member of the bank halfway")
     parser.add_argument("--course", help=argparse.SUPPRESS)  # in a process of its own
     arguments = parser.parse_args()
     folder: Path = arguments.folder
@@ -162,7 +203,7 @@ def main() -> None:
             data = data._replace(budget=budget)
             print(f"world {seed}, within {budget:.1f} ms of CPU time a scan")
         if arguments.driven:
-            driven(data, seed, slice(*map(int, arguments.every.split(":"))))
+            driven(data, seed, slice(*map(int, arguments.every.split(":"))), arguments.kill)
         else:
             left_out(data)
 
