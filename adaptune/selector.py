@@ -185,6 +185,12 @@ class Selector:
         """
         self._live.measure()
 
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen: the fixed set, of a bank with all weight."""
+        weights = {member: float(member == self.fixed) for member in self.members}
+        is_weighed = isinstance(self._rule, BankRule)
+        return Selection(self.fixed, self._model.sets[self.fixed], weights if is_weighed else None)
+
     def _choose(self, feature: NDArray[np.float64]) -> Selection:
         if isinstance(self._rule, BankRule):
             return self._rule.weigh(feature, self._live.squares())

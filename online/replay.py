@@ -5,37 +5,25 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.cores import resident_megabytes
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Motions, OdometryInstance, Usage
+from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
+from adaptune.timed_selector import Schedule, Selects
 from adaptune.trajectory import Trajectory
 
 _SAMPLED = 10
 """Scans from one look at the memory to the next."""
 
 _log = logging.getLogger(__name__)
-
-
-class Selects(Protocol):
-    """What `adaptune.selector.Selector` offers to a replay; see there."""
-
-    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan."""
-
-    def select(self) -> Selection:
-        """Choose what to apply."""
-
-    def measure(self) -> None:
-        """Measure how wrong the odometry was, for the next selections."""
 
 
 class Choice(NamedTuple):
@@ -61,37 +49,6 @@ class Replay:
     unhealthy: dict[str, int]  # how often the health check found what
     cpu_ms: float  # milliseconds of CPU time a scan, in all processes, without reading it
     memory: float  # most megabytes of all processes
-
-
-class Schedule:
-    """Says when a selection is due: at the first scan, and at the first of every further period.
-
-    Parameters
-    ----------
-    period
-        Seconds.
-    """
-
-    def __init__(self, period: float):
-        self._period = period * 1e9
-        self._first: int | None = None
-        self._n_periods = 0
-
-    def due(self, stamp: int) -> bool:
-        """Whether to select at this scan.
-
-        Parameters
-        ----------
-        stamp
-            Nanoseconds, rising from call to call.
-        """
-        if self._first is None:
-            self._first = stamp
-        since = stamp - self._first
-        if since < self._n_periods * self._period:
-            return False
-        self._n_periods = int(since // self._period) + 1
-        return True
 
 
 def replay(
@@ -131,7 +88,7 @@ def replay(
     OdometryError
         If the odometry cannot change its parameters.
     """
-    schedule, tracker = Schedule(period), Tracker(odometry, health)
+    schedule, tracker = Schedule(period * 1e9), Tracker(odometry, health)
     steps: list[RegisteredScan] = []
     choices: list[Choice] = []
     meter = _Meter()
