@@ -28,6 +28,11 @@ def available() -> int:
     return os.cpu_count() or 1
 
 
+def together() -> int:
+    """Number of cores for this process and those that work beside it, see `pin`."""
+    return available() if _before is None else len(_before)
+
+
 def pin(core: int, alone: bool = False) -> Callable[[], None]:
     """Keep this process on one core, if the system can, and return a function that undoes it.
 

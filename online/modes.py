@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+from adaptune.cores import together
 from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
@@ -44,6 +45,11 @@ class ReplaySetup:
     switch_cost: float  # what a switch must promise, as a share of the fixed set's error
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
+
+    @property
+    def cores(self) -> int:
+        """Cores that the members of a bank may use."""
+        return min(self.switching.cores or together(), together())
 
     @classmethod
     def of(cls, study: Study) -> Self:
@@ -154,7 +160,7 @@ class ReplaySetup:
         if mode == UNTRAINED:
             members = self.untrained_sets()
             by_number = dict(zip(members.trials, members.parameters, strict=True))
-            bank = Bank(self.odometry, by_number, self.warm_up, self.lost_track)
+            bank = Bank(self.odometry, by_number, self.warm_up, self.lost_track, self.cores)
             return Mode(bank, UntrainedSelector(members, self.sub_trajectory))
         if mode not in self.rules:
             return Mode(self.odometry(self.parameters(mode, model), sequence), None)
@@ -162,7 +168,7 @@ class ReplaySetup:
         mechanism = self._mechanism(mode, model)
         if mechanism == "bank":
             sets = bank_members(self.switching, model)
-            bank = Bank(self.odometry, sets, self.warm_up, self.lost_track)
+            bank = Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores)
             return Mode(bank, Selector(model, mode, list(sets), descriptors=self.descriptors))
         fixed = model.sets[model.fixed]
         selector = Selector(model, mode, (), self.switch_cost, self.descriptors)
