@@ -80,7 +80,6 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
     bank = named_members(model, switching, complete) or switching.size
     chosen = choose(complete, bank, fixed=model.fixed)
     members = chosen.members or [model.fixed]
-    found = rivals(complete, driven_cost(complete, chosen, model.fixed))
     return replace(
         model,
         paired=chosen.one_set,
@@ -92,7 +91,7 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
             way: {key: float(value) for key, value in figures._asdict().items()}
             for way, figures in chosen.expected.items()
         },
-        rivals={name: trial for name, trial in found.items() if trial != model.fixed},
+        rivals=rivals(complete, driven_cost(complete, chosen, model.fixed)),
     )
 
 

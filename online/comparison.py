@@ -12,7 +12,7 @@ from adaptune import report
 from adaptune.drawing import LINES
 from adaptune.geometry import invert
 from adaptune.model import ErrorModel
-from adaptune.study.driven import RIVAL_WORDS, RIVALS
+from adaptune.study.driven import RIVAL_WORDS, RIVALS, named
 from adaptune.study.inputs import check_model
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
@@ -61,18 +61,18 @@ def compare(study: Study) -> list[ComparisonRow]:
     """
     setup = ReplaySetup.of(study)
     names, modes = _replayed(study, setup)
-    _check_replays(study, setup, names, modes)
+    model = _check_replays(study, setup, names, modes)
     rows: list[ComparisonRow] = []
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
         reference = _reference(study, name)
-        rows += compare_modes(name, replays, reference)
+        rows += compare_modes(name, _with_rivals(replays, model), reference)
         draw_replays(
             study.folder / "comparison" / f"{name}.png",
             f"{study.name}: {name}",
             study.config.sub_trajectory,
-            {mode: _track(replay, reference) for mode, replay in replays.items()},
+            {mode: _track(replay, reference, model) for mode, replay in replays.items()},
             None if reference.trajectory is None else _seen_from(reference.trajectory),
             setup.odometry.space.logarithmic,
             reference.estimated,
@@ -324,7 +324,7 @@ def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
     return said
 
 
-def _track(replay: StoredReplay, reference: Reference) -> Track:
+def _track(replay: StoredReplay, reference: Reference, model: ErrorModel | None) -> Track:
     stamps, known = replay.trajectory.stamps, reference.trajectory
     # The odometry's own frame begins elsewhere: both are drawn from the first common pose.
     start = 0 if known is None else int(np.argmax(np.isin(stamps, known.stamps)))
@@ -336,7 +336,10 @@ def _track(replay: StoredReplay, reference: Reference) -> Track:
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
         replay.choices,
-        replay.weights,
+        {
+            str(trial) if model is None or trial not in model.sets else named(model, trial): weights
+            for trial, weights in replay.weights.items()
+        },
         replay.estimated,
         replay.lost,
     )
@@ -350,8 +353,14 @@ def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
 
 def _check_replays(
     study: Study, setup: ReplaySetup, names: Sequence[str], modes: Sequence[str]
-) -> None:
-    """Refuse replays that are missing, or of another recording, model or configuration."""
+) -> ErrorModel | None:
+    """Refuse replays that are missing, or of another recording, model or configuration.
+
+    Returns
+    -------
+    ErrorModel or None
+        What the replays are of; None if its file is not there any more.
+    """
     made = {
         (name, mode): ReplaySummary.read(study.folder / "replays" / name / mode)
         for name in names
@@ -383,6 +392,18 @@ def _check_replays(
                 f"{study.folder / 'replays' / name}: was judged by another reference; run "
                 f"`adaptune online{option}` with this study, which replays nothing for it"
             )
+    return model
+
+
+def _with_rivals(
+    replays: Mapping[str, StoredReplay], model: ErrorModel | None
+) -> dict[str, StoredReplay]:
+    """The replays by mode; of several odometries the fixed set's for each rival that it is."""
+    if model is None or "fixed" not in replays or len(model.sets.space.baselines) == 1:
+        return dict(replays)
+    same = {mode: replays["fixed"] for mode in RIVALS if model.rivals.get(mode) == model.fixed}
+    every = {**same, **replays}
+    return {mode: every[mode] for mode in LINES if mode in every}
 
 
 def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:

@@ -69,8 +69,11 @@ class ReplaySetup:
         )
 
     def modes(self, model: ErrorModel) -> tuple[str, ...]:
-        """What is compared with a model: baseline, rivals, fixed, and each selection rule."""
-        rivals = [rival for rival in RIVALS if rival in model.rivals]
+        """What is replayed with a model: baseline, rivals, fixed, and each selection rule.
+
+        A rival that is the fixed set is not replayed again.
+        """
+        rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
         return (BASELINE, *rivals, "fixed", *self.rules)
 
     def check(self, model: ErrorModel, path: Path) -> None:

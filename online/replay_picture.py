@@ -29,7 +29,7 @@ class Track(NamedTuple):
     restarted: NDArray[np.bool_]  # of shape (n,)
     choice_seconds: NDArray[np.float64]  # of shape (m,)
     choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
-    weights: Mapping[int, Sequence[float]]  # in a bank by trial instead, of shape (m,)
+    weights: Mapping[str, Sequence[float]]  # in a bank by trial instead, of shape (m,)
     # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
     # interval; NaN where there is none.
     estimated: NDArray[np.float64]

@@ -38,6 +38,9 @@ def test_rivals_are_driven_where_the_model_has_some():
     assert setup().modes(one) == ("baseline", "equal_cost", "fixed", "paired", "paper")
     both = replace(model, rivals={"equal_cost": 6, "best_default": 2})
     assert setup().modes(both)[:4] == ("baseline", "best_default", "equal_cost", "fixed")
+    # One that is the fixed set is not replayed again.
+    same = replace(model, rivals={"equal_cost": model.fixed, "best_default": 2})
+    assert setup().modes(same)[:3] == ("baseline", "best_default", "fixed")
     assert setup().parameters("equal_cost", both) == both.sets[6]
     assert setup().parameters("best_default", both) == both.sets[2]
     assert setup().parameters("fixed", both) == both.sets[4]

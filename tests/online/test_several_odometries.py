@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import pytest
 from drives import STUDY
@@ -90,13 +91,20 @@ def test_it_is_validated_against_its_rivals(trained):
 
 def test_it_is_replayed_and_compared(trained):
     study, training = trained
-    modes = {"baseline", "fixed", "paired", *training.model.rivals}
-    assert run_replays(study, study.model_path) == len(modes)
+    rivals, fixed = training.model.rivals, training.model.fixed
+    modes = ["baseline", "best_default", "equal_cost", "fixed", "paired"]
+    assert set(rivals) == set(modes[1:3])
+    replayed = {"baseline", "fixed", "paired"} | {m for m, t in rivals.items() if t != fixed}
+    assert run_replays(study, study.model_path) == len(replayed)
     rows = compare(study)
-    assert {row.mode for row in rows} == modes
+    # A rival that is the fixed set has its replay.
+    assert list(dict.fromkeys(row.mode for row in rows)) == modes
+    for rival in set(modes) - replayed:
+        one, other = ([row for row in rows if row.mode == mode] for mode in (rival, "fixed"))
+        assert [replace(row, mode="fixed") for row in one] == other
     assert all(row.cpu_ms > 0.0 and row.cores > 0.0 and row.memory_mb > 0.0 for row in rows)
     assert tables(rows, 3.0)
-    assert len([said for said in remarks(rows) if "CPU time" in said]) == len(training.model.rivals)
+    assert len([said for said in remarks(rows) if "CPU time" in said]) == len(rivals)
     assert run_replays(study, study.model_path) == 0
 
 
