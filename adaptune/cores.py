@@ -28,9 +28,16 @@ def available() -> int:
     return os.cpu_count() or 1
 
 
+def shared_cores() -> set[int]:
+    """The cores of this process and of those that work beside it, see `pin`; empty if unknown."""
+    if _before is None and hasattr(os, "sched_getaffinity"):
+        return os.sched_getaffinity(0)
+    return set(_before or ())
+
+
 def together() -> int:
-    """Number of cores for this process and those that work beside it, see `pin`."""
-    return available() if _before is None else len(_before)
+    """How many they are."""
+    return len(shared_cores()) or available()
 
 
 def pin(core: int, alone: bool = False) -> Callable[[], None]:

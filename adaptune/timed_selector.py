@@ -105,12 +105,13 @@ class TimedSelector:
         self._stamp: int | None = None
         self._metres = 0.0
         self._unmeasured = self._failing = False
+        self._owed: Selection | None = None  # for the next update to return
 
     def update(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
         """See a scan, before it is registered, and select if that is due.
 
-        A selection takes some milliseconds. After each, the next call also measures how wrong the
-        odometry was, which takes some tens of milliseconds.
+        A selection takes some milliseconds. After each, `measure` takes some tens of milliseconds;
+        the next update does that first if nobody has done it.
 
         Parameters
         ----------
@@ -139,15 +140,32 @@ class TimedSelector:
                 )
                 self._begin()
             self._stamp = stamp
+            if (owed := self._owed) is not None:
+                self._owed = None
+                return owed
             try:
                 return self._selected(stamp, scan, motions)
             except Exception:
                 return self._after_failure()
 
-    def _selected(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
+    def measure(self) -> None:
+        """Measure how wrong the odometry was, for the next selections; else the next update does.
+
+        Nothing is measured twice.
+        """
+        with self._lock:
+            try:
+                self._measure()
+            except Exception:
+                self._owed = self._after_failure()
+
+    def _measure(self) -> None:
         if self._unmeasured:
             self._unmeasured = False
             self._selector.measure()
+
+    def _selected(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
+        self._measure()
         self._selector.observe(stamp, scan, motions)
         moved = float(np.linalg.norm(motions.T_previous_current[:3, 3]))
         self._metres += moved if np.isfinite(moved) else 0.0

@@ -11,6 +11,14 @@ from adaptune.errors import AdaptuneError
 from adaptune.next_command import say_next, say_next_of_study, say_next_online
 from adaptune.terminal import begin_work, console, progress, say
 
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        help="Replay in real time, so many times as fast as it was recorded.",
+        show_default="as fast as it goes, no scan dropped",
+    ),
+]
+
 
 def online(
     study: StudyFile,
@@ -21,6 +29,7 @@ def online(
         typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
     ] = None,
     again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
+    rate: Rate = None,
     untrained: Annotated[
         bool,
         typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
@@ -34,9 +43,14 @@ def online(
 
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
+
+    With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
+    so are scans that wait too long.
     """
     if untrained and model is not None:
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    if rate is not None:
+        override = [*override, f"online.real_time.rate={rate:g}"]
     loaded = load(study, override, folder)
     from adaptune.cores import pin
     from adaptune.model import ErrorModel
@@ -115,7 +129,8 @@ def compare(
     from adaptune.study.driven import MIN_RECORDINGS
     from offline.budget import TRIALS, more_trials
     from online.comparison import compare as compare_replays
-    from online.comparison import remarks, tables
+    from online.comparison import tables
+    from online.remarks import remarks
 
     loaded.check()
     begin_work()

@@ -323,4 +323,5 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
         process = MemberProcess(factories[0][0].name, whole)
         for number, (i, (factory, own)) in enumerate(zip(share, factories, strict=True)):
             made[i] = Member(process, number, factory, own)
+        process.connect()
     return made

@@ -134,6 +134,29 @@ def test_errors_cost_a_selection_and_not_the_drive(caplog):
     assert caplog.text.count("the fixed set is used") == caplog.text.count("out of luck\n") == 1
 
 
+def test_measures_at_once_where_that_is_asked_for():
+    selector = Counting()
+    timed = TimedSelector(selector)
+    trials(timed, [0])
+    timed.measure()
+    timed.measure()
+    trials(timed, [1])
+    assert selector.calls == ["reset", 0, "select", "measure", 1]
+
+
+def test_an_error_of_the_measurement_shows_at_the_next_scan(caplog):
+    class Failing(Counting):
+        def measure(self):
+            raise RuntimeError("out of luck")
+
+    timed = TimedSelector(Failing())
+    trials(timed, [0])
+    timed.measure()
+    assert timed.failed == 1
+    assert "out of luck" in caplog.text
+    assert trials(timed, [1, 2, 10**9]) == {1: 0, 2: None, 10**9: 7}
+
+
 @pytest.mark.parametrize("bank", [True, False])
 def test_falls_back_to_the_fixed_set(bank):
     model = random_model()
