@@ -197,6 +197,7 @@ def _check_replays(
         for mode in modes
     }
     path, model = _model_of(study, made.values())
+    model = model and setup.pinned(model)
     digest = "" if model is None else model.digest
     # Both read what they are about.
     shared = {name: shared_identity(study, name) for name in names}

@@ -1,7 +1,7 @@
 """The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and untrained."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -51,6 +51,8 @@ class ReplaySetup:
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
     real_time: RealTimeConfig | None = None
+    pins: Mapping[str, Any] = field(default_factory=dict)  # values that parameters have in all sets
+    dwell: float = 0.0  # seconds for which a set stays at least
 
     @property
     def cores(self) -> int:
@@ -73,6 +75,8 @@ class ReplaySetup:
             config.descriptor.names,
             config.online.budget,
             config.online.real_time,
+            config.online.pin,
+            config.online.dwell,
         )
 
     def modes(self, model: ErrorModel) -> tuple[str, ...]:
@@ -82,6 +86,17 @@ class ReplaySetup:
         """
         rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
         return (BASELINE, *rivals, "fixed", *self.rules)
+
+    def pinned(self, model: ErrorModel) -> ErrorModel:
+        """The model with what is pinned in all its sets."""
+        return replace(model, sets=self._held(model.sets)) if self.pins else model
+
+    def _held(self, sets: ParameterSets) -> ParameterSets:
+        held = (
+            own | {name: value for name, value in self.pins.items() if name in own}
+            for own in sets.parameters
+        )
+        return replace(sets, parameters=tuple(held))
 
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
@@ -108,7 +123,7 @@ class ReplaySetup:
                 f"{what} the program runs whole recordings; try parameter sets on recordings with "
                 f"a reference instead (`adaptune offline`)"
             )
-        sets = untrained_sets(self.odometry.space, self.switching.size)
+        sets = self._held(untrained_sets(self.odometry.space, self.switching.size))
         if len(sets) < 2:
             raise ModeError(
                 f"{what} it has no parameters by which its members would differ; name some "
@@ -135,7 +150,9 @@ class ReplaySetup:
         if mechanism != "live":
             settings["warm_up"] = self.warm_up._asdict()
         if mechanism != "bank":
-            settings["switch_cost"] = self.switch_cost
+            settings |= {"switch_cost": self.switch_cost} | (
+                {"dwell": self.dwell} if self.dwell else {}
+            )
         settings["mechanism"] = mechanism
         return about | {"model": digest, "switching": settings}
 
@@ -201,9 +218,10 @@ class ReplaySetup:
             return None
         model = needed(mode, model)
         if self._mechanism(mode, model) != "bank":
-            return Selector(model, mode, (), self.switch_cost, self.descriptors)
+            return Selector(model, mode, (), self.switch_cost, self.descriptors, self.dwell)
         members = list(bank_members(self.switching, model))
-        return Selector(model, mode, members, descriptors=self.descriptors)
+        descriptors, dwell = self.descriptors, self.dwell
+        return Selector(model, mode, members, descriptors=descriptors, dwell=dwell)
 
     def adapts(self, mode: str) -> bool:
         """Whether a mode has a selector."""

@@ -134,7 +134,6 @@ def replay_in_real_time(
     health: HealthCheck,
     settings: RealTimeConfig,
     selector: SelectorProcess | None = None,
-    period: float = 1.0,
     progress: Callable[[int], None] = lambda _: None,
     what: str = "the replay",
     core_ms: float = np.nan,
@@ -145,7 +144,7 @@ def replay_in_real_time(
 
     Parameters
     ----------
-    scans, odometry, health, period, what
+    scans, odometry, health, what
         See `online.replay.replay`.
     settings
         Rate, deadline and queue.
@@ -166,7 +165,7 @@ def replay_in_real_time(
     if said := outlook([scan.stamp for scan in first], settings, core_ms):
         _log.info("%s: %s", what, said)
     tracker, meter, steps = Tracker(odometry, health), Meter(), list[RegisteredScan]()
-    selecting = _Selecting(odometry, selector, settings, Schedule(period * 1e9), what)
+    selecting = _Selecting(odometry, selector, settings, what)
     for scan, due, dropped in arrivals(chain(first, source), settings.rate, settings.queue):
         meter.begin()
         selecting.record.dropped += dropped
@@ -194,13 +193,13 @@ class _Selecting:
         odometry: OdometryInstance,
         selector: SelectorProcess | None,
         settings: RealTimeConfig,
-        schedule: Schedule,
         what: str,
     ):
         self.choices: list[Choice] = []
         self.record = RealTimeRecord(settings.rate)
         self._odometry, self._selector = odometry, selector
-        self._deadline, self._schedule = settings.deadline, schedule
+        self._deadline = settings.deadline
+        self._schedule = Schedule(1.0 if selector is None else selector.period * 1e9)
         self._what = what
 
     def prepare(self, scan: Scan, due: float) -> Any:

@@ -71,6 +71,7 @@ def run_replays(
     model.check_study(study.odometry.identity, study.odometry.space, length, model_path)
     setup = ReplaySetup.of(study)
     setup.check(model, model_path)
+    model = setup.pinned(model)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     of = _Modes(setup, setup.modes(model), model, model_path)
@@ -223,7 +224,6 @@ def _in_real_time(
             config.health,
             config.online.real_time,
             selector,
-            period,
             lambda n_done: progress(n_done, n),
             f"{name}, {mode}",
             setup.core_ms(mode, modes.model),

@@ -74,7 +74,7 @@ class SelectorProcess:
     """
 
     def __init__(self, make: Make, period: float):
-        self.unseen, self.cpu = 0, 0.0
+        self.period, self.unseen, self.cpu = period, 0, 0.0
         self._slots: list[SharedMemory] = []
         self._free: list[int] = []
         self._moved: Motions | None = None  # over the scans that were not shown

@@ -62,7 +62,7 @@ class ReplaySummary(BaseModel):
     mean_estimated_error: float | None = None
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
-    real_time: dict[str, float] | None = None  # how it kept up, see `_kept_up`
+    real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
     model_file: str | None  # of the model that it was made with; None if it needed none
     about: ReplayIdentity
 
@@ -192,14 +192,14 @@ def write_replay(
         mean_estimated_error=_mean_estimated(replay),
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
-        real_time=_kept_up(replay),
+        real_time=kept_up(replay),
         model_file=None if model_file is None else str(model_file.resolve()),
         about=about,
     )
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
 
 
-def _kept_up(replay: Replay) -> dict[str, float] | None:
+def kept_up(replay: Replay) -> dict[str, float] | None:
     """Counts, and medians and 99th percentiles in milliseconds, of a replay in real time."""
     if (record := replay.real_time) is None:
         return None

@@ -20,6 +20,14 @@ Rate = Annotated[
 ]
 
 
+Pin = Annotated[
+    list[str],
+    typer.Option(
+        metavar="KEY=VALUE", help="Hold a parameter at this value in all sets. May be repeated."
+    ),
+]
+
+
 def online(
     study: StudyFile,
     override: Override = [],  # noqa: B006
@@ -30,6 +38,7 @@ def online(
     ] = None,
     again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
     rate: Rate = None,
+    pin: Pin = [],  # noqa: B006
     untrained: Annotated[
         bool,
         typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
@@ -49,17 +58,18 @@ def online(
     """
     if untrained and model is not None:
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    override = [*override, *(f"online.pin.{given}" for given in pin)]
     if rate is not None:
         override = [*override, f"online.real_time.rate={rate:g}"]
     loaded = load(study, override, folder)
-    from adaptune.cores import pin
+    from adaptune.cores import pin as bind
     from adaptune.model import ErrorModel
     from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
     from online.run_replays import run_replays, run_untrained
 
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
-    unpin = pin(os.getpid(), alone=True)
+    unbind = bind(os.getpid(), alone=True)
     try:
         with progress() as show:
             if untrained:
@@ -67,7 +77,7 @@ def online(
             else:
                 made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
-        unpin()
+        unbind()
     if untrained:
         n = len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
     else:

@@ -138,11 +138,14 @@ class RealTimeConfig(StrictModel):
 class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, switching, and what it may cost.
 
+    A set stays for `dwell` seconds at least. Parameters of `pin` have these values in all sets.
     The budget is in milliseconds of CPU time a scan, all members and live evidence together.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
+    dwell: float = Field(0.0, ge=0, le=3600)
+    pin: dict[str, Value] = Field(default_factory=dict)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)

@@ -71,6 +71,7 @@ class Answering:
     seconds: float = 0.0
     unseen: int = 0
     cpu: float = 1.0
+    period: float = 1.0
 
     def __post_init__(self):
         self.turns = itertools.cycle((2, 1))
@@ -90,7 +91,7 @@ class Answering:
 
 def run(odometry, n=30, selector=None, **settings):
     return replay_in_real_time(
-        scans(n), InProcess(odometry), HEALTH, RealTimeConfig(**settings), selector, 1.0
+        scans(n), InProcess(odometry), HEALTH, RealTimeConfig(**settings), selector
     )
 
 
