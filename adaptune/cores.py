@@ -78,3 +78,15 @@ def next_core() -> int | None:
         return None
     cores = sorted(_before or os.sched_getaffinity(0))
     return cores[(os.getpid() + next(_numbers)) % len(cores)]
+
+
+def other_core(number: int) -> int | None:
+    """Core for the process of this number, from 0, of those that work for this one; see `pin`.
+
+    They get the cores that this process does not use, as far as there are any.
+    """
+    cores = sorted(shared_cores())
+    if not cores:
+        return None
+    others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
+    return others[number % len(others)]

@@ -27,13 +27,18 @@ from pathlib import Path
 import numpy as np
 
 from adaptune import cores
-from adaptune.live.untrained import UntrainedSelector, untrained_sets
+from adaptune.descriptor import lowest_elevation
+from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
+from adaptune.live.untrained import untrained_sets
+from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Limits
+from adaptune.parameter_sets import ParameterSets
+from adaptune.selector import Selector
 from adaptune.sequence.config import SequenceConfig
 from adaptune.sequence.opening import open_sequence
 from adaptune.sequence.scan import Scan
@@ -94,7 +99,7 @@ def of_four(scans: Iterable[Scan]) -> None:
 
 def lockstep(bag: Path) -> None:
     """Compare with the bare odometry."""
-    sequence = open_sequence(SequenceConfig(bag=bag, points="/velodyne_points"))
+    sequence = open_sequence(SequenceConfig(bag=str(bag), points="/velodyne_points"))
     bare(sequence)  # decodes the recording
     seconds, ratio = compared(lambda: bare(sequence), lambda: single(sequence))
     print(f"lockstep: {seconds:.2f} s bare, a replay takes {ratio:.3f} times as long", flush=True)
@@ -111,9 +116,33 @@ def spread_bank(scans: list[Scan]) -> None:
     print(f"cores: {ms:.1f} ms a scan, a bank of four on two takes {ratio:.2f} times as long")
 
 
+def model_of(scans: list[Scan], n_sets: int = 16, copies: int = 20) -> ErrorModel:
+    """A model of as many frames as training has, with errors of chance."""
+    rng = np.random.default_rng(0)
+    sets = ParameterSets(
+        SPACE, tuple(range(n_sets)), tuple(SPACE.from_unit(rng.random((n_sets, len(SPACE)))))
+    )
+    described = np.tile([ndt_histogram(scan.points) for scan in scans], (copies, 1))
+    n = len(described)
+    return ErrorModel(
+        odometry={"name": "gicp"},
+        sets=sets,
+        fixed=0,
+        length=25.0,
+        sequences=["one", "two"],
+        blocks={"ndt": N_FEATURES},
+        window=1,
+        descriptors=described.astype(np.float32),
+        sequence=np.arange(n) * 2 // n,
+        errors=rng.gamma(2.0, 0.5, (n, n_sets)).astype(np.float32),
+        provenance={},
+        elevations=[lowest_elevation(scans[0])] * 2,
+    )
+
+
 def in_real_time(scans: list[Scan]) -> None:
     """Replay at the sensor's rate with a selector."""
-    make = partial(UntrainedSelector, SETS, 25.0)
+    make = partial(Selector, model_of(scans), "paired", ())
     with closing(SelectorProcess(make, 1.0)) as selector:
         found = replay_in_real_time(scans, GICP(), HealthCheck(), RealTimeConfig(), selector)
     print(f"real time, {len(scans)} scans: {kept_up(found)}", flush=True)

@@ -16,13 +16,12 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
-from adaptune.selection import Selection
 from adaptune.sequence.imu import Imu, joined
 from adaptune.sequence.scan import Scan
 from adaptune.study.config import RealTimeConfig
 from adaptune.timed_selector import Schedule
 from online.replay import Choice, Meter, RealTimeRecord, Replay, recorded, tell_of_loss
-from online.selector_process import SelectorProcess
+from online.selector_process import Answer, SelectorProcess
 
 _AHEAD = 32
 """Scans that are read before they are due."""
@@ -203,37 +202,45 @@ class _Selecting:
         self._what = what
 
     def prepare(self, scan: Scan, due: float) -> Any:
-        """Prepare a scan with the parameters that it is registered with."""
+        """Prepare a scan with the parameters that it is registered with.
+
+        The odometry waits for a selection until half the time to the deadline is over, and takes
+        one that comes while it prepares the scan.
+        """
         odometry, selector = self._odometry, self._selector
         if selector is None:
             return odometry.prepare(scan)
         wanted = self._schedule.due(scan.stamp)
         wait = self._left(due) if wanted else 0.0
         shown = selector.show(scan.stamp, scan, odometry.motions, wait)
+        if not wanted:
+            return odometry.prepare(scan)
+        begin = time.perf_counter()
+        answer = selector.answer_to(scan.stamp, 0.5 * self._left(due)) if shown else None
+        self.record.waited.append(time.perf_counter() - begin)
+        if answer is not None:
+            self._take(answer, scan.stamp, due)
+            return odometry.prepare(scan)
         prepared, preparation = odometry.prepare(scan), odometry.preparation
-        if wanted:
-            asked = time.perf_counter()
-            answer = selector.answer_to(scan.stamp, self._left(due)) if shown else None
-            self.record.waited.append(time.perf_counter() - asked)
-            if answer is None or answer.selection is None:
-                self.record.missed += 1
-            elif self._applied(answer.selection):
-                seconds = time.perf_counter() - due
-                self.choices.append(Choice(scan.stamp, answer.selection, seconds))
-                tell_of_loss(self.choices, self._what)
-                if odometry.preparation != preparation:
-                    return odometry.prepare(scan)
-        return prepared
+        if shown and self._left(due):
+            answer = selector.answer_to(scan.stamp, 0.0)
+        self._take(answer, scan.stamp, due)
+        return prepared if odometry.preparation == preparation else odometry.prepare(scan)
+
+    def _take(self, answer: Answer | None, stamp: int, due: float) -> None:
+        """Apply what was selected; where that fails, the last set stays."""
+        if answer is None or answer.selection is None:
+            self.record.missed += 1
+            return
+        try:
+            self._odometry.apply(answer.selection)
+        except AdaptuneError as error:
+            trial = answer.selection.trial
+            _log.warning("%s: trial %d cannot be applied: %s", self._what, trial, error)
+            return
+        self.choices.append(Choice(stamp, answer.selection, time.perf_counter() - due))
+        tell_of_loss(self.choices, self._what)
 
     def _left(self, due: float) -> float:
         """Seconds to the deadline."""
         return max(self._deadline - (time.perf_counter() - due), 0.0)
-
-    def _applied(self, selection: Selection) -> bool:
-        """Apply a selection; where that fails, the last set stays."""
-        try:
-            self._odometry.apply(selection)
-        except AdaptuneError as error:
-            _log.warning("%s: trial %d cannot be applied: %s", self._what, selection.trial, error)
-            return False
-        return True

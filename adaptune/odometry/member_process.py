@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from adaptune import hosting
-from adaptune.cores import next_core
+from adaptune.cores import other_core
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
@@ -55,7 +55,7 @@ class MemberProcess:
         self.generation = 0  # of how many processes this is the last
         self.ending = ""  # what is known of how the last one ended
         self._name = name
-        self._bounds = bounds._replace(core=next_core())
+        self._bounds = bounds
         self._stream: BinaryIO | None = None
         self._numbers = itertools.count()
         self._held: OrderedDict[int, None] = OrderedDict()
@@ -316,10 +316,10 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
     movable = [i for together in alike.values() for i in together]
     n = min(cores, len(movable))
     # This process, which does more than its members, has the smallest share.
-    for share in np.array_split(movable[::-1], n)[: n - 1] if n > 1 else ():
+    for i_process, share in enumerate(np.array_split(movable[::-1], n)[: n - 1] if n > 1 else ()):
         factories = [make.alone(sets[i]) for i in share]
         bounds = factories[0][0].limits.bounds
-        whole = bounds._replace(memory=bounds.memory * len(share))
+        whole = bounds._replace(memory=bounds.memory * len(share), core=other_core(i_process))
         process = MemberProcess(factories[0][0].name, whole)
         for number, (i, (factory, own)) in enumerate(zip(share, factories, strict=True)):
             made[i] = Member(process, number, factory, own)
