@@ -66,6 +66,8 @@ class SelectorProcess:
         Scans that the process did not get.
     cpu : float
         Seconds of CPU time for the scans that it got.
+    alive : bool
+        Whether the process was there when it was last used.
 
     Raises
     ------
@@ -74,7 +76,7 @@ class SelectorProcess:
     """
 
     def __init__(self, make: Make, period: float):
-        self.period, self.unseen, self.cpu = period, 0, 0.0
+        self.period, self.unseen, self.cpu, self.alive = period, 0, 0.0, True
         self._slots: list[SharedMemory] = []
         self._free: list[int] = []
         self._moved: Motions | None = None  # over the scans that were not shown
@@ -92,11 +94,6 @@ class SelectorProcess:
         if error:
             self.close()
             raise AdaptuneError(f"the selector's process: {error}")
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.is_alive()
 
     def show(self, stamp: int, scan: Scan, motions: Motions, seconds: float = 0.0) -> bool:
         """Show a scan, see `TimedSelector.update`; whether the process gets it.
@@ -151,11 +148,14 @@ class SelectorProcess:
     def _take_answers(self, seconds: float = 0.0) -> Answer | None:
         """The newest answer that is there, or that comes in so many seconds."""
         newest = None
-        with contextlib.suppress(EOFError, OSError):
-            while self._here.poll(0.0 if newest else seconds):
+        try:
+            while self.alive and self._here.poll(0.0 if newest else seconds):
                 slot, newest = self._here.recv()
                 self._free.append(slot)
                 self.cpu = newest.cpu
+        except (EOFError, OSError):
+            self.alive = False
+            _log.warning("the selector's process has ended; the last set stays")
         return newest
 
     def close(self) -> None:

@@ -104,22 +104,21 @@ def test_scans_come_when_they_are_due():
     late, stamps = zip(*found, strict=True)
     assert list(stamps) == [i * TENTH for i in range(8)]
     assert min(late) >= 0.0
-    assert np.median(late) < 0.01
+    assert np.median(late) < 0.1
 
 
-@pytest.mark.parametrize(("queue", "taken"), [(1, [0, 3, 6, 9]), (2, [0, 2, 5, 8, 9])])
-def test_the_oldest_that_wait_are_dropped_as_in_a_queue_of_ros(queue, taken):
+@pytest.mark.parametrize("queue", [1, 2])
+def test_the_oldest_that_wait_are_dropped_as_in_a_queue_of_ros(queue):
     found = []
-    for arrival in arrivals(scans(10), 5.0, queue):  # one every 20 ms
+    for arrival in arrivals(scans(12), 5.0, queue):  # one every 20 ms
         found.append(arrival)
-        time.sleep(max(arrival.due + 0.07 - time.perf_counter(), 0.0) if queue == 1 else 0.07)
+        time.sleep(0.07)
     stamps = [arrival.scan.stamp // TENTH for arrival in found]
-    assert stamps[0] == 0
-    assert stamps[-1] == 9
-    assert len(stamps) <= len(taken) + 2
-    assert sum(arrival.dropped for arrival in found) == 10 - len(found)
-    gaps = np.diff(stamps)
-    assert [arrival.dropped for arrival in found[1:]] == (gaps - 1).tolist()
+    assert (stamps[0], stamps[-1]) == (0, 11)
+    # The newest are always taken.
+    assert stamps[-queue:] == list(range(12 - queue, 12))
+    assert [arrival.dropped for arrival in found[1:]] == (np.diff(stamps) - 1).tolist()
+    assert 12 - len(found) == sum(arrival.dropped for arrival in found) >= 4
 
 
 def test_with_no_queue_all_scans_wait():
@@ -151,48 +150,47 @@ def test_an_error_of_the_recording_is_raised_here():
 
 def test_selections_are_applied_before_their_scan_is_registered():
     odometry = Steady()
-    result = run(odometry, 25, Answering(), rate=10.0)
+    result = run(odometry, 25, Answering(), rate=10.0, deadline=9.0, queue=0)
     assert [choice.stamp for choice in result.choices] == [0, 10 * TENTH, 20 * TENTH]
     assert (result.real_time.missed, result.real_time.dropped) == (0, 0)
     assert odometry.prepared[:2] == [(0, 2), (TENTH, 2)]
     assert [fine for stamp, fine in odometry.prepared if stamp == 10 * TENTH] == [1]
-    assert max(choice.seconds for choice in result.choices) < 0.1
+    assert max(choice.seconds for choice in result.choices) < 9.0
     assert len(result.real_time.late) == len(result.trajectory) == 25
     # A second of CPU time in the other process, for 25 scans.
     assert 40.0 < result.cpu_ms < 80.0
 
 
 def test_a_selection_that_comes_while_the_scan_is_prepared():
-    odometry = Steady(prepares=0.15)
-    result = run(odometry, 12, Answering(0.2), deadline=0.3, queue=0, rate=2.0)
+    odometry = Steady(prepares=0.2)
+    result = run(odometry, 3, Answering(0.5), deadline=0.8, queue=0)
     assert [choice.stamp for choice in result.choices] == [0]
     # Another preparation prepares the scan again.
     assert odometry.prepared[:3] == [(0, 1), (0, 2), (TENTH, 2)]
-    assert result.real_time.waited[0] < 0.3
+    assert 0.3 < result.real_time.waited[0] < 0.5
 
 
 def test_late_selections_are_dropped_and_the_last_set_stays():
     odometry = Steady()
-    result = run(odometry, 25, Answering(0.05), rate=10.0, deadline=0.02)
+    result = run(odometry, 25, Answering(0.05), rate=10.0, deadline=0.02, queue=0)
     assert result.real_time.missed == 3
     assert not result.choices
     assert odometry.parameters == {"fine": 1}
-    assert max(result.real_time.waited) < 0.04
+    assert max(result.real_time.waited) < 0.05
 
 
 def test_one_that_cannot_be_applied_leaves_the_last_set(caplog):
     odometry = Steady(refuses=[2])
-    result = run(odometry, 25, Answering(), rate=10.0)
+    result = run(odometry, 25, Answering(), rate=10.0, deadline=9.0, queue=0)
     assert [choice.selection.parameters["fine"] for choice in result.choices] == [1]
     assert caplog.text.count("trial 0 cannot be applied: too fine") == 2
     assert len(result.trajectory) == 25
 
 
 def test_an_odometry_that_is_too_slow_drops_scans():
-    result = run(Steady(0.015), 40, rate=20.0)  # one every 5 ms
-    assert 20 < result.real_time.dropped < 35
+    result = run(Steady(0.03), 40, rate=10.0)  # one every 10 ms
+    assert result.real_time.dropped > 15
     assert len(result.trajectory) == 40 - result.real_time.dropped
-    assert np.median(result.real_time.late) < 0.04
 
 
 @pytest.mark.parametrize(
