@@ -28,6 +28,18 @@ def available() -> int:
     return os.cpu_count() or 1
 
 
+def shared_cores() -> set[int]:
+    """The cores of this process and of those that work beside it, see `pin`; empty if unknown."""
+    if _before is None and hasattr(os, "sched_getaffinity"):
+        return os.sched_getaffinity(0)
+    return set(_before or ())
+
+
+def together() -> int:
+    """How many they are."""
+    return len(shared_cores()) or available()
+
+
 def pin(core: int, alone: bool = False) -> Callable[[], None]:
     """Keep this process on one core, if the system can, and return a function that undoes it.
 
@@ -66,3 +78,15 @@ def next_core() -> int | None:
         return None
     cores = sorted(_before or os.sched_getaffinity(0))
     return cores[(os.getpid() + next(_numbers)) % len(cores)]
+
+
+def other_core(number: int) -> int | None:
+    """Core for the process of this number, from 0, of those that work for this one; see `pin`.
+
+    They get the cores that this process does not use, as far as there are any.
+    """
+    cores = sorted(shared_cores())
+    if not cores:
+        return None
+    others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
+    return others[number % len(others)]

@@ -62,6 +62,9 @@ class Selector:
         What a switch must promise, as a share of the fixed set's error.
     descriptors
         Descriptors besides adaptune's own that may be used: a model that names another is refused.
+    dwell
+        Seconds for which a set stays at least, unless it does worse than predicted. The weights of
+        a bank do not wait.
 
     Attributes
     ----------
@@ -86,6 +89,7 @@ class Selector:
         members: Sequence[int] | None = None,
         switch_cost: float = 0.0,
         descriptors: Collection[str] = (),
+        dwell: float = 0.0,
     ):
         model.check_descriptors(descriptors)
         if members is None:
@@ -93,6 +97,7 @@ class Selector:
         self.members = tuple(members)
         self.fixed = self.members[0] if self.members else model.fixed
         self._model = model
+        self._dwell = dwell * 1e9
         self._pca = model.pca()
         weighs = bool(self.members) and rule == "paired"
         fitted = (
@@ -118,7 +123,7 @@ class Selector:
         self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
         self._found: deque[Selection] = deque(maxlen=SMOOTHING)
         self._current: int | None = None
-        self._stamp = 0
+        self._stamp = self._switched = 0
         self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
         self._elevations: list[float] = []
         self._warned = False
@@ -173,7 +178,15 @@ class Selector:
         if selection.weights is not None:
             selection = self._smoothed(selection)
         elif selection.trial != self._current:
-            self._live.forget()  # the hops were those of another set
+            if (current := self._kept()) is not None:
+                selection = selection._replace(
+                    trial=current,
+                    parameters=self._model.sets[current],
+                    predicted_error=self._predicted,
+                )
+            else:
+                self._live.forget()  # the hops were those of another set
+                self._switched = self._stamp
         self._current, self._predicted = selection.trial, selection.predicted_error
         return self._live.estimated(selection)
 
@@ -184,6 +197,12 @@ class Selector:
         and without it only the training counts.
         """
         self._live.measure()
+
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen: the fixed set, of a bank with all weight."""
+        weights = {member: float(member == self.fixed) for member in self.members}
+        is_weighed = isinstance(self._rule, BankRule)
+        return Selection(self.fixed, self._model.sets[self.fixed], weights if is_weighed else None)
 
     def _choose(self, feature: NDArray[np.float64]) -> Selection:
         if isinstance(self._rule, BankRule):
@@ -201,6 +220,12 @@ class Selector:
         if error is not None and current is not None and error.low > WORSE * self._predicted:
             self._avoided[current] = seconds + AVOIDED
         return self._avoided
+
+    def _kept(self) -> int | None:
+        """The current set, if it has just been selected and does not do worse than predicted."""
+        if self._current in self._avoided or self._stamp - self._switched >= self._dwell:
+            return None
+        return self._current
 
     def _motion(self) -> NDArray[np.float64]:
         """Speed and turn rate over the last second of registered scans, of shape (2,)."""

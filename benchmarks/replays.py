@@ -35,10 +35,11 @@ from adaptune.selector import Selector
 from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import SimulatedScan, simulate
+from adaptune.timed_selector import Selects
 from offline.fit import fit
 from offline.labelled import LabelledData
 from offline.tuning import Policy, choose
-from online.replay import Replay, Selects, replay
+from online.replay import Replay, replay
 
 ORDERS = (
     ("cave", "open", "street"),

@@ -1,9 +1,13 @@
 """The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and untrained."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import numpy as np
+
+from adaptune.cores import together
 from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
@@ -14,13 +18,15 @@ from adaptune.parameter_sets import ParameterSets
 from adaptune.selector import Selector
 from adaptune.sequence.part import part_name
 from adaptune.space import ParameterSet
-from adaptune.study.config import SwitchingConfig
+from adaptune.study.config import RealTimeConfig, SwitchingConfig
 from adaptune.study.driven import RIVALS, ModeError, bank_members, mechanism_of
 from adaptune.study.study import Mechanism, Study
 
 BASELINE, UNTRAINED = "baseline", "untrained"
 WITHOUT_MODEL = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
+CATCH_UP_SCANS = 4
+"""Of a hand-over in real time, unless the study says otherwise: the sensor does not wait."""
 
 
 class Mode(NamedTuple):
@@ -44,6 +50,14 @@ class ReplaySetup:
     switch_cost: float  # what a switch must promise, as a share of the fixed set's error
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
+    real_time: RealTimeConfig | None = None
+    pins: Mapping[str, Any] = field(default_factory=dict)  # values that parameters have in all sets
+    dwell: float = 0.0  # seconds for which a set stays at least
+
+    @property
+    def cores(self) -> int:
+        """Cores that the members of a bank may use."""
+        return min(self.switching.cores or together(), together())
 
     @classmethod
     def of(cls, study: Study) -> Self:
@@ -60,6 +74,9 @@ class ReplaySetup:
             study.switch_cost(),
             config.descriptor.names,
             config.online.budget,
+            config.online.real_time,
+            config.online.pin,
+            config.online.dwell,
         )
 
     def modes(self, model: ErrorModel) -> tuple[str, ...]:
@@ -69,6 +86,17 @@ class ReplaySetup:
         """
         rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
         return (BASELINE, *rivals, "fixed", *self.rules)
+
+    def pinned(self, model: ErrorModel) -> ErrorModel:
+        """The model with what is pinned in all its sets."""
+        return replace(model, sets=self._held(model.sets)) if self.pins else model
+
+    def _held(self, sets: ParameterSets) -> ParameterSets:
+        held = (
+            own | {name: value for name, value in self.pins.items() if name in own}
+            for own in sets.parameters
+        )
+        return replace(sets, parameters=tuple(held))
 
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
@@ -95,7 +123,7 @@ class ReplaySetup:
                 f"{what} the program runs whole recordings; try parameter sets on recordings with "
                 f"a reference instead (`adaptune offline`)"
             )
-        sets = untrained_sets(self.odometry.space, self.switching.size)
+        sets = self._held(untrained_sets(self.odometry.space, self.switching.size))
         if len(sets) < 2:
             raise ModeError(
                 f"{what} it has no parameters by which its members would differ; name some "
@@ -122,7 +150,9 @@ class ReplaySetup:
         if mechanism != "live":
             settings["warm_up"] = self.warm_up._asdict()
         if mechanism != "bank":
-            settings["switch_cost"] = self.switch_cost
+            settings |= {"switch_cost": self.switch_cost} | (
+                {"dwell": self.dwell} if self.dwell else {}
+            )
         settings["mechanism"] = mechanism
         return about | {"model": digest, "switching": settings}
 
@@ -138,7 +168,13 @@ class ReplaySetup:
     def start(
         self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
     ) -> Mode:
-        """Make a new odometry, or a bank, and its selector.
+        """Make a new odometry, or a bank, and its selector; see `instance` and `selector`."""
+        return Mode(self.instance(mode, model, sequence), self.selector(mode, model))
+
+    def instance(
+        self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
+    ) -> OdometryInstance:
+        """Make a new odometry, or a bank.
 
         Parameters
         ----------
@@ -157,22 +193,61 @@ class ReplaySetup:
         if mode == UNTRAINED:
             members = self.untrained_sets()
             by_number = dict(zip(members.trials, members.parameters, strict=True))
-            bank = Bank(self.odometry, by_number, self.warm_up, self.lost_track)
-            return Mode(bank, UntrainedSelector(members, self.sub_trajectory))
+            return self._bank(by_number)
         if mode not in self.rules:
-            return Mode(self.odometry(self.parameters(mode, model), sequence), None)
+            return self.odometry(self.parameters(mode, model), sequence)
         model = needed(mode, model)
         mechanism = self._mechanism(mode, model)
         if mechanism == "bank":
-            sets = bank_members(self.switching, model)
-            bank = Bank(self.odometry, sets, self.warm_up, self.lost_track)
-            return Mode(bank, Selector(model, mode, list(sets), descriptors=self.descriptors))
+            return self._bank(bank_members(self.switching, model))
         fixed = model.sets[model.fixed]
-        selector = Selector(model, mode, (), self.switch_cost, self.descriptors)
         if mechanism == "live":
-            return Mode(self.odometry(fixed), selector)
+            return self.odometry(fixed)
         scans = self.switching.catch_up_scans
-        return Mode(HandOver(self.odometry, fixed, self.warm_up, scans), selector)
+        if self.real_time is not None and not scans:
+            scans = CATCH_UP_SCANS
+        return HandOver(self.odometry, fixed, self.warm_up, scans)
+
+    def selector(
+        self, mode: str, model: ErrorModel | None = None
+    ) -> Selector | UntrainedSelector | None:
+        """Make the selector of a mode; None if its parameters stay. See `start`."""
+        if mode == UNTRAINED:
+            return UntrainedSelector(self.untrained_sets(), self.sub_trajectory)
+        if mode not in self.rules:
+            return None
+        model = needed(mode, model)
+        if self._mechanism(mode, model) != "bank":
+            return Selector(model, mode, (), self.switch_cost, self.descriptors, self.dwell)
+        members = list(bank_members(self.switching, model))
+        descriptors, dwell = self.descriptors, self.dwell
+        return Selector(model, mode, members, descriptors=descriptors, dwell=dwell)
+
+    def adapts(self, mode: str) -> bool:
+        """Whether a mode has a selector."""
+        return mode == UNTRAINED or mode in self.rules
+
+    def fixed(self, mode: str, model: ErrorModel) -> int:
+        """Trial number of the set that a mode begins with."""
+        if mode in self.rules and self._mechanism(mode, model) == "bank":
+            return next(iter(bank_members(self.switching, model)))
+        return model.fixed
+
+    def core_ms(self, mode: str, model: ErrorModel | None) -> float:
+        """Milliseconds that a scan keeps the busiest core at work; NaN if that was not measured."""
+        if model is None or model.costs is None:
+            return np.nan
+        if mode == BASELINE:
+            return model.costs.alone(0)
+        if mode not in self.rules:
+            return model.costs.alone(model.rivals.get(mode, model.fixed))
+        if self._mechanism(mode, model) != "bank":
+            return max(model.costs.adaptive([trial]) for trial in model.sets)
+        members = bank_members(self.switching, model)
+        return model.costs.adaptive(members) / min(len(members), self.cores)
+
+    def _bank(self, sets: Mapping[int, ParameterSet]) -> Bank:
+        return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores)
 
     def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:
         return mechanism_of(mode, model, self.mechanism, self.odometry.description.live)

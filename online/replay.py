@@ -4,19 +4,20 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.cores import resident_megabytes
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import Motions, OdometryInstance, Usage
+from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
+from adaptune.timed_selector import Schedule, Selects
 from adaptune.trajectory import Trajectory
 
 _SAMPLED = 10
@@ -25,25 +26,26 @@ _SAMPLED = 10
 _log = logging.getLogger(__name__)
 
 
-class Selects(Protocol):
-    """What `adaptune.selector.Selector` offers to a replay; see there."""
-
-    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan."""
-
-    def select(self) -> Selection:
-        """Choose what to apply."""
-
-    def measure(self) -> None:
-        """Measure how wrong the odometry was, for the next selections."""
-
-
 class Choice(NamedTuple):
     """A selection that was made."""
 
     stamp: int  # nanoseconds, of the scan that it was made from and first applied to
     selection: Selection
-    seconds: float  # time to describe the scan and choose
+    seconds: float  # to describe the scan and choose; in real time, from its arrival
+
+
+@dataclass
+class RealTimeRecord:
+    """How a replay in real time kept up."""
+
+    rate: float  # times as fast as it was recorded
+    dropped: int = 0  # scans that the odometry did not get
+    missed: int = 0  # selections that were not there at their deadline
+    unseen: int = 0  # scans that the selector did not get
+    late: list[float] = field(
+        default_factory=list
+    )  # (n,): seconds from a scan's arrival to its pose
+    waited: list[float] = field(default_factory=list)  # seconds for each selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,37 +63,7 @@ class Replay:
     unhealthy: dict[str, int]  # how often the health check found what
     cpu_ms: float  # milliseconds of CPU time a scan, in all processes, without reading it
     memory: float  # most megabytes of all processes
-
-
-class Schedule:
-    """Says when a selection is due: at the first scan, and at the first of every further period.
-
-    Parameters
-    ----------
-    period
-        Seconds.
-    """
-
-    def __init__(self, period: float):
-        self._period = period * 1e9
-        self._first: int | None = None
-        self._n_periods = 0
-
-    def due(self, stamp: int) -> bool:
-        """Whether to select at this scan.
-
-        Parameters
-        ----------
-        stamp
-            Nanoseconds, rising from call to call.
-        """
-        if self._first is None:
-            self._first = stamp
-        since = stamp - self._first
-        if since < self._n_periods * self._period:
-            return False
-        self._n_periods = int(since // self._period) + 1
-        return True
+    real_time: RealTimeRecord | None = None  # in real time
 
 
 def replay(
@@ -131,10 +103,10 @@ def replay(
     OdometryError
         If the odometry cannot change its parameters.
     """
-    schedule, tracker = Schedule(period), Tracker(odometry, health)
+    schedule, tracker = Schedule(period * 1e9), Tracker(odometry, health)
     steps: list[RegisteredScan] = []
     choices: list[Choice] = []
-    meter = _Meter()
+    meter = Meter()
     for scan in scans:
         meter.begin()
         if selector is not None:
@@ -143,7 +115,7 @@ def replay(
                 t = time.perf_counter()
                 selection = selector.select()
                 choices.append(Choice(scan.stamp, selection, time.perf_counter() - t))
-                _tell_of_loss(choices, what)
+                tell_of_loss(choices, what)
                 odometry.apply(selection)
                 selector.measure()
         steps.append(tracker.register(scan))
@@ -151,10 +123,10 @@ def replay(
         progress()
     if not steps:
         raise AdaptuneError("there is no scan to replay; check start, stop and views")
-    return _recorded(steps, choices, meter, odometry.usage)
+    return recorded(steps, choices, meter, odometry.usage)
 
 
-class _Meter:
+class Meter:
     """Measures CPU time and memory, scan by scan."""
 
     def __init__(self) -> None:
@@ -168,9 +140,11 @@ class _Meter:
         return time.perf_counter() - self._started
 
     def begin(self) -> None:
+        """A scan is there."""
         self._begin = time.process_time()
 
     def end(self) -> None:
+        """It is done."""
         self._cpu += time.process_time() - self._begin
         if self._n % _SAMPLED == 0:
             self._memory = max(self._memory, resident_megabytes())
@@ -182,7 +156,7 @@ class _Meter:
         return ms, self._memory + (odometry.memory or 0.0)
 
 
-def _tell_of_loss(choices: list[Choice], what: str) -> None:
+def tell_of_loss(choices: list[Choice], what: str) -> None:
     """Log that the bank, or the odometry, is lost since the last selection, or not any more."""
     lost, weights = choices[-1].selection.lost, choices[-1].selection.weights
     if lost != (len(choices) > 1 and choices[-2].selection.lost):
@@ -192,9 +166,14 @@ def _tell_of_loss(choices: list[Choice], what: str) -> None:
         _log.warning("%s: the %s %s at %.1f s", what, who, does, seconds)
 
 
-def _recorded(
-    steps: list[RegisteredScan], choices: list[Choice], meter: _Meter, usage: Usage
+def recorded(
+    steps: list[RegisteredScan],
+    choices: list[Choice],
+    meter: Meter,
+    usage: Usage,
+    real_time: RealTimeRecord | None = None,
 ) -> Replay:
+    """A replay from what became of its scans."""
     stamps, poses, registered, unhealthy, prepare, register = zip(*steps, strict=True)
     return Replay(
         Trajectory(np.array(stamps, np.int64), np.array(poses)),
@@ -206,4 +185,5 @@ def _recorded(
         meter.seconds,
         dict(Counter(what for what in unhealthy if what is not None)),
         *meter.used(usage),
+        real_time,
     )

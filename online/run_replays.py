@@ -3,6 +3,7 @@
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +17,10 @@ from adaptune.study.config import StudyConfig
 from adaptune.study.inputs import check_model, odometry_inputs
 from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
-from online.modes import WITHOUT_MODEL, Mode, ReplaySetup, sequences_without_model
+from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
+from online.real_time import replay_in_real_time
 from online.replay import Replay, replay
+from online.selector_process import SelectorProcess
 from online.stored_reference import is_reference_of, write_reference
 from online.stored_replays import ReplayIdentity, StoredReplay, other_keys, write_replay
 
@@ -68,6 +71,7 @@ def run_replays(
     model.check_study(study.odometry.identity, study.odometry.space, length, model_path)
     setup = ReplaySetup.of(study)
     setup.check(model, model_path)
+    model = setup.pinned(model)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     of = _Modes(setup, setup.modes(model), model, model_path)
@@ -143,18 +147,18 @@ def _replay_due(
     folder = study.folder / "replays" / name
     poses, sequence = study.sequences.reference(name), study.sequences.open(name)
     for i, (mode, about) in enumerate(due.items()):
-        started = modes.setup.start(mode, modes.model, name)
         what = f"{name}, {mode}"
+        run = _in_lockstep if study.config.online.real_time is None else _in_real_time
         try:
-            result = _replay(study.config, sequence, what, started, partial(progress, what))
+            result = run(study.config, sequence, name, modes, mode, partial(progress, what))
         except DescriptorError as error:
             raise ReplayError(f"sequences.{name}: {error}") from error
         if i == 0:
             write_reference(folder, sequence.reference(), result.trajectory, poses)
         write_replay(folder / mode, result, about, modes.model_path)
-        if started.selector is not None:
+        if modes.model is not None and result.choices:
             selections = [choice.selection for choice in result.choices]
-            warn_of_scant_evidence(what, selections, started.selector.fixed)
+            warn_of_scant_evidence(what, selections, modes.setup.fixed(mode, modes.model))
 
 
 def _renew_reference(study: Study, name: str, replayed: Path) -> None:
@@ -174,26 +178,56 @@ def _report_changes(name: str, others: Mapping[str, Sequence[str] | None]) -> No
             _log.info("%s, %s: replayed again, with another %s", name, mode, ", ".join(keys))
 
 
-def _replay(
+def _in_lockstep(
     config: StudyConfig,
     sequence: Recording,
-    what: str,
-    mode: Mode,
+    name: str,
+    modes: _Modes,
+    mode: str,
     progress: Callable[[int, int], None],
 ) -> Replay:
     done, n = itertools.count(1), sequence.n_messages
-    try:
+    odometry = modes.setup.instance(mode, modes.model, name)
+    with closing(odometry):
         result = replay(
             sequence,
-            mode.odometry,
+            odometry,
             config.health,
-            mode.selector,
+            modes.setup.selector(mode, modes.model),
             config.online.period,
             lambda: progress(next(done), n),
-            what,
+            f"{name}, {mode}",
         )
-    finally:
-        mode.odometry.close()
+    progress(n, n)
+    return result
+
+
+def _in_real_time(
+    config: StudyConfig,
+    sequence: Recording,
+    name: str,
+    modes: _Modes,
+    mode: str,
+    progress: Callable[[int, int], None],
+) -> Replay:
+    n, period, setup = sequence.n_messages, config.online.period, modes.setup
+    assert config.online.real_time is not None
+    odometry = setup.instance(mode, modes.model, name)
+    selector = None
+    with closing(odometry), ExitStack() as stack:
+        if setup.adapts(mode):
+            make = partial(setup.selector, mode, modes.model)
+            selector = stack.enter_context(closing(SelectorProcess(make, period)))
+        result = replay_in_real_time(
+            sequence,
+            odometry,
+            config.health,
+            config.online.real_time,
+            selector,
+            lambda n_done: progress(n_done, n),
+            f"{name}, {mode}",
+            setup.core_ms(mode, modes.model),
+        )
     progress(n, n)
     return result
 
@@ -215,8 +249,10 @@ def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: in
 
 def shared_identity(study: Study, name: str) -> dict[str, Any]:
     """What the replays of a sequence depend on in all modes."""
+    in_real_time = study.config.online.real_time
     return {
         "period": study.config.online.period,
+        "real_time": in_real_time and in_real_time.model_dump(mode="json"),
         "odometry": odometry_inputs(study),
         "health": study.config.health.model_dump(mode="json"),
     } | study.sequences.identity(name)

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -157,6 +158,7 @@ class ComparisonRow:
     cpu_ms: float | None = None  # milliseconds of CPU time a scan
     cores: float | None = None  # that this takes at the sensor's rate
     memory_mb: float | None = None  # most megabytes of all processes
+    real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
@@ -188,7 +190,9 @@ class ComparisonRow:
             "_median": self.median,
             "_estimated_low": estimated_low,
             "_estimated_high": estimated_high,
-        } | {f"_{key}": value for key, value in self._standard().items()}
+            **{f"_{key}": value for key, value in self._standard().items()},
+            **{f"_{key}": value for key, value in (self.real_time or {}).items()},
+        }
 
     def _standard(self) -> dict[str, Any]:
         keys = ("ape_m", "rpe_m", "kitti_percent", "kitti_deg_per_m", "kitti_lengths_m")
@@ -228,7 +232,7 @@ def compare_modes(
     reference
         Of the sequence.
     """
-    errors = {mode: reference.errors(replay.trajectory) for mode, replay in replays.items()}
+    errors = _errors(replays, reference)
     yardstick = "fixed" if "fixed" in replays else "baseline"
     block = reference.block
     rows = []
@@ -269,9 +273,21 @@ def compare_modes(
                 summary.cpu_ms,
                 _cores(summary),
                 summary.memory_mb,
+                summary.real_time,
             )
         )
     return rows
+
+
+def _errors(
+    replays: Mapping[str, StoredReplay], reference: Reference
+) -> dict[str, NDArray[np.float64]]:
+    """Percent by mode, each of shape (n,): at the scans that no mode has dropped."""
+    common = reduce(np.intersect1d, [replay.trajectory.stamps for replay in replays.values()])
+    return {
+        mode: reference.errors(replay.trajectory)[np.isin(replay.trajectory.stamps, common)]
+        for mode, replay in replays.items()
+    }
 
 
 def _cores(summary: ReplaySummary) -> float | None:

@@ -39,6 +39,7 @@ class ReplayIdentity(BaseModel):
     model: str | None  # its digest, of an adaptive mode
     switching: dict[str, Any] | None  # see `online.modes.ReplaySetup.identity`
     period: float  # seconds
+    real_time: dict[str, Any] | None = None  # see `online.real_time.RealTime`
     odometry: dict[str, Any]  # with its content, see `adaptune.study.inputs.odometry_inputs`
     health: dict[str, Any]
     sequence: dict[str, Any]
@@ -61,6 +62,7 @@ class ReplaySummary(BaseModel):
     mean_estimated_error: float | None = None
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
+    real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
     model_file: str | None  # of the model that it was made with; None if it needed none
     about: ReplayIdentity
 
@@ -173,6 +175,8 @@ def write_replay(
         "prepare_ms": np.round(1e3 * replay.prepare_seconds, 3),
         "register_ms": np.round(1e3 * replay.register_seconds, 3),
     }
+    if replay.real_time is not None:
+        columns["late_ms"] = np.round(1e3 * np.array(replay.real_time.late), 3)
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     _write_csv(folder / "frames.csv", list(columns), rows)
     stamps = replay.trajectory.stamps
@@ -188,10 +192,30 @@ def write_replay(
         mean_estimated_error=_mean_estimated(replay),
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
+        real_time=kept_up(replay),
         model_file=None if model_file is None else str(model_file.resolve()),
         about=about,
     )
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
+
+
+def kept_up(replay: Replay) -> dict[str, float] | None:
+    """Counts, and medians and 99th percentiles in milliseconds, of a replay in real time."""
+    if (record := replay.real_time) is None:
+        return None
+    found: dict[str, float] = {
+        "rate": record.rate,
+        "dropped_scans": record.dropped,
+        "missed_selections": record.missed,
+        "unseen_scans": record.unseen,
+    }
+    latencies = [choice.seconds for choice in replay.choices]
+    named = {"pose": record.late, "selection": latencies, "waited": record.waited}
+    for name, seconds in named.items():
+        for q in (50, 99):
+            value = 1e3 * float(np.percentile(seconds, q)) if seconds else 0.0
+            found[f"{name}_ms_p{q}"] = round(value, 3)
+    return found
 
 
 def _lost_seconds(replay: Replay) -> float:

@@ -11,6 +11,22 @@ from adaptune.errors import AdaptuneError
 from adaptune.next_command import say_next, say_next_of_study, say_next_online
 from adaptune.terminal import begin_work, console, progress, say
 
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        help="Replay in real time, so many times as fast as it was recorded.",
+        show_default="as fast as it goes, no scan dropped",
+    ),
+]
+
+
+Pin = Annotated[
+    list[str],
+    typer.Option(
+        metavar="KEY=VALUE", help="Hold a parameter at this value in all sets. May be repeated."
+    ),
+]
+
 
 def online(
     study: StudyFile,
@@ -21,6 +37,8 @@ def online(
         typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
     ] = None,
     again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
+    rate: Rate = None,
+    pin: Pin = [],  # noqa: B006
     untrained: Annotated[
         bool,
         typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
@@ -34,18 +52,24 @@ def online(
 
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
+
+    With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
+    so are scans that wait too long.
     """
     if untrained and model is not None:
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    override = [*override, *(f"online.pin.{given}" for given in pin)]
+    if rate is not None:
+        override = [*override, f"online.real_time.rate={rate:g}"]
     loaded = load(study, override, folder)
-    from adaptune.cores import pin
+    from adaptune.cores import pin as bind
     from adaptune.model import ErrorModel
     from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
     from online.run_replays import run_replays, run_untrained
 
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
-    unpin = pin(os.getpid(), alone=True)
+    unbind = bind(os.getpid(), alone=True)
     try:
         with progress() as show:
             if untrained:
@@ -53,7 +77,7 @@ def online(
             else:
                 made = run_replays(loaded, model or loaded.model_path, again, show)
     finally:
-        unpin()
+        unbind()
     if untrained:
         n = len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
     else:
@@ -115,7 +139,8 @@ def compare(
     from adaptune.study.driven import MIN_RECORDINGS
     from offline.budget import TRIALS, more_trials
     from online.comparison import compare as compare_replays
-    from online.comparison import remarks, tables
+    from online.comparison import tables
+    from online.remarks import remarks
 
     loaded.check()
     begin_work()

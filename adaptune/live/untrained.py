@@ -98,6 +98,11 @@ class UntrainedSelector:
         of_members = dict(zip(self.members, weights.tolist(), strict=True))
         return self._live.estimated(weighted_selection(self._sets, of_members))
 
+    def fall_back(self) -> Selection:
+        """See `adaptune.selector.Selector.fall_back`."""
+        weights = {member: float(member == self.fixed) for member in self.members}
+        return Selection(self.fixed, self._sets[self.fixed], weights)
+
     def measure(self) -> None:
         """See `adaptune.selector.Selector.measure`."""
         self._live.measure()

@@ -17,6 +17,8 @@ from adaptune.odometry.base import (
     Usage,
     WarmUp,
 )
+from adaptune.odometry.member_process import spread
+from adaptune.odometry.pool import Factory
 from adaptune.odometry.preparations import Preparations, PreparedScan
 from adaptune.odometry.short_registrations import ShortRegistrations
 from adaptune.odometry.warm_up import Make, RecentScans, catch_up_together
@@ -45,6 +47,8 @@ class Bank(OdometryInstance):
         Which scans a member sees when it restarts.
     lost_track
         Metres a second by which motions may never differ and agree.
+    cores
+        That the members may use, if `make` is a factory, see `spread`. The motions are the same.
 
     Attributes
     ----------
@@ -53,11 +57,21 @@ class Bank(OdometryInstance):
     """
 
     def __init__(
-        self, make: Make, sets: Mapping[int, ParameterSet], warm_up: WarmUp, lost_track: float = 3.0
+        self,
+        make: Make,
+        sets: Mapping[int, ParameterSet],
+        warm_up: WarmUp,
+        lost_track: float = 3.0,
+        cores: int = 1,
     ):
         self.trials = tuple(sets)
         self.restarts = 0
-        self._members = [make(dict(parameters)) for parameters in sets.values()]
+        given = [dict(parameters) for parameters in sets.values()]
+        self._members = (
+            spread(make, given, cores)
+            if isinstance(make, Factory)
+            else [make(parameters) for parameters in given]
+        )
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
         # Members in processes of their own register while those of this process do.
         self._apart_first = sorted(self._members, key=lambda member: not member.apart)
@@ -97,7 +111,7 @@ class Bank(OdometryInstance):
 
     def prepare(self, scan: Scan) -> PreparedScan:
         prepared = self._preparations.of(scan)
-        for member in self._members:
+        for member in self._apart_first:
             prepared.by(member)
         return prepared
 

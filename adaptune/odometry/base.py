@@ -216,12 +216,13 @@ class LastMotion:
         """Begin at a pose, with the motion that led there; None if the sensor stood still."""
         self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
         self._T_before: Poses | None = None
-        self._T_now = np.array(T_odom_sensor)
+        self._T_now = np.array(T_odom_sensor, order="C")
 
     def move(self, T_odom_sensor: Poses) -> None:
         """Move to the pose of the next scan."""
-        # A copy, in case the odometry changes its pose in place.
-        self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor)
+        # A copy, in case the odometry changes its pose in place. Products of matrices round by
+        # their layout in memory, which must not depend on where the odometry runs.
+        self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor, order="C")
 
     @property
     def motions(self) -> Motions:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from adaptune import hosting
-from adaptune.odometry import wire
+from adaptune.odometry import member_process, wire
 from adaptune.odometry.declaration import declare_here
 from adaptune.odometry.registry import odometry_class
 
@@ -18,6 +18,11 @@ def load(name: str) -> None:
 def converse(reader: wire.Readable, writer: BinaryIO, name: str) -> None:
     """Be an instance."""
     wire.serve(reader, writer, name)
+
+
+def members(reader: wire.Readable, writer: BinaryIO, _: str) -> None:
+    """Be members of a bank."""
+    member_process.serve(reader, writer)
 
 
 def describe(reader: wire.Readable, writer: BinaryIO, name: str) -> None:

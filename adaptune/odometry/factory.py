@@ -97,6 +97,10 @@ class OdometryFactory:
         """Versions of the packages that the poses depend on."""
         return versions(self.name)
 
+    def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
+        """What makes the odometry that a set is for, and all parameters that it takes."""
+        return self, self.space.complete(parameters)
+
     def __call__(
         self,
         parameters: ParameterSet | None = None,

@@ -97,6 +97,11 @@ class OdometryPool:
         given = {k: f.reading(program_input) for k, f in self.factories.items()}
         return OdometryPool(given)
 
+    def alone(self, parameters: ParameterSet) -> tuple[OdometryFactory, ParameterSet]:
+        """See `OdometryFactory.alone`."""
+        label, own = self.space.split(parameters)
+        return self.factories[label].alone(own)
+
     def __call__(
         self,
         parameters: ParameterSet | None = None,

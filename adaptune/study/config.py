@@ -117,16 +117,39 @@ class SwitchingConfig(StrictModel):
     memory: float = Field(16.0, gt=0, le=1e6)
 
 
+class RealTimeConfig(StrictModel):
+    """How to replay in real time.
+
+    Attributes
+    ----------
+    rate : float
+        Times as fast as it was recorded.
+    deadline : float
+        Seconds from a scan's arrival to the selection that is made from it; a later one is dropped.
+    queue : int
+        Scans that may wait for the odometry; the oldest ones are dropped. With 0 all wait.
+    """
+
+    rate: float = Field(1.0, gt=0, le=1e3)
+    deadline: float = Field(0.02, gt=0, le=60)
+    queue: int = Field(1, ge=0, le=10_000)
+
+
 class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, switching, and what it may cost.
 
+    A set stays for `dwell` seconds at least. Parameters of `pin` have these values in all sets.
     The budget is in milliseconds of CPU time a scan, all members and live evidence together.
+    Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
+    dwell: float = Field(0.0, ge=0, le=3600)
+    pin: dict[str, Value] = Field(default_factory=dict)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
+    real_time: RealTimeConfig | None = None
 
 
 class StudyConfig(StrictModel):

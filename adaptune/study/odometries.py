@@ -11,7 +11,7 @@ from adaptune.odometry.declaration import declare
 from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, where
 from adaptune.plain_words import Key
 from adaptune.pooled_space import ODOMETRY, PooledSpace
-from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
+from adaptune.space import Categorical, Float, Integer, ParameterSpace, describe, nearest
 from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.mistakes import Mistake, validated
 from adaptune.study.study import describe_odometry, tuned_space, whole_definition
@@ -77,6 +77,7 @@ def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace |
     space = PooledSpace(labelled) if len(entries) > 1 else next(iter(spaces.values()))
     if not mistakes:
         mistakes += _check_switching(config, list(described.values()), space)
+        mistakes += _check_pins(config.online.pin, space)
     return mistakes, space
 
 
@@ -204,6 +205,20 @@ def _check_set(at: Key, given: Mapping[str, Any], space: ParameterSpace) -> Iter
         if name not in space.names:
             message = f"there is no such parameter; {nearest(name, space.names)}"
             yield Mistake((*at, name), message)
+
+
+def _check_pins(pins: Mapping[str, Any], space: ParameterSpace) -> Iterable[Mistake]:
+    """Find parameters that no odometry has, and values that none can have."""
+    spaces = list(space.spaces.values()) if isinstance(space, PooledSpace) else [space]
+    for name, value in pins.items():
+        having = [one.parameters[name] for one in spaces if name in one.parameters]
+        if not having:
+            every = [known for one in spaces for known in one.names]
+            message = f"there is no such parameter; {nearest(name, every)}"
+            yield Mistake(("online", "pin", name), message)
+        elif wrong := [one for one in having if not one.contains(value)]:
+            message = f"{value!r} is outside {describe(wrong[0])}"
+            yield Mistake(("online", "pin", name), message)
 
 
 def _check_switching(

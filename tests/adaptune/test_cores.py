@@ -40,3 +40,15 @@ def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
     unpin = cores.pin(1)
     assert {cores.next_core() for _ in range(4)} == allowed == {3}
     unpin()
+
+
+def test_those_that_work_for_this_process_get_other_cores(allowed):
+    assert [cores.other_core(i) for i in range(4)] == [3, 5, 7, 3]
+    unpin = cores.pin(1, alone=True)
+    assert cores.together() == 4
+    assert [cores.other_core(i) for i in range(4)] == [2, 5, 7, 2]
+    unpin()
+    allowed.clear()
+    allowed.add(7)
+    assert [cores.other_core(i) for i in range(2)] == [7, 7]
+    assert cores.together() == 1

@@ -99,6 +99,32 @@ def with_motion():
     )
 
 
+def test_a_set_stays_for_a_while():
+    (scan, *_) = drive_cave("hdl32e", 3)
+
+    def switches(**given):
+        """Seconds at which another set is selected, where the best one changes every 3 s."""
+        selector, chosen = Selector(with_motion(), "paper", **given), []
+        for i in range(200):
+            selector.observe(i * 10**8, scan, moving(0.05 if (i // 30) % 2 else 0.5))
+            if i % 10 == 0:
+                chosen.append(selector.select().trial)
+        return np.flatnonzero(np.diff(chosen)) + 1
+
+    assert set(np.diff(switches())) == {3}
+    assert min(np.diff(switches(dwell=4.0))) >= 4
+    assert not len(switches(dwell=100.0))
+    with patch.object(Selector, "_worse_than_predicted", lambda self: self._avoided):
+        selector = Selector(with_motion(), "paper", dwell=100.0)
+        selector.observe(0, scan, moving(0.5))
+        first = selector.select().trial
+        for i in range(1, 30):
+            selector.observe(i * 10**8, scan, moving(0.05))
+        assert selector.select().trial == first
+        selector._avoided = {first: 100.0}
+        assert selector.select().trial != first
+
+
 def test_places_differ_by_the_sensors_motion():
     selector = Selector(with_motion(), "paper")
     (scan, *_) = drive_cave("hdl32e", 3)

@@ -18,7 +18,8 @@ from adaptune.study.driven import ModeError, bank_members
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.offline_study import load_study
-from online.comparison import compare, remarks, tables
+from online.comparison import compare, tables
+from online.remarks import remarks
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
 from online.statistics import ComparisonRow, StandardErrors
 from online.stored_replays import StoredReplay, StoredReplayError

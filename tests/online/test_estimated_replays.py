@@ -8,7 +8,8 @@ from pictures import texts
 
 from adaptune.reference.estimated import EstimateError
 from offline.offline_study import load_study
-from online.comparison import compare, remarks, tables
+from online.comparison import compare, tables
+from online.remarks import remarks
 from online.run_replays import run_untrained
 from online.statistics import allowing_for
 

@@ -69,3 +69,19 @@ def test_a_model_for_another_budget_is_refused(tmp_path):
     for given, fitted in ((9.0, None), (None, 9.0), (9.0, 8.0)):
         with pytest.raises(ModeError, match=r"online\.budget: .* run `adaptune offline` again"):
             setup(given).check(replace(model, budget=fitted), tmp_path)
+
+
+def test_what_is_pinned_has_its_value_in_all_sets():
+    model = random_model()
+    pinning = replace(setup(), pins={"points": 7})
+    held = pinning.pinned(model)
+    assert {of["points"] for of in held.sets.parameters} == {7}
+    assert [of | {"points": 0} for of in held.sets.parameters] == [
+        of | {"points": 0} for of in model.sets.parameters
+    ]
+    assert held.digest != model.digest
+    assert setup().pinned(model) is model
+    gicp = replace(pinning, pins={"keyframe_interval": 2.5})
+    members = gicp.untrained_sets().parameters
+    assert {of["keyframe_interval"] for of in members} == {2.5}
+    assert len({of["max_correspondence_distance"] for of in members}) == len(members)

@@ -18,7 +18,7 @@ from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 from adaptune.trajectory import read_tum
-from online.replay import Schedule, replay
+from online.replay import replay
 from online.stored_replays import ReplayIdentity, StoredReplay, write_replay
 
 
@@ -281,14 +281,6 @@ def test_a_real_replay_is_the_same_every_time(tmp_path):
     assert [int(row["stamp_ns"]) for row in rows] == [c.stamp for c in results[0].choices]
     assert {row["predicted_error_percent"] for row in rows} == {"0.5000"}
     assert {float(row["keyframe_interval"]) for row in rows} == {1.0, 3.0}
-
-
-@pytest.mark.parametrize("period", [0.1, 0.2, 0.3, 0.7, 1.0])
-def test_no_selection_is_lost_to_rounding(period):
-    schedule = Schedule(period)
-    every = round(period * 10)
-    due = [i for i in range(6000) if schedule.due(i * 10**8)]
-    assert due == list(range(0, 6000, every))
 
 
 def test_what_a_replay_costs_is_measured_without_reading(tmp_path):

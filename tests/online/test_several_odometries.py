@@ -15,7 +15,8 @@ from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, driven
 from offline.offline_study import load_study
 from offline.train import train
 from offline.validate import validate
-from online.comparison import compare, remarks, tables
+from online.comparison import compare, tables
+from online.remarks import remarks
 from online.run_replays import run_replays
 
 ODOMETRIES = """\

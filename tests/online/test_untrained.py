@@ -15,8 +15,9 @@ from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.study.driven import ModeError
 from offline.offline_study import load_study
-from online.comparison import compare, remarks, tables
+from online.comparison import compare, tables
 from online.modes import ReplaySetup, sequences_without_model
+from online.remarks import remarks
 from online.run_replays import run_replays, run_untrained
 from online.stored_replays import StoredReplay, StoredReplayError
 

@@ -7,6 +7,7 @@ from street import N_SCANS, drive, make, scan
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError, OdometryInstance, Usage, WarmUp
 from adaptune.odometry.bank import Bank
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.hand_over import HandOver
 from adaptune.odometry.in_process import InProcess
@@ -17,6 +18,7 @@ from adaptune.selection import Selection
 BASELINE = KeyframeGicp.space.baseline
 OTHER = {"max_correspondence_distance": 1.0, "keyframe_interval": 1.0}
 WARM_UP = WarmUp(0.5, 0.5, 1)
+FACTORY = OdometryFactory("gicp", {}, KeyframeGicp.space, Limits(seconds=60.0))
 
 
 def gicp(parameters=None):
@@ -36,8 +38,9 @@ KINDS = {
     "hand-over, isolated": lambda: HandOver(isolated, BASELINE, WARM_UP, 2),
     "bank": lambda: Bank(gicp, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
     "bank, isolated": lambda: Bank(isolated, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
+    "bank, two cores": lambda: Bank(FACTORY, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0, cores=2),
 }
-ELSEWHERE = {"isolated", "process", "hand-over, isolated", "bank, isolated"}
+ELSEWHERE = {"isolated", "process", "hand-over, isolated", "bank, isolated", "bank, two cores"}
 every_kind = pytest.mark.parametrize("kind", KINDS)
 
 

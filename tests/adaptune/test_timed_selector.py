@@ -1,0 +1,196 @@
+import logging
+import re
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import drives
+import numpy as np
+import pytest
+from random_models import random_model
+
+from adaptune.live.untrained import UntrainedSelector
+from adaptune.odometry.base import Motions
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.in_process import InProcess
+from adaptune.parameter_sets import ParameterSets
+from adaptune.selection import Selection
+from adaptune.selector import Selector
+from adaptune.sequence.scan import Scan
+from adaptune.timed_selector import Schedule, TimedSelector
+
+SCAN = Scan(0, np.zeros((0, 3), np.float32))
+GUIDE = Path(__file__).parents[2] / "docs/adapting-live.md"
+
+
+def moved(metres):
+    T = np.eye(4)
+    T[0, 3] = metres
+    return Motions(T, {})
+
+
+class Counting:
+    """A selector that notes its calls, and raises at the scans that it is told to."""
+
+    def __init__(self, raises=()):
+        self.raises = set(raises)
+        self.calls = []
+
+    def reset(self):
+        self.calls.append("reset")
+
+    def observe(self, stamp, *_):
+        self.calls.append(stamp)
+        if stamp in self.raises:
+            raise RuntimeError("out of luck")
+
+    def select(self):
+        self.calls.append("select")
+        return Selection(7, {"speed": 1.0})
+
+    def measure(self):
+        self.calls.append("measure")
+
+    def fall_back(self):
+        return Selection(0, {"speed": 0.0})
+
+
+def trials(timed, stamps, motions=None):
+    """By stamp, the trial number of what is selected at each scan, or None."""
+    found = {}
+    for stamp in stamps:
+        selection = timed.update(stamp, SCAN, motions or moved(0.1))
+        found[stamp] = None if selection is None else selection.trial
+    return found
+
+
+@pytest.mark.parametrize("period", [0.1, 0.2, 0.3, 0.7, 1.0])
+def test_no_selection_is_lost_to_rounding(period):
+    schedule = Schedule(period * 1e9)
+    every = round(period * 10)
+    due = [i for i in range(6000) if schedule.due(i * 10**8)]
+    assert due == list(range(0, 6000, every))
+
+
+def test_selects_once_a_period():
+    selected = trials(TimedSelector(Counting()), range(0, 35 * 10**8, 10**8))
+    assert [stamp for stamp, trial in selected.items() if trial] == [0, 10**9, 2 * 10**9, 3 * 10**9]
+
+
+def test_selects_once_a_distance():
+    timed = TimedSelector(Counting(), distance=2.0)
+    due = [i for i in range(20) if timed.update(i, SCAN, moved(0.5))]
+    # The first motion ends at the first scan.
+    assert due == [0, 4, 8, 12, 16]
+    # A robot that stands, or has no pose, has not moved.
+    assert not any(trials(timed, range(100, 120), moved(0.0)).values())
+    assert not any(trials(timed, range(200, 220), moved(np.nan)).values())
+
+
+@pytest.mark.parametrize("given", [{"period": 0.0}, {"distance": -1.0}, {"distance": np.nan}])
+def test_periods_that_cannot_be(given):
+    with pytest.raises(ValueError, match="above 0"):
+        TimedSelector(Counting(), **given)
+
+
+def test_measures_after_each_selection_and_before_the_next_scan():
+    selector = Counting()
+    trials(TimedSelector(selector), [0, 1, 10**9, 10**9 + 1])
+    once = ["measure", 1, 10**9, "select", "measure", 10**9 + 1]
+    assert selector.calls == ["reset", 0, "select", *once]
+
+
+def test_scans_that_come_twice_or_late_are_ignored():
+    selector = Counting()
+    timed = TimedSelector(selector)
+    assert trials(timed, [0, 10**8])[0] == 7
+    assert set(trials(timed, [10**8, 5 * 10**7]).values()) == {None}
+    assert timed.ignored == 2
+    assert 5 * 10**7 not in selector.calls
+
+
+def test_missing_scans_shift_no_selection():
+    stamps = [0, 10**8, 27 * 10**8, 29 * 10**8, 30 * 10**8]
+    assert list(trials(TimedSelector(Counting()), stamps).values()) == [7, None, 7, None, 7]
+
+
+def test_a_clock_that_goes_back_begins_another_drive(caplog):
+    selector = Counting()
+    timed = TimedSelector(selector)
+    trials(timed, [50 * 10**8, 51 * 10**8])
+    assert trials(timed, [10**8])[10**8] == 7
+    assert selector.calls[-3:] == ["reset", 10**8, "select"]
+    assert "the clock went back by 5.0 s" in caplog.text
+
+
+def test_errors_cost_a_selection_and_not_the_drive(caplog):
+    stamps = [i * 10**9 for i in range(8)]
+    timed = TimedSelector(Counting(raises=stamps[2:5]))
+    with caplog.at_level(logging.ERROR):
+        selected = trials(timed, stamps)
+    # The fixed set once, nothing while it goes on failing, then selections again.
+    assert list(selected.values()) == [7, 7, 0, None, None, 7, 7, 7]
+    assert timed.failed == 3
+    assert caplog.text.count("the fixed set is used") == caplog.text.count("out of luck\n") == 1
+
+
+def test_measures_at_once_where_that_is_asked_for():
+    selector = Counting()
+    timed = TimedSelector(selector)
+    trials(timed, [0])
+    timed.measure()
+    timed.measure()
+    trials(timed, [1])
+    assert selector.calls == ["reset", 0, "select", "measure", 1]
+
+
+def test_an_error_of_the_measurement_shows_at_the_next_scan(caplog):
+    class Failing(Counting):
+        def measure(self):
+            raise RuntimeError("out of luck")
+
+    timed = TimedSelector(Failing())
+    trials(timed, [0])
+    timed.measure()
+    assert timed.failed == 1
+    assert "out of luck" in caplog.text
+    assert trials(timed, [1, 2, 10**9]) == {1: 0, 2: None, 10**9: 7}
+
+
+@pytest.mark.parametrize("bank", [True, False])
+def test_falls_back_to_the_fixed_set(bank):
+    model = random_model()
+    members = model.bank if bank else ()
+    found = Selector(model, members=members).fall_back()
+    assert (found.trial, found.parameters) == (model.fixed, model.sets[model.fixed])
+    assert found.weights == ({t: float(t == model.fixed) for t in members} if bank else None)
+    untrained = UntrainedSelector(model.sets, 10.0).fall_back()
+    assert untrained.weights is not None
+    assert untrained.weights.pop(model.sets.trials[0]) == 1.0
+    assert not any(untrained.weights.values())
+
+
+def test_the_guide_s_example(tmp_path, monkeypatch):
+    blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL)
+    (example,) = [block for block in blocks if "TimedSelector(" in block]
+    monkeypatch.chdir(tmp_path)
+    space, model = KeyframeGicp.space, random_model()
+    of_gicp = tuple(space.from_unit(np.random.default_rng(0).random((6, 4))))
+    model = replace(model, sets=ParameterSets(space, model.sets.trials, of_gicp))
+    Path("runs/my").mkdir(parents=True)
+    replace(model, bank=[], vectors=np.zeros((0, 0, 3), np.float32)).save(
+        Path("runs/my/model.safetensors")
+    )
+    names = {}
+    exec(example, names)
+    odometry = InProcess(KeyframeGicp(model.sets[model.fixed]))
+    first, *scans = [Scan(stamp, points) for stamp, points, _ in drives.scans(n_scans=25)]
+    odometry.start(odometry.prepare(first), np.eye(4))
+    poses = []
+    thread = threading.Thread(
+        target=lambda: poses.extend(names["step"](scan, odometry) for scan in scans)
+    )
+    thread.start()
+    thread.join()
+    np.testing.assert_allclose(poses[-1][:3, 3], [24 * 0.3, 0.0, 0.0], atol=0.15)
+    assert names["timed"].failed == 0

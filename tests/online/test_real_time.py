@@ -1,0 +1,218 @@
+import itertools
+import logging
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.odometry.base import OdometryError, Registration
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.in_process import InProcess
+from adaptune.selection import Selection
+from adaptune.sequence.imu import Imu, ImuNoise
+from adaptune.sequence.scan import Scan
+from adaptune.study.config import RealTimeConfig
+from online.real_time import arrivals, outlook, replay_in_real_time
+from online.selector_process import Answer
+
+TENTH = 10**8
+"""Nanoseconds between scans."""
+HEALTH = HealthCheck()
+
+
+def scans(n, imu=False):
+    points = np.zeros((30, 3), np.float32)
+    for i in range(n):
+        measured = Imu(
+            np.array([i]), np.full((1, 3), i), np.zeros((1, 3)), np.eye(4), ImuNoise(1, 1, 1, 1)
+        )
+        yield Scan(i * TENTH, points, imu=measured if imu else None)
+
+
+class Steady:
+    """An odometry that drives straight on, and takes its time."""
+
+    live, space = True, None
+
+    def __init__(self, seconds=0.0, refuses=(), prepares=0.0):
+        self.seconds, self.refuses, self.prepares = seconds, refuses, prepares
+        self.prepared = []
+        self.parameters = {"fine": 1}
+
+    @property
+    def preparation(self):
+        return self.parameters["fine"]
+
+    def prepare(self, scan):
+        self.prepared.append((scan.stamp, self.preparation))
+        time.sleep(self.prepares)
+        return scan
+
+    def start(self, _, T_odom_sensor, __=None):
+        self.T = T_odom_sensor
+
+    def register(self, _):
+        time.sleep(self.seconds)
+        self.T = self.T.copy()
+        self.T[0, 3] += 0.1
+        return Registration(self.T)
+
+    def configure(self, parameters):
+        if parameters.get("fine") in self.refuses:
+            raise OdometryError("too fine")
+        self.parameters |= parameters
+
+
+@dataclass
+class Answering:
+    """Stands for a process that answers after so many seconds, with sets in turn."""
+
+    seconds: float = 0.0
+    unseen: int = 0
+    cpu: float = 1.0
+    period: float = 1.0
+
+    def __post_init__(self):
+        self.turns = itertools.cycle((2, 1))
+        self.shown = {}
+
+    def show(self, stamp, *_):
+        self.shown[stamp] = time.perf_counter()
+        return True
+
+    def answer_to(self, stamp, seconds):
+        left = self.shown[stamp] + self.seconds - time.perf_counter()
+        time.sleep(max(min(left, seconds), 0.0))
+        if left > seconds:
+            return None
+        return Answer(stamp, Selection(0, {"fine": next(self.turns)}), self.seconds, self.cpu)
+
+
+def run(odometry, n=30, selector=None, **settings):
+    return replay_in_real_time(
+        scans(n), InProcess(odometry), HEALTH, RealTimeConfig(**settings), selector
+    )
+
+
+def test_scans_come_when_they_are_due():
+    found = []
+    for arrival in arrivals(scans(8), 10.0, 1):
+        found.append((time.perf_counter() - arrival.due, arrival.scan.stamp))
+        assert not arrival.dropped
+    late, stamps = zip(*found, strict=True)
+    assert list(stamps) == [i * TENTH for i in range(8)]
+    assert min(late) >= 0.0
+    assert np.median(late) < 0.1
+
+
+@pytest.mark.parametrize("queue", [1, 2])
+def test_the_oldest_that_wait_are_dropped_as_in_a_queue_of_ros(queue):
+    found = []
+    for arrival in arrivals(scans(12), 5.0, queue):  # one every 20 ms
+        found.append(arrival)
+        time.sleep(0.07)
+    stamps = [arrival.scan.stamp // TENTH for arrival in found]
+    assert (stamps[0], stamps[-1]) == (0, 11)
+    # The newest are always taken.
+    assert stamps[-queue:] == list(range(12 - queue, 12))
+    assert [arrival.dropped for arrival in found[1:]] == (np.diff(stamps) - 1).tolist()
+    assert 12 - len(found) == sum(arrival.dropped for arrival in found) >= 4
+
+
+def test_with_no_queue_all_scans_wait():
+    found = []
+    for arrival in arrivals(scans(10), 50.0, 0):
+        found.append(arrival.scan.stamp)
+        time.sleep(0.01)
+    assert found == [i * TENTH for i in range(10)]
+
+
+def test_what_the_imu_measured_is_not_dropped():
+    turned = []
+    for arrival in arrivals(scans(10, imu=True), 20.0, 1):
+        turned += arrival.scan.imu.angular_velocity[:, 0].tolist()
+        time.sleep(0.02)
+    assert turned == list(range(10))
+
+
+def test_an_error_of_the_recording_is_raised_here():
+    def broken():
+        yield from scans(3)
+        raise AdaptuneError("the bag ends in a message")
+
+    with pytest.raises(AdaptuneError, match="the bag ends"):
+        replay_in_real_time(broken(), InProcess(Steady()), HEALTH, RealTimeConfig(rate=100.0))
+    with pytest.raises(AdaptuneError, match="no scan to replay"):
+        replay_in_real_time([], InProcess(Steady()), HEALTH, RealTimeConfig())
+
+
+def test_selections_are_applied_before_their_scan_is_registered():
+    odometry = Steady()
+    result = run(odometry, 25, Answering(), rate=10.0, deadline=9.0, queue=0)
+    assert [choice.stamp for choice in result.choices] == [0, 10 * TENTH, 20 * TENTH]
+    assert (result.real_time.missed, result.real_time.dropped) == (0, 0)
+    assert odometry.prepared[:2] == [(0, 2), (TENTH, 2)]
+    assert [fine for stamp, fine in odometry.prepared if stamp == 10 * TENTH] == [1]
+    assert max(choice.seconds for choice in result.choices) < 9.0
+    assert len(result.real_time.late) == len(result.trajectory) == 25
+    # A second of CPU time in the other process, for 25 scans.
+    assert 40.0 < result.cpu_ms < 80.0
+
+
+def test_a_selection_that_comes_while_the_scan_is_prepared():
+    odometry = Steady(prepares=0.2)
+    result = run(odometry, 3, Answering(0.5), deadline=0.8, queue=0)
+    assert [choice.stamp for choice in result.choices] == [0]
+    # Another preparation prepares the scan again.
+    assert odometry.prepared[:3] == [(0, 1), (0, 2), (TENTH, 2)]
+    assert 0.3 < result.real_time.waited[0] < 0.5
+
+
+def test_late_selections_are_dropped_and_the_last_set_stays():
+    odometry = Steady()
+    result = run(odometry, 25, Answering(0.05), rate=10.0, deadline=0.02, queue=0)
+    assert result.real_time.missed == 3
+    assert not result.choices
+    assert odometry.parameters == {"fine": 1}
+    assert max(result.real_time.waited) < 0.05
+
+
+def test_one_that_cannot_be_applied_leaves_the_last_set(caplog):
+    odometry = Steady(refuses=[2])
+    result = run(odometry, 25, Answering(), rate=10.0, deadline=9.0, queue=0)
+    assert [choice.selection.parameters["fine"] for choice in result.choices] == [1]
+    assert caplog.text.count("trial 0 cannot be applied: too fine") == 2
+    assert len(result.trajectory) == 25
+
+
+def test_an_odometry_that_is_too_slow_drops_scans():
+    result = run(Steady(0.03), 40, rate=10.0)  # one every 10 ms
+    assert result.real_time.dropped > 15
+    assert len(result.trajectory) == 40 - result.real_time.dropped
+
+
+@pytest.mark.parametrize(
+    ("ms", "queue", "said"),
+    [
+        (40.0, 1, "a scan takes about 40 ms, and there is one every 50 ms: this machine holds"),
+        (100.0, 1, "about 50% of the scans will be dropped"),
+        (100.0, 0, "the odometry will lag behind"),
+        (np.nan, 1, ""),
+    ],
+)
+def test_it_says_before_whether_the_machine_holds_the_rate(ms, queue, said):
+    stamps = [i * TENTH for i in (0, 1, 2, 5, 6)]
+    found = outlook(stamps, RealTimeConfig(rate=2.0, queue=queue), ms)
+    assert said in found
+    assert bool(said) == bool(found)
+    assert outlook(stamps[:1], RealTimeConfig(), 10.0) == ""
+
+
+def test_it_is_logged(caplog):
+    with caplog.at_level(logging.INFO):
+        replay_in_real_time(
+            scans(3), InProcess(Steady()), HEALTH, RealTimeConfig(), what="home", core_ms=30.0
+        )
+    assert "home: a scan takes about 30 ms" in caplog.text

@@ -1,0 +1,111 @@
+"""A study whose replays are made in real time."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import call
+
+from adaptune.model import BankSettings, ErrorModel
+from offline.offline_study import load_study
+from online.comparison import compare
+from online.remarks import remarks
+from online.run_replays import run_replays
+from online.stored_replays import StoredReplay, StoredReplayError
+
+RATE = "online.real_time.rate=5"
+WAITS = "online.real_time.deadline=5"
+TWO_CORES = "online.switching.cores=2"
+
+
+@pytest.fixture(scope="module")
+def study(study_file, trained_folder, tmp_path_factory):
+    """With a bank, and replays in real time."""
+    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("real_time") / "run")
+    overrides = ["online.rules=[paired]", TWO_CORES, "online.real_time.queue=0", RATE, WAITS]
+    study = load_study(study_file, overrides, folder)
+    model = ErrorModel.load(study.model_path)
+    replace(model, bank_settings=BankSettings()).save(study.model_path)
+    with pytest.MonkeyPatch.context() as patch:
+        # The selector sees every scan, also where the tests share a core.
+        patch.setattr("online.selector_process.SLOTS", 100)
+        run_replays(study, study.model_path)
+    return study
+
+
+def summary(study, mode):
+    return json.loads((study.folder / f"replays/three/{mode}/replay.json").read_text())
+
+
+def test_it_is_recorded_how_a_replay_kept_up(study):
+    for mode in ("baseline", "fixed", "paired"):
+        found = summary(study, mode)
+        kept = found["real_time"]
+        assert found["about"]["real_time"] == {"rate": 5.0, "deadline": 5.0, "queue": 0}
+        assert (kept["rate"], kept["dropped_scans"], kept["missed_selections"]) == (5.0, 0, 0)
+        assert 0.0 < kept["pose_ms_p50"] <= kept["pose_ms_p99"]
+        assert (kept["selection_ms_p50"] > 0.0) == (mode == "paired")
+        # Forty scans in 0.8 s.
+        assert 0.7 < found["replay_s"] < 60.0
+        with (study.folder / f"replays/three/{mode}/frames.csv").open() as file:
+            late = [float(row["late_ms"]) for row in csv.DictReader(file)]
+        assert np.percentile(late, 50) == pytest.approx(kept["pose_ms_p50"], abs=0.01)
+
+
+def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
+    in_real_time = StoredReplay.read(study.folder / "replays/three/paired")
+    overrides = ["online.rules=[paired]", TWO_CORES]
+    lockstep = load_study(study_file, overrides, study.folder.parent / "lockstep")
+    shutil.copytree(study.folder, lockstep.folder)
+    assert run_replays(lockstep, lockstep.model_path) == 3  # those in real time are others
+    found = StoredReplay.read(lockstep.folder / "replays/three/paired")
+    np.testing.assert_allclose(
+        in_real_time.trajectory.T_world_sensor, found.trajectory.T_world_sensor, atol=1e-9
+    )
+    assert list(in_real_time.choice_stamps) == list(found.choice_stamps)
+    np.testing.assert_allclose(in_real_time.estimated, found.estimated, atol=1e-9)
+    assert found.summary.real_time is None
+    mixed = lockstep.folder / "replays/three/paired"
+    shutil.copytree(study.folder / "replays/three/paired", mixed, dirs_exist_ok=True)
+    with pytest.raises(StoredReplayError, match="some were made in real time"):
+        compare(lockstep)
+
+
+def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
+    """Also by a study that does not say that they were, and where scans were dropped."""
+    asks = load_study(study_file, ["online.rules=[paired]", TWO_CORES], study.folder)
+    fixed = study.folder / "replays/three/fixed"
+    said = json.loads((fixed / "replay.json").read_text())
+    said["real_time"] |= {"dropped_scans": 1, "missed_selections": 2}
+    (fixed / "replay.json").write_text(json.dumps(said))
+    for name in ("frames.csv", "trajectory.tum"):
+        lines = (fixed / name).read_text().splitlines(keepends=True)
+        # One of the last twenty scans.
+        (fixed / name).write_text("".join(lines[:-20] + lines[-19:]))
+    rows = compare(asks)
+    assert [row.mode for row in rows] == ["baseline", "fixed", "paired"]
+    assert {row.real_time["rate"] for row in rows} == {5.0}
+    (found,) = [text for text in remarks(rows) if "too late" in text]
+    assert "On three `fixed` was too late for 1 scan and 2 selections, at 5 times the" in found
+
+
+def test_the_command_takes_a_rate(study_file, trained_folder, tmp_path):
+    folder = shutil.copytree(trained_folder, tmp_path / "run")
+    given = [study_file, "--folder", folder, "-o", "online.rules=[paired]"]
+    first, again = (call("online", *given, "--rate", "20") for _ in range(2))
+    assert "3 of 3 replays made" in first.output
+    assert json.loads((folder / "replays/three/fixed/replay.json").read_text())["real_time"]
+    assert "All 3 replays were there" in again.output
+    assert call("compare", *given).exit_code == 0
+    pinned = call("online", *given, "--rate", "20", "--pin", "keyframe_interval=2")
+    assert "2 of 3 replays made" in pinned.output  # the baseline is as it was
+    about = json.loads((folder / "replays/three/fixed/replay.json").read_text())["about"]
+    assert about["parameters"]["keyframe_interval"] == 2
+    refused = call("online", *given, "--rate", "-1")
+    assert refused.exit_code == 2
+    assert "online.real_time.rate: give a number above 0, not -1" in " ".join(
+        refused.output.split()
+    )
