@@ -6,12 +6,12 @@ from functools import partial
 import drives
 import numpy as np
 import pytest
+from noting_selector import Noting, refusing
 
 from adaptune.errors import AdaptuneError
 from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.odometry.base import Motions
 from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.selection import Selection
 from adaptune.sequence.imu import Imu, ImuNoise
 from adaptune.sequence.scan import Scan
 from adaptune.timed_selector import TimedSelector
@@ -42,46 +42,6 @@ def started():
     yield start
     for process in processes:
         process.close()
-
-
-class Noting:
-    """Selects with what it saw."""
-
-    fixed = 0
-
-    def __init__(self, slow=0.0, fails=False):
-        self.slow, self.fails = slow, fails
-        self.seen = []
-
-    def reset(self):
-        self.seen = []
-
-    def observe(self, _, scan, motions):
-        self.seen.append((scan, motions))
-
-    def select(self):
-        time.sleep(self.slow)
-        if self.fails:
-            raise RuntimeError("out of luck")
-        scan, motions = self.seen[-1]
-        told = {
-            "metres": float(motions.T_previous_current[0, 3]),
-            "member": {k: float(T[0, 3]) for k, T in motions.members.items()},
-            "points": scan.points.tolist(),
-            "times": scan.times is not None and scan.times.tolist(),
-            "gyro": scan.imu is not None and scan.imu.angular_velocity.tolist(),
-        }
-        return Selection(len(self.seen), told)
-
-    def measure(self):
-        pass
-
-    def fall_back(self):
-        return Selection(0, {"fixed": True})
-
-
-def refusing():
-    raise AdaptuneError("there is no such descriptor")
 
 
 def test_it_selects_what_a_selector_here_selects(started):
