@@ -116,11 +116,9 @@ def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
 
 
 def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every replay in real time that did not get all scans or selections."""
-    said = []
-    for row in rows:
-        if (kept := row.real_time) is None:
-            continue
+    """Of replays in real time, a sentence about each that did not get all scans or selections."""
+    said, timed = [], [(row, row.real_time) for row in rows if row.real_time is not None]
+    for row, kept in timed:
         found = [
             f"{kept[key]:.0f} {what}{'' if kept[key] == 1 else 's'}"
             for key, what in (("dropped_scans", "scan"), ("missed_selections", "selection"))
@@ -132,6 +130,9 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
                 f"{kept['rate']:g} times the recorded rate; 99 % of its poses came within "
                 f"{kept['pose_ms_p99']:.0f} ms of the scans."
             )
+    if timed and not said:
+        rate = timed[0][1]["rate"]
+        said.append(f"Replayed at {rate:g} times the recorded rate: nothing came too late.")
     return said
 
 
