@@ -15,14 +15,14 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, cast
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from adaptune import keeper
 from adaptune.errors import AdaptuneError
 from adaptune.keeper import Ended
-from adaptune.odometry.wire import Message, Readable, WireError, receive, send
+from adaptune.odometry.wire import Message, Readable, SocketStream, WireError, receive, send
 
 IMPORT_SECONDS = 60.0
 """An import of user code may take so long."""
@@ -220,15 +220,15 @@ def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -
     return what
 
 
-def connect(service: Service, name: str, do: str, bounds: Bounds) -> BinaryIO:
+def connect(service: Service, name: str, do: str, bounds: Bounds) -> SocketStream:
     """A stream to a fresh process, in which a function `do` of the service answers messages."""
     if server(service, name).process.poll() is not None:
         server.cache_clear()
     here, there = socket.socketpair()
-    with here, there:
+    with there:
         request = json.dumps([do, bounds]).encode()
         socket.send_fds(server(service, name).control, [request], [there.fileno()])
-        return cast("BinaryIO", here.makefile("rwb"))
+    return SocketStream(here)
 
 
 class Hosted:
@@ -242,7 +242,7 @@ class Hosted:
 
     def __init__(self, service: Service, name: str, do: str, bounds: Bounds = UNBOUNDED):
         self._to = service, name, do, bounds
-        self._stream: BinaryIO | None = None
+        self._stream: SocketStream | None = None
 
     def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
         """Send a message and wait for the answer.

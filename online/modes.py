@@ -247,7 +247,8 @@ class ReplaySetup:
         return model.costs.adaptive(members) / min(len(members), self.cores)
 
     def _bank(self, sets: Mapping[int, ParameterSet]) -> Bank:
-        return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores)
+        rate = None if self.real_time is None else self.real_time.rate
+        return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores, rate)
 
     def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:
         return mechanism_of(mode, model, self.mechanism, self.odometry.description.live)

@@ -17,6 +17,7 @@ from adaptune.odometry.base import (
     Usage,
     WarmUp,
 )
+from adaptune.odometry.lateness import Lateness
 from adaptune.odometry.member_process import spread
 from adaptune.odometry.pool import Factory
 from adaptune.odometry.preparations import Preparations, PreparedScan
@@ -49,11 +50,16 @@ class Bank(OdometryInstance):
         Metres a second by which motions may never differ and agree.
     cores
         That the members may use, if `make` is a factory, see `spread`. The motions are the same.
+    rate
+        Times as fast as recorded at which scans come: members that are late are not waited for,
+        see `Lateness`. None waits for all.
 
     Attributes
     ----------
     restarts : int
         How often a member was restarted.
+    late : Lateness
+        Which members were late.
     """
 
     def __init__(
@@ -63,6 +69,7 @@ class Bank(OdometryInstance):
         warm_up: WarmUp,
         lost_track: float = 3.0,
         cores: int = 1,
+        rate: float | None = None,
     ):
         self.trials = tuple(sets)
         self.restarts = 0
@@ -80,6 +87,7 @@ class Bank(OdometryInstance):
             for trial, of in sets.items()
         ]
         self._told: set[int] = set()
+        self.late = Lateness(self._members, self._names, rate)
         self._weights = np.eye(len(sets))[0]
         self._agreement = Agreement(len(sets), lost_track)
         self._short = ShortRegistrations()
@@ -111,9 +119,16 @@ class Bank(OdometryInstance):
 
     def prepare(self, scan: Scan) -> PreparedScan:
         prepared = self._preparations.of(scan)
-        for member in self._apart_first:
+        self.late.begin()
+        for member in self._present:
             prepared.by(member)
         return prepared
+
+    @property
+    def _present(self) -> list[OdometryInstance]:
+        """Members that take the next scan; those apart come first."""
+        absent = {self._members[i] for i in np.flatnonzero(self.late.absent)}
+        return [member for member in self._apart_first if member not in absent]
 
     def apply(self, selection: Selection) -> None:
         # Members without a weight get 0.
@@ -131,9 +146,11 @@ class Bank(OdometryInstance):
     def start(
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        for member in self._members:
+        self.late.settle()
+        for member in self._present:
             member.start(prepared.by(member), T_odom_sensor, T_previous_current)
-        self._T_previous_current = self._member_motions()
+        self._T_previous_current = self._member_motions(T_odom_sensor)
+        self.late.given(T_odom_sensor)
         self._agreement.start()
         self._short.start(prepared.stamp, prepared.scan.points)
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
@@ -145,16 +162,21 @@ class Bank(OdometryInstance):
         self._restart(self._asked)
         self._asked[:] = False
         self._submitted = prepared
-        for member in self._apart_first:
+        for member in self._present:
             member.submit(prepared.by(member))
 
     def collect(self) -> Registration:
-        scan = self._submitted
-        found = {member: member.collect() for member in reversed(self._apart_first)}
+        scan, before = self._submitted, self._recent.last
+        seconds = (scan.stamp - before.scan.stamp) * 1e-9
+        numbers = {member: i for i, member in enumerate(self._members)}
+        found = {
+            member: self.late.collect(numbers[member], seconds)
+            for member in reversed(self._apart_first)
+        }
         registrations = [found[member] for member in self._members]
         self._tell()
-        self._T_previous_current = T_previous_current = self._member_motions()
-        seconds = (scan.stamp - self._recent.last.scan.stamp) * 1e-9
+        T_previous_current = self._member_motions(before.T_odom_sensor)
+        self._T_previous_current = T_previous_current
         self._short.add(scan.stamp, scan.scan.points)
         agreeing = self._agreement.judge(
             T_previous_current, seconds, self._weights, self._short, self._lost
@@ -166,6 +188,7 @@ class Bank(OdometryInstance):
         T_moved = self._agreement.T_previous_current
         T_odom_sensor = rectify(self._recent.last.T_odom_sensor @ T_moved)
         self._recent.add(scan, T_odom_sensor)
+        self.late.given(T_odom_sensor)
         self._last_motion.move(T_odom_sensor)
         self._restart(self._agreement.due)
         registered = np.array([registration.registered for registration in registrations])
@@ -175,12 +198,13 @@ class Bank(OdometryInstance):
         for member in self._members:
             member.close()
 
-    def _member_motions(self) -> Poses:
-        return np.array([member.motions.T_previous_current for member in self._members])
+    def _member_motions(self, T_odom_previous: Poses) -> Poses:
+        return np.array([self.late.motion(i, T_odom_previous) for i in range(len(self._members))])
 
     def _restart(self, members: NDArray[np.bool_]) -> None:
-        """Restart members at the bank's pose, but for those that have given up."""
+        """Restart members at the bank's pose, but for those that have given up or are late."""
         members = members & ~np.array([member.given_up for member in self._members])
+        members &= ~self.late.working
         due = [self._members[i] for i in np.flatnonzero(members)]
         in_order = [member for member in self._apart_first if member in due]
         catch_up_together([self._recent.replay_to(member) for member in in_order])

@@ -155,6 +155,15 @@ class OdometryInstance(Protocol):
         """Whether it had so many faults that it does not start again."""
         return False
 
+    @property
+    def busy(self) -> bool:
+        """Whether what runs it works on a scan that was not collected, and takes no other."""
+        return False
+
+    def ready(self, seconds: float) -> bool:  # noqa: ARG002
+        """Whether `collect` has something to give in so many seconds."""
+        return True
+
     @abstractmethod
     def prepare(self, scan: Scan) -> Any:
         """Do to a scan all that does not depend on the pose or on earlier scans.

@@ -7,7 +7,7 @@ milliseconds, and global state of the odometry ends with its process.
 import contextlib
 import logging
 from collections.abc import Sequence
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationInfo
@@ -136,7 +136,8 @@ class Isolated(Faulting):
             "settings": settings.model_dump(mode="json"),
         }
         self._limits = limits
-        self._stream: BinaryIO | None = None
+        self._stream: wire.SocketStream | None = None
+        self._busy = False
         # Nothing else limits TBB's threads, and it sums in the order in which they finish.
         self._core = next_core()
 
@@ -147,6 +148,13 @@ class Isolated(Faulting):
     @property
     def usage(self) -> Usage:
         return Usage(self._cpu, self._memory, elsewhere=self._cpu)
+
+    @property
+    def busy(self) -> bool:
+        return self._busy
+
+    def ready(self, seconds: float) -> bool:
+        return self._stream is None or self._stream.ready(seconds)
 
     def prepare(self, scan: Scan) -> Scan:
         return scan  # the other process prepares
@@ -177,7 +185,7 @@ class Isolated(Faulting):
         )
 
     def submit(self, prepared: Scan) -> None:
-        self._submitted = prepared.stamp
+        self._submitted, self._busy = prepared.stamp, True
         self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
 
     def collect(self) -> Registration:
@@ -188,6 +196,7 @@ class Isolated(Faulting):
     def _registration(self) -> Registration:
         """The answer to the submitted scan; NaN if there is none, or a wrong one."""
         answer, lost = self._receive(), Registration(np.full((4, 4), np.nan), registered=False)
+        self._busy = False
         if answer is None:
             return lost
         try:
@@ -260,7 +269,7 @@ class Isolated(Faulting):
             return None
         return answer
 
-    def _connect(self) -> BinaryIO:
+    def _connect(self) -> wire.SocketStream:
         """A stream to a new process, which first receives a hello."""
         bounds = self._limits.bounds._replace(core=self._core)
         try:

@@ -8,6 +8,7 @@ its process, it ends the others there, too.
 import contextlib
 import itertools
 import resource
+import time
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from typing import Any, BinaryIO, NamedTuple
@@ -56,10 +57,16 @@ class MemberProcess:
         self.ending = ""  # what is known of how the last one ended
         self._name = name
         self._bounds = bounds
-        self._stream: BinaryIO | None = None
+        self._stream: wire.SocketStream | None = None
         self._numbers = itertools.count()
         self._held: OrderedDict[int, None] = OrderedDict()
         self._answers: dict[int, deque[wire.Message]] = {}
+        self._owed = 0  # answers that are not here yet
+
+    @property
+    def busy(self) -> bool:
+        """Whether it works: a scan that it is sent would wait."""
+        return self._owed > 0
 
     @property
     def alive(self) -> bool:
@@ -81,12 +88,13 @@ class MemberProcess:
                 raise OdometryError(str(error)) from error
             self.generation += 1
             self._held.clear()
-            self._answers = {}
+            self._answers, self._owed = {}, 0
 
     def sent(self, scan: Scan) -> SentScan:
-        """Give a scan a number, and send it where there is a process."""
+        """Give a scan a number, and send it where there is a process that takes it now."""
         sent = SentScan(next(self._numbers), scan)
-        self.need(sent)
+        if not self.busy:
+            self.need(sent)
         return sent
 
     def need(self, sent: SentScan) -> None:
@@ -94,35 +102,52 @@ class MemberProcess:
         if self._stream is not None and sent.number not in self._held:
             _keep(self._held, sent.number, None)
             header = {"type": "scan", "number": sent.number, "stamp": sent.scan.stamp}
-            self.send(header, **wire.scan_arrays(sent.scan))
+            self._send(header, **wire.scan_arrays(sent.scan))
 
-    def send(self, header: dict[str, Any], **arrays: Any) -> None:
-        """Send a message to a member, or to all."""
+    def ask(self, header: dict[str, Any], **arrays: Any) -> None:
+        """Send a member what it has to answer."""
+        self._owed += 1
+        self._send(header, **arrays)
+
+    def _send(self, header: dict[str, Any], **arrays: Any) -> None:
         if self._stream is not None:
             # A process that does not listen any more has said why, or has ended.
             with contextlib.suppress(OSError):
                 wire.send(self._stream, header, **arrays)
 
+    def ready(self, member: int, seconds: float) -> bool:
+        """Whether `receive` would not wait longer than so many seconds."""
+        end = time.perf_counter() + seconds
+        while not self._answers.get(member) and self._stream is not None:
+            if not self._stream.ready(end - time.perf_counter()):
+                return False
+            self._take_answer(self._stream)
+        return True
+
     def receive(self, member: int) -> wire.Message | None:
         """Wait for a member's answer; None if the process ends before."""
-        mine = self._answers.setdefault(member, deque())
-        while not mine and self._stream is not None:
-            answer = None
-            with contextlib.suppress(OSError, wire.WireError):
-                answer = wire.receive(self._stream)
-            if answer is None or answer.header["type"] == "fault":
-                self.ending = "its process ended" if answer is None else answer.header["message"]
-                self.close()
-            else:
-                self._answers.setdefault(answer.header["member"], deque()).append(answer)
+        while not self._answers.get(member) and self._stream is not None:
+            self._take_answer(self._stream)
+        mine = self._answers.get(member)
         return mine.popleft() if mine else None
+
+    def _take_answer(self, stream: wire.SocketStream) -> None:
+        answer = None
+        with contextlib.suppress(OSError, wire.WireError):
+            answer = wire.receive(stream)
+        if answer is None or answer.header["type"] == "fault":
+            self.ending = "its process ended" if answer is None else answer.header["message"]
+            self.close()
+        else:
+            self._owed -= 1
+            self._answers.setdefault(answer.header["member"], deque()).append(answer)
 
     def close(self) -> None:
         """End the process."""
         if self._stream is not None:
             with contextlib.suppress(OSError):
                 self._stream.close()
-            self._stream = None
+            self._stream, self._owed = None, 0
 
 
 class Member(Faulting):
@@ -173,6 +198,13 @@ class Member(Faulting):
     def preparation(self) -> MemberProcess:
         return self._process
 
+    @property
+    def busy(self) -> bool:
+        return self._process.busy
+
+    def ready(self, seconds: float) -> bool:
+        return self.ended or self._process.ready(self._number, seconds)
+
     def prepare(self, scan: Scan) -> SentScan:
         return self._process.sent(scan)
 
@@ -195,7 +227,7 @@ class Member(Faulting):
         if not self.ended:
             self._process.need(prepared)
             header = {"type": "register", "scan": prepared.number, "member": self._number}
-            self._process.send(header)
+            self._process.ask(header)
 
     def collect(self) -> Registration:
         registration = Registration(np.full((4, 4), np.nan), registered=False)
@@ -216,7 +248,7 @@ class Member(Faulting):
 
     def _ask(self, header: dict[str, Any], **arrays: Any) -> None:
         if not self.ended:
-            self._process.send({**header, "member": self._number}, **arrays)
+            self._process.ask({**header, "member": self._number}, **arrays)
             self._receive()
 
     def _receive(self) -> wire.Message | None:

@@ -3,7 +3,7 @@
 import socket
 import tempfile
 from functools import cache
-from typing import Any, BinaryIO, Self, cast
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
@@ -97,7 +97,7 @@ class Process(Isolated):
             self._program.close()
             self._program = None
 
-    def _connect(self) -> BinaryIO:
+    def _connect(self) -> wire.SocketStream:
         address = self._reach.address
         if address is None:
             self._socket = self._begin(self._reach.command or ())
@@ -111,7 +111,7 @@ class Process(Isolated):
                 what = f"nothing listens at {address} ({error.strerror})"
                 raise OdometryError(f"{what}: start the program there first") from error
         self._socket.settimeout(max(self._limits.seconds, _FIRST_ANSWER))
-        return cast("BinaryIO", self._socket.makefile("rwb"))
+        return wire.SocketStream(self._socket)
 
     def _begin(self, command: tuple[str, ...]) -> socket.socket:
         here, there = socket.socketpair()

@@ -1,15 +1,20 @@
 """Register scan after scan, and restart the odometry where its motion is not healthy."""
 
 import time
+from collections import deque
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, invert, rectify, rotation_angle
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.sequence.scan import Scan
+
+WARM_UP = 2.0
+"""Seconds of scans that an odometry sees again where it restarts with other parameters."""
 
 
 class RegisteredScan(NamedTuple):
@@ -23,31 +28,60 @@ class RegisteredScan(NamedTuple):
     register_seconds: float
 
 
+class _Seen(NamedTuple):
+    """A scan of the last seconds, with its pose and the motion to it."""
+
+    scan: Scan
+    preparation: Hashable
+    prepared: Any
+    T_odom_sensor: Poses
+    T_previous_current: Poses | None
+
+
 @dataclass
 class Tracker:
-    """Registers scan after scan, and restarts the odometry where its motion is not healthy."""
+    """Registers scan after scan, and restarts the odometry where its motion is not healthy.
 
-    odometry: OdometryInstance  # a new instance
+    Attributes
+    ----------
+    odometry : OdometryInstance
+        A new instance.
+    health : HealthCheck
+        What motions are healthy.
+    fall_back : callable, optional
+        Called with the stamp of a scan and what is wrong, before the odometry restarts. It may
+        change the parameters; if it says that it did, the odometry sees the scans of the last
+        `WARM_UP` seconds again. If its motion is still not healthy then, it restarts without a
+        past.
+    """
+
+    odometry: OdometryInstance
     health: HealthCheck
+    fall_back: Callable[[int, str], bool] | None = None
     _last: RegisteredScan | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._guard = Guard(self.health)
+        self._seen: deque[_Seen] = deque()
 
     def register(self, scan: Scan) -> RegisteredScan:
         """Find the pose of the next scan."""
         begin = time.perf_counter()
         prepared = self.odometry.prepare(scan)
-        return self.register_prepared(scan.stamp, prepared, time.perf_counter() - begin)
+        seconds = time.perf_counter() - begin
+        return self.register_prepared(scan.stamp, prepared, seconds, scan)
 
     def register_prepared(
-        self, stamp: int, prepared: Any, prepare_seconds: float = 0.0
+        self, stamp: int, prepared: Any, prepare_seconds: float = 0.0, scan: Scan | None = None
     ) -> RegisteredScan:
-        """Find the pose of the next scan, which such an odometry has prepared."""
+        """Find the pose of the next scan, which such an odometry has prepared.
+
+        A warm-up needs the scan as well.
+        """
         begin = time.perf_counter()
         registered, unhealthy = True, None
         if self._last is None:
-            T_odom_sensor = np.eye(4)
+            T_odom_sensor, T_previous_current = np.eye(4), None
             self.odometry.start(prepared, T_odom_sensor)
         else:
             T_odom_previous = self._last.T_odom_sensor
@@ -60,9 +94,52 @@ class Tracker:
                 T_previous_healthy, T_healthy = self._guard.go_on(elapsed)
                 # The motion was computed from the pose before: their errors of rounding multiply.
                 T_odom_sensor = rectify(T_odom_previous @ T_previous_healthy @ T_healthy)
-                self.odometry.start(prepared, T_odom_sensor, T_healthy)
+                T_previous_current = T_healthy
+                T_warm = None
+                if self.fall_back is not None and self.fall_back(stamp, unhealthy):
+                    prepared = prepared if scan is None else self.odometry.prepare(scan)
+                    T_warm = self._warm_up(prepared, T_healthy, elapsed)
+                if T_warm is None:
+                    self.odometry.start(prepared, T_odom_sensor, T_healthy)
+                else:
+                    T_odom_sensor = T_warm
+        if self.fall_back is not None and scan is not None:
+            self._remember(scan, prepared, T_odom_sensor, T_previous_current)
         seconds = time.perf_counter() - begin
         self._last = RegisteredScan(
             stamp, T_odom_sensor, registered, unhealthy, prepare_seconds, seconds
         )
         return self._last
+
+    def _remember(
+        self, scan: Scan, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None
+    ) -> None:
+        preparation = self.odometry.preparation
+        self._seen.append(_Seen(scan, preparation, prepared, T_odom_sensor, T_previous_current))
+        while scan.stamp - self._seen[0].scan.stamp > WARM_UP * 1e9:
+            self._seen.popleft()
+
+    def _warm_up(self, prepared: Any, T_healthy: Poses, elapsed: float) -> Poses | None:
+        """Show the odometry the last seconds again; its pose then, None if that is not healthy."""
+        if not self._seen:
+            return None
+        first, *others = self._seen
+        start = self._prepared(first), first.T_odom_sensor, first.T_previous_current
+        self.odometry.start(*start)
+        for seen in others:
+            self.odometry.register(self._prepared(seen))
+        T_odom_sensor, registered = self.odometry.register(prepared)
+        T = self.odometry.motions.T_previous_current
+        if not (registered and np.isfinite(T).all() and np.isfinite(T_odom_sensor).all()):
+            return None
+        velocity, usual = (motion[:3, 3] / elapsed for motion in (T, T_healthy))
+        turn_rate = float(rotation_angle(T)) / elapsed
+        if self.health.exceeded(velocity, usual, elapsed, turn_rate) is not None:
+            return None
+        return T_odom_sensor
+
+    def _prepared(self, seen: _Seen) -> Any:
+        """A scan of the past, prepared as the odometry takes it now."""
+        if seen.preparation == self.odometry.preparation:
+            return seen.prepared
+        return self.odometry.prepare(seen.scan)

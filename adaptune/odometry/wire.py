@@ -33,9 +33,11 @@ see `adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
 
 import json
 import resource
+import select
+import socket
 import struct
-from collections.abc import Callable, Mapping
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +72,50 @@ class Readable(Protocol):
         """Read so many bytes; fewer only at the end."""
 
 
+class Writable(Protocol):
+    """A stream that takes messages."""
+
+    def write(self, data: bytes, /) -> Any:
+        """Take bytes."""
+
+    def writelines(self, lines: Iterable[Any], /) -> None:
+        """Take several buffers."""
+
+    def flush(self) -> None:
+        """Send what was taken."""
+
+
+class SocketStream:
+    """A socket as a stream of messages, which tells whether one has come.
+
+    Nothing is read ahead, so that what has come can be seen at the socket.
+    """
+
+    def __init__(self, connection: socket.socket):
+        self._socket = connection
+        self._writer = connection.makefile("wb")
+        self.write, self.writelines = self._writer.write, self._writer.writelines
+        self.flush = self._writer.flush
+
+    def read(self, size: int, /) -> bytes:
+        """Read so many bytes; fewer only at the end."""
+        data = bytearray()
+        while len(data) < size and (more := self._socket.recv(size - len(data))):
+            data += more
+        return bytes(data)
+
+    def ready(self, seconds: float) -> bool:
+        """Whether a message, or the end, is there, or comes in so many seconds."""
+        return bool(select.select([self._socket], [], [], max(seconds, 0.0))[0])
+
+    def close(self) -> None:
+        """Close the socket."""
+        try:
+            self._writer.close()
+        finally:
+            self._socket.close()
+
+
 class WireError(AdaptuneError):
     """A stream without messages of this version."""
 
@@ -81,7 +127,7 @@ class Message(NamedTuple):
     arrays: dict[str, NDArray[Any]]
 
 
-def send(stream: BinaryIO, header: Mapping[str, Any], **arrays: NDArray[Any] | None) -> None:
+def send(stream: Writable, header: Mapping[str, Any], **arrays: NDArray[Any] | None) -> None:
     """Write a message; arrays that are None are left out."""
     given = {name: np.ascontiguousarray(a) for name, a in arrays.items() if a is not None}
     layout = [[name, a.dtype.str, list(a.shape)] for name, a in given.items()]
@@ -197,7 +243,7 @@ def announced(answer: Message) -> Description:
 
 
 def serve(
-    reader: Readable, writer: BinaryIO, name: str | None = None, make: Make = make_here
+    reader: Readable, writer: Writable, name: str | None = None, make: Make = make_here
 ) -> None:
     """Answer messages with an odometry until the stream ends; anything else is a `WireError`.
 
@@ -266,7 +312,7 @@ def unpacked(found: Any) -> Registration:
         raise TypeError(f"register returned {found!r:.100}, not a Registration") from error
 
 
-def _answer(odometry: Served, message: Message, writer: BinaryIO) -> None:
+def _answer(odometry: Served, message: Message, writer: Writable) -> None:
     header, arrays = message
     if header["type"] == "register":
         found = odometry.register(odometry.prepare(to_scan(message)))

@@ -1,0 +1,135 @@
+"""Members of a bank that do not keep up with the sensor."""
+
+import logging
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert
+from adaptune.odometry.base import OdometryInstance, Registration
+
+ALWAYS = 10
+"""A member that is late at so many scans in a row is removed."""
+
+_log = logging.getLogger(__name__)
+
+
+class Lateness:
+    """Collects the poses of members that are in time, and does not wait for the others.
+
+    A member in another process has until the next scan is due. One that needs longer is late: it
+    has no motion over that scan, and takes part again as soon as it is done. Members of this
+    process are never late, for everything waits for them.
+
+    Parameters
+    ----------
+    members, names
+        Of the bank.
+    rate
+        Times as fast as recorded at which scans come; None if the bank waits for everybody.
+
+    Attributes
+    ----------
+    scans : ndarray of shape (n_members,)
+        At how many scans each member was late.
+    removed : ndarray of shape (n_members,)
+        Members that were always late: they take no part any more.
+    absent : ndarray of shape (n_members,)
+        Members that have no motion over the newest scan.
+    """
+
+    def __init__(
+        self, members: Sequence[OdometryInstance], names: Sequence[str], rate: float | None
+    ):
+        n = len(members)
+        self.scans = np.zeros(n, np.intp)
+        self.removed, self.absent = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._members, self._names, self._rate = members, names, rate
+        self._owing = np.zeros(n, np.bool_)
+        self._in_a_row = np.zeros(n, np.intp)
+        # The bank's pose at the last scan that each member was given.
+        self._T_odom_given = np.tile(np.eye(4), (n, 1, 1))
+
+    def settle(self) -> None:
+        """Wait for all that is owed, as before everybody starts again."""
+        for i in np.flatnonzero(self._owing & ~self.removed).tolist():
+            self._members[i].collect()
+        self._owing[:] = False
+        self.absent[:] = self.removed
+
+    def begin(self) -> None:
+        """A scan is there: take what came late. Members that still work are absent."""
+        self._begun = time.perf_counter()
+        if self._rate is None:
+            return
+        for i in np.flatnonzero(self._owing).tolist():
+            if self._members[i].ready(0.0):
+                self._members[i].collect()
+                self._owing[i] = False
+        busy = [member.busy for member in self._members]
+        self.absent = self._owing | self.removed | np.array(busy)
+
+    def collect(self, i: int, interval: float) -> Registration:
+        """A member's pose; NaN if it is absent, or late.
+
+        Parameters
+        ----------
+        i
+            Number of the member.
+        interval
+            Seconds from the scan before to this one.
+        """
+        if not self.absent[i]:
+            if self._rate is None:
+                return self._members[i].collect()
+            left = self._begun + interval / self._rate - time.perf_counter()
+            if self._members[i].ready(left):
+                self._in_a_row[i] = 0
+                return self._members[i].collect()
+            self._owing[i] = True
+        self._note(i)
+        return Registration(np.full((4, 4), np.nan), registered=False)
+
+    def _note(self, i: int) -> None:
+        if self.removed[i]:
+            return
+        self.scans[i] += 1
+        self._in_a_row[i] += 1
+        # Somebody has to go on.
+        if self._in_a_row[i] >= ALWAYS and self.removed.sum() < len(self._members) - 1:
+            self.removed[i] = True
+            what = "%s was late at %d scans in a row; the bank goes on without it"
+            _log.warning(what, self._names[i], ALWAYS)
+
+    def motion(self, i: int, T_odom_previous: Poses) -> Poses:
+        """A member's motion over the newest scan, of shape (4, 4); NaN if it is absent or late.
+
+        Where the member has missed scans, it moved there as the bank did.
+
+        Parameters
+        ----------
+        i
+            Number of the member.
+        T_odom_previous
+            The bank's pose at the scan before.
+        """
+        if self.absent[i] or self._owing[i]:
+            return np.full((4, 4), np.nan)
+        T_moved = self._members[i].motions.T_previous_current
+        T_given = self._T_odom_given[i]
+        if self._rate is None or np.array_equal(T_given, T_odom_previous):
+            return T_moved
+        missed: Poses = invert(T_odom_previous) @ T_given
+        return np.asarray(missed @ T_moved)
+
+    def given(self, T_odom_sensor: Poses) -> None:
+        """Take note of the bank's pose at a scan that all present members were given."""
+        if self._rate is not None:
+            self._T_odom_given[~self.absent] = T_odom_sensor
+
+    @property
+    def working(self) -> NDArray[np.bool_]:
+        """Members that cannot be restarted now, of shape (n_members,)."""
+        return self._owing | self.absent
