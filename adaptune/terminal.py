@@ -68,12 +68,17 @@ How much is done may be a fraction: half a run, say.
 
 
 @contextmanager
-def progress() -> Iterator[Show]:
-    """Show a bar for each thing that is done; without a terminal, write a line now and then."""
+def progress(above: Any = None) -> Iterator[Show]:
+    """Show a bar for each thing that is done; without a terminal, write a line now and then.
+
+    In a terminal, `above` stands over the bars: something that rich can render, again and again.
+    """
     begin_work()
     if not errors.is_terminal:
         yield _logger()
         return
+    from rich.console import Group
+    from rich.live import Live
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -92,7 +97,8 @@ def progress() -> Iterator[Show]:
     )
     tasks: dict[str, TaskID] = {}
     pace, full = _Pace(), _Full()
-    with bars:
+    shown = bars if above is None else Live(Group(above, bars), console=errors)
+    with shown:
 
         def show(what: str, done: float, total: int, remark: str = "") -> None:
             if full.again(what, done, total):

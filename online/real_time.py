@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.errors import AdaptuneError
+from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.tracker import RegisteredScan, Tracker
+from adaptune.odometry.tracker import RegisteredScan
 from adaptune.sequence.imu import Imu, joined
 from adaptune.sequence.scan import Scan
 from adaptune.study.config import RealTimeConfig
 from adaptune.timed_selector import Schedule
-from online.replay import Choice, Meter, RealTimeRecord, Replay, recorded, tell_of_loss
+from online.replay import Meter, Progressed, RealTimeRecord, Replay, Watch, recorded
+from online.safety import Choice, Driver
 from online.selector_process import Answer, SelectorProcess
 
 _AHEAD = 32
@@ -133,7 +134,7 @@ def replay_in_real_time(
     health: HealthCheck,
     settings: RealTimeConfig,
     selector: SelectorProcess | None = None,
-    progress: Callable[[int], None] = lambda _: None,
+    watch: Watch = lambda _: None,
     what: str = "the replay",
     core_ms: float = np.nan,
 ) -> Replay:
@@ -149,8 +150,8 @@ def replay_in_real_time(
         Rate, deadline and queue.
     selector
         Chooses the parameters; without one they stay. What is late is dropped.
-    progress
-        Called after every scan with the number of those that are done or dropped.
+    watch
+        Called after every scan.
     core_ms
         Milliseconds that a scan keeps the busiest core at work, if they are known.
 
@@ -163,45 +164,77 @@ def replay_in_real_time(
     first = list(islice(source, _AHEAD // 2))
     if said := outlook([scan.stamp for scan in first], settings, core_ms):
         _log.info("%s: %s", what, said)
-    tracker, meter, steps = Tracker(odometry, health), Meter(), list[RegisteredScan]()
-    selecting = _Selecting(odometry, selector, settings, what)
-    for scan, due, dropped in arrivals(chain(first, source), settings.rate, settings.queue):
+    steps, choices, meter = list[RegisteredScan](), list[Choice](), Meter()
+    drive = RealTimeDrive(odometry, health, settings, selector, choices.append, what)
+    for arrival in arrivals(chain(first, source), settings.rate, settings.queue):
         meter.begin()
-        selecting.record.dropped += dropped
-        begin = time.perf_counter()
-        prepared = selecting.prepare(scan, due)
-        seconds = time.perf_counter() - begin
-        steps.append(tracker.register_prepared(scan.stamp, prepared, seconds))
-        selecting.record.late.append(time.perf_counter() - due)
+        steps.append(drive.step(arrival))
         meter.end()
-        progress(len(steps) + selecting.record.dropped)
-    if not steps:
-        raise AdaptuneError("there is no scan to replay; check start, stop and views")
+        done, newest = len(steps) + drive.record.dropped, choices[-1] if choices else None
+        watch(Progressed(done, steps[-1], newest, drive.record))
     usage = odometry.usage
     if selector is not None:
-        selecting.record.unseen = selector.unseen
         usage = usage._replace(elsewhere=usage.elsewhere + selector.cpu)
-    return recorded(steps, selecting.choices, meter, usage, selecting.record)
+    return recorded(steps, choices, meter, usage, drive.finished())
 
 
-class _Selecting:
-    """Has scans described while they are prepared, and applies what is selected in time."""
+class RealTimeDrive:
+    """Takes scans as they come, and applies what is selected in time.
+
+    A scan is described while it is prepared.
+
+    Parameters
+    ----------
+    odometry, health, settings, selector, what
+        See `replay_in_real_time`.
+    note
+        Called with every choice, also with those that are not applied.
+
+    Attributes
+    ----------
+    record : RealTimeRecord
+        How it keeps up.
+    """
 
     def __init__(
         self,
         odometry: OdometryInstance,
-        selector: SelectorProcess | None,
+        health: HealthCheck,
         settings: RealTimeConfig,
+        selector: SelectorProcess | None,
+        note: Callable[[Choice], None],
         what: str,
     ):
-        self.choices: list[Choice] = []
         self.record = RealTimeRecord(settings.rate)
         self._odometry, self._selector = odometry, selector
-        self._deadline = settings.deadline
+        self._deadline, self._note = settings.deadline, note
         self._schedule = Schedule(1.0 if selector is None else selector.period * 1e9)
-        self._what = what
+        fixed = None if selector is None else selector.fixed
+        self._driver = Driver(odometry, health, fixed, what, note)
 
-    def prepare(self, scan: Scan, due: float) -> Any:
+    def step(self, arrival: Arrival) -> RegisteredScan:
+        """Select if that is due, and find the pose of a scan."""
+        scan, due, dropped = arrival
+        self.record.dropped += dropped
+        begin = time.perf_counter()
+        prepared = self._prepare(scan, due)
+        seconds = time.perf_counter() - begin
+        found = self._driver.register_prepared(scan, prepared, seconds)
+        self.record.late.append(time.perf_counter() - due)
+        return found
+
+    def finished(self) -> RealTimeRecord:
+        """The record, with what selector and bank have counted."""
+        if self._selector is not None:
+            self.record.unseen = self._selector.unseen
+        if isinstance(self._odometry, Bank):
+            late, trials = self._odometry.late, self._odometry.trials
+            pairs = zip(trials, late.scans.tolist(), strict=True)
+            self.record.late_members = {trial: scans for trial, scans in pairs if scans}
+            self.record.removed = tuple(np.array(trials)[late.removed].tolist())
+        return self.record
+
+    def _prepare(self, scan: Scan, due: float) -> Any:
         """Prepare a scan with the parameters that it is registered with.
 
         The odometry waits for a selection until half the time to the deadline is over, and takes
@@ -228,18 +261,14 @@ class _Selecting:
         return prepared if odometry.preparation == preparation else odometry.prepare(scan)
 
     def _take(self, answer: Answer | None, stamp: int, due: float) -> None:
-        """Apply what was selected; where that fails, the last set stays."""
+        """Apply what was selected, if it is there."""
+        assert self._selector is not None
+        for old in self._selector.too_late():
+            self._note(Choice(old.stamp, old.selection, old.seconds, "too late"))
         if answer is None or answer.selection is None:
             self.record.missed += 1
             return
-        try:
-            self._odometry.apply(answer.selection)
-        except AdaptuneError as error:
-            trial = answer.selection.trial
-            _log.warning("%s: trial %d cannot be applied: %s", self._what, trial, error)
-            return
-        self.choices.append(Choice(stamp, answer.selection, time.perf_counter() - due))
-        tell_of_loss(self.choices, self._what)
+        self._driver.take(stamp, answer.selection, time.perf_counter() - due)
 
     def _left(self, due: float) -> float:
         """Seconds to the deadline."""

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -14,24 +14,17 @@ from adaptune.cores import resident_megabytes
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.tracker import RegisteredScan, Tracker
+from adaptune.odometry.tracker import RegisteredScan
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.timed_selector import Schedule, Selects
 from adaptune.trajectory import Trajectory
+from online.safety import Choice, Driver
 
 _SAMPLED = 10
 """Scans from one look at the memory to the next."""
 
 _log = logging.getLogger(__name__)
-
-
-class Choice(NamedTuple):
-    """A selection that was made."""
-
-    stamp: int  # nanoseconds, of the scan that it was made from and first applied to
-    selection: Selection
-    seconds: float  # to describe the scan and choose; in real time, from its arrival
 
 
 @dataclass
@@ -46,6 +39,20 @@ class RealTimeRecord:
         default_factory=list
     )  # (n,): seconds from a scan's arrival to its pose
     waited: list[float] = field(default_factory=list)  # seconds for each selection
+    late_members: dict[int, int] = field(default_factory=dict)  # scans at which they were, by trial
+    removed: tuple[int, ...] = ()  # trials of members that were always late
+
+
+class Progressed(NamedTuple):
+    """How far a replay is."""
+
+    done: int  # scans, with those that were dropped
+    step: RegisteredScan  # the newest
+    choice: Choice | None  # the newest, applied or not
+    real_time: RealTimeRecord | None = None  # in real time
+
+
+Watch = Callable[[Progressed], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +65,8 @@ class Replay:
     registered: NDArray[np.bool_]
     prepare_seconds: NDArray[np.float64]  # (n,)
     register_seconds: NDArray[np.float64]  # (n,)
-    choices: list[Choice]
+    choices: list[Choice]  # those that were applied
+    rejected: list[Choice]  # those that were not
     seconds: float  # the whole replay, reading included
     unhealthy: dict[str, int]  # how often the health check found what
     cpu_ms: float  # milliseconds of CPU time a scan, in all processes, without reading it
@@ -72,8 +80,9 @@ def replay(
     health: HealthCheck,
     selector: Selects | None = None,
     period: float = 1.0,
-    progress: Callable[[], None] = lambda: None,
+    watch: Watch = lambda _: None,
     what: str = "the replay",
+    fixed: Selection | None = None,
 ) -> Replay:
     """Replay a recording, as fast as it goes and always the same way.
 
@@ -91,22 +100,23 @@ def replay(
         Chooses the parameters; without one they stay.
     period
         Seconds between selections.
-    progress
+    watch
         Called after every scan.
     what
         What is replayed, for the log.
+    fixed
+        What an adaptive mode returns to where it fails, see `online.safety.Driver`.
 
     Raises
     ------
     AdaptuneError
         If there are no scans.
     OdometryError
-        If the odometry cannot change its parameters.
+        If the odometry cannot change its parameters, and there is no `fixed` to return to.
     """
-    schedule, tracker = Schedule(period * 1e9), Tracker(odometry, health)
-    steps: list[RegisteredScan] = []
-    choices: list[Choice] = []
-    meter = Meter()
+    choices, steps = list[Choice](), list[RegisteredScan]()
+    driver = Driver(odometry, health, fixed, what, choices.append)
+    schedule, meter = Schedule(period * 1e9), Meter()
     for scan in scans:
         meter.begin()
         if selector is not None:
@@ -114,15 +124,11 @@ def replay(
             if schedule.due(scan.stamp):
                 t = time.perf_counter()
                 selection = selector.select()
-                choices.append(Choice(scan.stamp, selection, time.perf_counter() - t))
-                tell_of_loss(choices, what)
-                odometry.apply(selection)
+                driver.take(scan.stamp, selection, time.perf_counter() - t)
                 selector.measure()
-        steps.append(tracker.register(scan))
+        steps.append(driver.register(scan))
         meter.end()
-        progress()
-    if not steps:
-        raise AdaptuneError("there is no scan to replay; check start, stop and views")
+        watch(Progressed(len(steps), steps[-1], choices[-1] if choices else None))
     return recorded(steps, choices, meter, odometry.usage)
 
 
@@ -156,24 +162,16 @@ class Meter:
         return ms, self._memory + (odometry.memory or 0.0)
 
 
-def tell_of_loss(choices: list[Choice], what: str) -> None:
-    """Log that the bank, or the odometry, is lost since the last selection, or not any more."""
-    lost, weights = choices[-1].selection.lost, choices[-1].selection.weights
-    if lost != (len(choices) > 1 and choices[-2].selection.lost):
-        seconds = (choices[-1].stamp - choices[0].stamp) * 1e-9
-        who = "odometry" if weights is None else "bank"
-        does = "is lost" if lost else "goes on"
-        _log.warning("%s: the %s %s at %.1f s", what, who, does, seconds)
-
-
 def recorded(
-    steps: list[RegisteredScan],
-    choices: list[Choice],
+    steps: Sequence[RegisteredScan],
+    choices: Sequence[Choice],
     meter: Meter,
     usage: Usage,
     real_time: RealTimeRecord | None = None,
 ) -> Replay:
-    """A replay from what became of its scans."""
+    """A replay from what became of its scans, and of all selections."""
+    if not steps:
+        raise AdaptuneError("there is no scan to replay; check start, stop and views")
     stamps, poses, registered, unhealthy, prepare, register = zip(*steps, strict=True)
     return Replay(
         Trajectory(np.array(stamps, np.int64), np.array(poses)),
@@ -181,7 +179,8 @@ def recorded(
         np.array(registered),
         np.array(prepare),
         np.array(register),
-        choices,
+        [choice for choice in choices if not choice.why_not],
+        [choice for choice in choices if choice.why_not],
         meter.seconds,
         dict(Counter(what for what in unhealthy if what is not None)),
         *meter.used(usage),

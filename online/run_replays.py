@@ -1,6 +1,5 @@
 """The online stage: replay the test sequences in every mode."""
 
-import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -19,13 +18,15 @@ from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
 from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.real_time import replay_in_real_time
-from online.replay import Replay, replay
+from online.replay import Progressed, Replay, Watch, replay
 from online.selector_process import SelectorProcess
 from online.stored_reference import is_reference_of, write_reference
 from online.stored_replays import ReplayIdentity, StoredReplay, other_keys, write_replay
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
+Look = Callable[[str, int, Progressed], None]
+"""Called with what is replayed, how many scans there are, and how far it is."""
 
 SCANT = 1.5
 """Training sequences below which a selection rests on hardly more than one."""
@@ -38,7 +39,11 @@ class ReplayError(AdaptuneError):
 
 
 def run_replays(
-    study: Study, model_path: Path, again: bool = False, progress: Progress = lambda *_: None
+    study: Study,
+    model_path: Path,
+    again: bool = False,
+    progress: Progress = lambda *_: None,
+    look: Look | None = None,
 ) -> int:
     """Replay every test sequence in every mode, unless that was done before.
 
@@ -52,6 +57,8 @@ def run_replays(
         Replay even what was done before.
     progress
         Called about every scan.
+    look
+        Called with what is replayed, the number of its scans, and how far it is.
 
     Returns
     -------
@@ -74,11 +81,16 @@ def run_replays(
     model = setup.pinned(model)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
-    of = _Modes(setup, setup.modes(model), model, model_path)
+    of = _Modes(setup, setup.modes(model), look, model, model_path)
     return _replay_all(study, study.config.test, of, again, progress)
 
 
-def run_untrained(study: Study, again: bool = False, progress: Progress = lambda *_: None) -> int:
+def run_untrained(
+    study: Study,
+    again: bool = False,
+    progress: Progress = lambda *_: None,
+    look: Look | None = None,
+) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
 
     Neither trials nor references are needed. The sequences are those of
@@ -91,16 +103,16 @@ def run_untrained(study: Study, again: bool = False, progress: Progress = lambda
     """
     setup = ReplaySetup.of(study)
     setup.untrained_sets()
-    return _replay_all(
-        study, sequences_without_model(study), _Modes(setup, WITHOUT_MODEL), again, progress
-    )
+    modes = _Modes(setup, WITHOUT_MODEL, look)
+    return _replay_all(study, sequences_without_model(study), modes, again, progress)
 
 
 class _Modes(NamedTuple):
-    """The modes to replay, and the model of those that need one."""
+    """The modes to replay, who looks on, and the model of those that need one."""
 
     setup: ReplaySetup
     names: tuple[str, ...]
+    look: Look | None = None
     model: ErrorModel | None = None
     model_path: Path | None = None
 
@@ -150,15 +162,24 @@ def _replay_due(
         what = f"{name}, {mode}"
         run = _in_lockstep if study.config.online.real_time is None else _in_real_time
         try:
-            result = run(study.config, sequence, name, modes, mode, partial(progress, what))
+            watch = partial(_watch, progress, modes.look, what, sequence.n_messages)
+            result = run(study.config, sequence, name, modes, mode, watch)
         except DescriptorError as error:
             raise ReplayError(f"sequences.{name}: {error}") from error
+        progress(what, sequence.n_messages, sequence.n_messages)
         if i == 0:
             write_reference(folder, sequence.reference(), result.trajectory, poses)
         write_replay(folder / mode, result, about, modes.model_path)
         if modes.model is not None and result.choices:
             selections = [choice.selection for choice in result.choices]
             warn_of_scant_evidence(what, selections, modes.setup.fixed(mode, modes.model))
+
+
+def _watch(progress: Progress, look: Look | None, what: str, n: int, at: Progressed) -> None:
+    """Pass on how far a replay is."""
+    progress(what, at.done, n)
+    if look is not None:
+        look(what, n, at)
 
 
 def _renew_reference(study: Study, name: str, replayed: Path) -> None:
@@ -184,22 +205,21 @@ def _in_lockstep(
     name: str,
     modes: _Modes,
     mode: str,
-    progress: Callable[[int, int], None],
+    watch: Watch,
 ) -> Replay:
-    done, n = itertools.count(1), sequence.n_messages
     odometry = modes.setup.instance(mode, modes.model, name)
+    selector = modes.setup.selector(mode, modes.model)
     with closing(odometry):
-        result = replay(
+        return replay(
             sequence,
             odometry,
             config.health,
-            modes.setup.selector(mode, modes.model),
+            selector,
             config.online.period,
-            lambda: progress(next(done), n),
+            watch,
             f"{name}, {mode}",
+            None if selector is None else selector.fall_back(),
         )
-    progress(n, n)
-    return result
 
 
 def _in_real_time(
@@ -208,9 +228,9 @@ def _in_real_time(
     name: str,
     modes: _Modes,
     mode: str,
-    progress: Callable[[int, int], None],
+    watch: Watch,
 ) -> Replay:
-    n, period, setup = sequence.n_messages, config.online.period, modes.setup
+    period, setup = config.online.period, modes.setup
     assert config.online.real_time is not None
     odometry = setup.instance(mode, modes.model, name)
     selector = None
@@ -218,18 +238,16 @@ def _in_real_time(
         if setup.adapts(mode):
             make = partial(setup.selector, mode, modes.model)
             selector = stack.enter_context(closing(SelectorProcess(make, period)))
-        result = replay_in_real_time(
+        return replay_in_real_time(
             sequence,
             odometry,
             config.health,
             config.online.real_time,
             selector,
-            lambda n_done: progress(n_done, n),
+            watch,
             f"{name}, {mode}",
             setup.core_ms(mode, modes.model),
         )
-    progress(n, n)
-    return result
 
 
 def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:

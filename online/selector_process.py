@@ -6,7 +6,8 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from multiprocessing.shared_memory import SharedMemory
@@ -28,6 +29,8 @@ SLOTS = 4
 """Scans on their way."""
 _START = 60.0
 """Seconds in which the process must be ready."""
+MOST_LATE = 100
+"""Selections that came too late and are remembered."""
 _NICE = 10
 """By how much the priority of live evidence is lower."""
 
@@ -44,6 +47,14 @@ class Answer(NamedTuple):
     selection: Selection | None  # None where none was due
     seconds: float  # from the scan's arrival in the process
     cpu: float  # seconds that the process has used
+
+
+class LateSelection(NamedTuple):
+    """A selection that nobody waited for."""
+
+    stamp: int  # nanoseconds, of its scan
+    selection: Selection
+    seconds: float  # that it took in the process
 
 
 class SelectorProcess:
@@ -68,6 +79,8 @@ class SelectorProcess:
         Seconds of CPU time for the scans that it got.
     alive : bool
         Whether the process was there when it was last used.
+    fixed : Selection
+        What the selector falls back to.
 
     Raises
     ------
@@ -80,6 +93,7 @@ class SelectorProcess:
         self._slots: list[SharedMemory] = []
         self._free: list[int] = []
         self._moved: Motions | None = None  # over the scans that were not shown
+        self._too_late: deque[LateSelection] = deque(maxlen=MOST_LATE)
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])
         self._here, there = context.Pipe()
@@ -87,13 +101,14 @@ class SelectorProcess:
         self._process = context.Process(target=_run, args=given, daemon=True)
         self._process.start()
         there.close()
-        error = "it did not start in time"
+        started: Selection | str = "it did not start in time"
         if self._here.poll(_START):
             with contextlib.suppress(EOFError, OSError):
-                error = self._here.recv()
-        if error:
+                started = self._here.recv()
+        if isinstance(started, str):
             self.close()
-            raise AdaptuneError(f"the selector's process: {error}")
+            raise AdaptuneError(f"the selector's process: {started}")
+        self.fixed = started
 
     def show(self, stamp: int, scan: Scan, motions: Motions, seconds: float = 0.0) -> bool:
         """Show a scan, see `TimedSelector.update`; whether the process gets it.
@@ -120,9 +135,9 @@ class SelectorProcess:
 
     def _slot(self, size: int, seconds: float) -> int | None:
         """A free slot for so many bytes; None if there is none in so many seconds."""
-        self._take_answers()
+        self._keep(self._take_answers())
         if not self._free and len(self._slots) == SLOTS:
-            self._take_answers(seconds)
+            self._keep(self._take_answers(seconds))
             if not self._free:
                 return None
         if not self._free:
@@ -140,23 +155,40 @@ class SelectorProcess:
         Answers to earlier scans are dropped.
         """
         end = time.perf_counter() + seconds
-        while True:
-            found = self._take_answers(max(end - time.perf_counter(), 0.0))
-            if found is None or found.stamp == stamp:
-                return found
+        while self.alive:
+            answers = self._take_answers(max(end - time.perf_counter(), 0.0))
+            if not answers:
+                break
+            if answers[-1].stamp == stamp:
+                self._keep(answers[:-1])
+                return answers[-1]
+            self._keep(answers)
+        return None
 
-    def _take_answers(self, seconds: float = 0.0) -> Answer | None:
-        """The newest answer that is there, or that comes in so many seconds."""
-        newest = None
+    def too_late(self) -> "list[LateSelection]":
+        """Selections that came after nobody waited for them, since this was last asked."""
+        late = list(self._too_late)
+        self._too_late.clear()
+        return late
+
+    def _keep(self, answers: "Sequence[Answer]") -> None:
+        for stamp, selection, seconds, _ in answers:
+            if selection is not None:
+                self._too_late.append(LateSelection(stamp, selection, seconds))
+
+    def _take_answers(self, seconds: float = 0.0) -> list[Answer]:
+        """The answers that are there, or the first that come in so many seconds."""
+        found: list[Answer] = []
         try:
-            while self.alive and self._here.poll(0.0 if newest else seconds):
-                slot, newest = self._here.recv()
+            while self.alive and self._here.poll(0.0 if found else seconds):
+                slot, answer = self._here.recv()
                 self._free.append(slot)
-                self.cpu = newest.cpu
+                self.cpu = answer.cpu
+                found.append(answer)
         except (EOFError, OSError):
             self.alive = False
             _log.warning("the selector's process has ended; the last set stays")
-        return newest
+        return found
 
     def close(self) -> None:
         """End the process."""
@@ -197,7 +229,7 @@ def _run(connection: Connection, make: Make, period: float, cores: list[int]) ->
             connection.send(str(error))
             return
         timed: Any = TimedSelector(gentle, period)  # type: ignore[arg-type]
-        connection.send("")
+        connection.send(gentle.fall_back())
         before = time.process_time()
         seen: dict[int, SharedMemory] = {}
         while True:

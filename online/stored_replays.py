@@ -208,6 +208,8 @@ def kept_up(replay: Replay) -> dict[str, float] | None:
         "dropped_scans": record.dropped,
         "missed_selections": record.missed,
         "unseen_scans": record.unseen,
+        "late_members_scans": sum(record.late_members.values()),
+        "removed_members": len(record.removed),
     }
     latencies = [choice.seconds for choice in replay.choices]
     named = {"pose": record.late, "selection": latencies, "waited": record.waited}
@@ -235,7 +237,7 @@ def _mean_estimated(replay: Replay) -> float | None:
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
 _SELECTION = (
     *("stamp_ns", "trial", "predicted_error_percent", "predicted_fixed_percent"),
-    *("familiarity", "sequences", *_ESTIMATED, "lost", "weights", "ms"),
+    *("familiarity", "sequences", *_ESTIMATED, "lost", "weights", "ms", "why_not", "fallen_back"),
 )
 """Columns of ``selections.csv`` before the parameters."""
 
@@ -245,7 +247,8 @@ def _write_selections(path: Path, replay: Replay) -> None:
     every = (name for choice in replay.choices for name in choice.selection.parameters)
     names = list(dict.fromkeys(every))
     rows = []
-    for stamp, selection, seconds in replay.choices:
+    made = sorted([*replay.choices, *replay.rejected], key=lambda choice: choice.stamp)
+    for stamp, selection, seconds, why_not, fallen_back in made:
         numbers = (
             selection.predicted_error,
             selection.predicted_fixed,
@@ -259,7 +262,7 @@ def _write_selections(path: Path, replay: Replay) -> None:
         rows.append(
             [stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)]
             + [" ".join(f"{trial}:{weight:.3f}" for trial, weight in weights)]
-            + [f"{1e3 * seconds:.3f}"]
+            + [f"{1e3 * seconds:.3f}", why_not, fallen_back]
             + [selection.parameters.get(name, "") for name in names]
         )
     _write_csv(path, [*_SELECTION, *names], rows)
@@ -283,7 +286,7 @@ class _Choices(NamedTuple):
 
 
 def _choices(path: Path) -> _Choices:
-    columns = _columns(path)
+    columns = _applied(_columns(path))
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
         weights = _weights(columns.get("weights", []))
@@ -299,6 +302,15 @@ def _choices(path: Path) -> _Choices:
         name: _numbers(values) for name, values in columns.items() if name not in _SELECTION
     }
     return _Choices(stamps, parameters, weights, estimated, lost)
+
+
+def _applied(columns: dict[str, list[str]]) -> dict[str, list[str]]:
+    """The rows of what was applied; of the same scan, the last one."""
+    stamps = columns.get("stamp_ns", [])
+    whys = columns.get("why_not", [""] * len(stamps))
+    rows = [i for i, why in enumerate(whys) if not why]
+    rows = list({stamps[i]: i for i in rows}.values())
+    return {name: [values[i] for i in rows] for name, values in columns.items()}
 
 
 def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:

@@ -217,11 +217,11 @@ def _measure(
     recording: Recording, what: str, mechanism: Mechanism, health: HealthCheck, progress: Progress
 ) -> tuple[float, float]:
     """Mean RTE in percent, and mean milliseconds a scan."""
-    done, n, what = itertools.count(1), len(recording.scans), f"{recording.name}, {what}"
+    n, what = len(recording.scans), f"{recording.name}, {what}"
     selector = Alternating(mechanism.sets) if mechanism.sets else None
     odometry = mechanism.make()
     result = replay(
-        recording.scans, odometry, health, selector, PERIOD, lambda: progress(what, next(done), n)
+        recording.scans, odometry, health, selector, PERIOD, lambda at: progress(what, at.done, n)
     )
     odometry.close()
     T_odom_sensor = result.trajectory.T_world_sensor

@@ -64,18 +64,21 @@ def online(
     loaded = load(study, override, folder)
     from adaptune.cores import pin as bind
     from adaptune.model import ErrorModel
+    from online.dashboard import Dashboard
     from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
     from online.run_replays import run_replays, run_untrained
 
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
     unbind = bind(os.getpid(), alone=True)
+    dashboard = Dashboard()
     try:
-        with progress() as show:
+        with progress(dashboard) as show:
             if untrained:
-                made = run_untrained(loaded, again, show)
+                made = run_untrained(loaded, again, show, dashboard.look)
             else:
-                made = run_replays(loaded, model or loaded.model_path, again, show)
+                path = model or loaded.model_path
+                made = run_replays(loaded, path, again, show, dashboard.look)
     finally:
         unbind()
     if untrained:

@@ -73,6 +73,7 @@ class Answering:
     unseen: int = 0
     cpu: float = 1.0
     period: float = 1.0
+    fixed: Selection = Selection(1, {"fine": 1})
 
     def __post_init__(self):
         self.turns = itertools.cycle((2, 1))
@@ -87,7 +88,11 @@ class Answering:
         time.sleep(max(min(left, seconds), 0.0))
         if left > seconds:
             return None
-        return Answer(stamp, Selection(0, {"fine": next(self.turns)}), self.seconds, self.cpu)
+        fine = next(self.turns)
+        return Answer(stamp, Selection(fine, {"fine": fine}), self.seconds, self.cpu)
+
+    def too_late(self):
+        return []
 
 
 def run(odometry, n=30, selector=None, **settings):
@@ -179,11 +184,17 @@ def test_late_selections_are_dropped_and_the_last_set_stays():
     assert max(result.real_time.waited) < 0.05
 
 
-def test_one_that_cannot_be_applied_leaves_the_last_set(caplog):
+def test_one_that_cannot_be_applied_returns_to_the_fixed_set(caplog):
     odometry = Steady(refuses=[2])
     result = run(odometry, 25, Answering(), rate=10.0, deadline=9.0, queue=0)
-    assert [choice.selection.parameters["fine"] for choice in result.choices] == [1]
-    assert caplog.text.count("trial 0 cannot be applied: too fine") == 2
+    assert [choice.selection.trial for choice in result.choices] == [1, 1]
+    assert result.choices[0].fallen_back == "trial 2 cannot be applied: too fine"
+    # It is not tried again at once.
+    assert [(choice.stamp, choice.why_not) for choice in result.rejected] == [
+        (0, "too fine"),
+        (20 * TENTH, "the odometry failed with it"),
+    ]
+    assert "cannot be applied: too fine at 0.0 s; the fixed set is used" in caplog.text
     assert len(result.trajectory) == 25
 
 
