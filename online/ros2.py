@@ -109,7 +109,7 @@ class Ros2:
         self._node = self._packages.entity.NodeEntity(
             self._domain, str(self._session.zid()), node_id=0, node_name=_NODE
         )
-        self._numbers = itertools.count(1)
+        self._numbers, self._closed = itertools.count(1), False
         token = self._packages.keys.node_liveliness_keyexpr(self._node)
         self._kept: list[Any] = [self._session.liveliness().declare_token(token)]
         self._threads: list[threading.Thread] = []
@@ -133,6 +133,8 @@ class Ros2:
     ) -> None:
         """Take messages until the subscriber is closed."""
         for sample in subscriber:
+            if self._closed:
+                return
             try:
                 take(self._message(sample.payload, kind))
             except Exception:
@@ -154,7 +156,8 @@ class Ros2:
 
         def publish(message: Any) -> None:
             raw = self.store.serialize_cdr(message, kind)
-            publisher.put(bytes(raw), attachment=attached())
+            with self._naming(topic):
+                publisher.put(bytes(raw), attachment=attached())
 
         return publish
 
@@ -194,27 +197,17 @@ class Ros2:
 
         One that is patient waits until there is such a service.
         """
-        zenoh, service = self._packages.zenoh, self._services[name]
+        service = self._services[name]
         place = f"{node}/{'set' if name == 'SetParameters' else 'get'}_parameters"
         request = self.store.types[service.request](**fields)
         key = self._packages.keys.topic_keyexpr(
             self._domain, place, _dds(self._packages, service.kind), service.type_hash
         )
         raw = bytes(self.store.serialize_cdr(request, service.request))
-        attached = self._attachments()
         end = time.monotonic() + _ANSWER
         while (left := end - time.monotonic()) > 0:
-            replies = self._session.get(
-                key,
-                payload=raw,
-                encoding="application/cdr",
-                attachment=attached(),
-                target=zenoh.QueryTarget.ALL_COMPLETE,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=left,
-            )
             there = False
-            for reply in replies:
+            for reply in self._ask(key, raw, left):
                 if reply.ok is not None:
                     return self._message(reply.ok.payload, service.response)
                 there = True  # but without an answer in time
@@ -222,6 +215,20 @@ class Ros2:
                 break
             time.sleep(_PAUSE)
         raise LinkError(self._silence(node, place))
+
+    def _ask(self, key: str, request: bytes, seconds: float) -> Any:
+        """Send a request; the replies, which end at once if nobody is there."""
+        zenoh = self._packages.zenoh
+        with self._naming(key):
+            return self._session.get(
+                key,
+                payload=request,
+                encoding="application/cdr",
+                attachment=self._attachments()(),
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=seconds,
+            )
 
     def _silence(self, node: str, service: str) -> str:
         """What to say of a node that does not answer."""
@@ -240,7 +247,8 @@ class Ros2:
         utils, space = self._packages.utils, self._packages.keys.ADMIN_SPACE
         kind = self._packages.entity.EntityKind[kind].value
         pattern = f"{space}/{self._domain}/*/*/*/{kind}/**"
-        replies = self._session.liveliness().get(pattern, timeout=_ANSWER)
+        with self._naming(pattern):
+            replies = self._session.liveliness().get(pattern, timeout=_ANSWER)
         keys = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
         # The name and the type follow the enclave, the namespace and the node's name.
         found = {utils.demangle_name(key[9]): key[10] for key in keys if len(key) > 10}
@@ -248,6 +256,7 @@ class Ros2:
 
     def close(self) -> None:
         """Leave; messages that wait to be taken are dropped."""
+        self._closed = True
         self._session.close()
         for thread in self._threads:
             if thread is not threading.current_thread():
@@ -256,6 +265,8 @@ class Ros2:
 
     def _key(self, topic: str, kind: str) -> str:
         """Where a topic's messages pass."""
+        if kind not in self.store.types:
+            raise LinkError(f"{topic}: the message type {kind} is not known")
         dds, type_hash = _dds(self._packages, kind), self.store.hash_rihs01(kind)
         return str(self._packages.keys.topic_keyexpr(self._domain, _full(topic), dds, type_hash))
 
@@ -282,14 +293,12 @@ class Ros2:
         return lambda: bytes(attachment(next(numbers), time.time_ns(), sender).to_bytes())
 
     @contextlib.contextmanager
-    def _naming(self, topic: str) -> Iterator[None]:
-        """Say which topic cannot be used, and why."""
+    def _naming(self, what: str) -> Iterator[None]:
+        """Say what Zenoh cannot do, and why."""
         try:
             yield
-        except KeyError as error:
-            raise LinkError(f"{topic}: the message type {error} is not known") from error
         except self._packages.zenoh.ZError as error:
-            raise LinkError(f"{topic}: {error}") from error
+            raise LinkError(f"{what}: {error}") from error
 
 
 def _packages() -> _Packages:

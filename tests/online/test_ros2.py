@@ -1,3 +1,4 @@
+import os
 import queue
 import socket
 import subprocess
@@ -55,13 +56,19 @@ def robot(router, port, tmp_path_factory):
     """Where the router of a robot listens whose node, in a process of its own, can be seen."""
     command = [sys.executable, ros2_node.__file__, str(port)]
     folder = tmp_path_factory.mktemp("definitions")
-    process = subprocess.Popen([*command, str(folder)], stdin=subprocess.PIPE)
+    # Nothing is downloaded; an attempt would leave the first of these folders.
+    aside = {"ZENOH_ROS2_SDK_CACHE": str(folder / "cache"), "GIT_ALLOW_PROTOCOL": "none"}
+    aside["GIT_CONFIG_GLOBAL"] = str(folder / "gitconfig")
+    process = subprocess.Popen(
+        [*command, str(folder)], stdin=subprocess.PIPE, env=os.environ | aside
+    )
     try:
         end = time.monotonic() + 20.0
         while not tokens(router, "SS", "deaf"):
             assert process.poll() is None
             assert time.monotonic() < end
             time.sleep(0.02)
+        assert not (folder / "cache").exists()
         yield f"127.0.0.1:{port}"
     finally:
         process.stdin.close()
@@ -217,7 +224,7 @@ def test_type_hashes_are_those_of_ros(router):
 
 
 def test_an_unknown_type_is_refused(link):
-    with pytest.raises(LinkError, match="/a: the message type 'a_msgs/msg/A' is not known"):
+    with pytest.raises(LinkError, match="/a: the message type a_msgs/msg/A is not known"):
         link.subscribe("/a", "a_msgs/msg/A", print)
     with pytest.raises(LinkError, match="/a#b: "):
         link.advertise("/a#b", ros2_node.POINTS)
@@ -234,6 +241,9 @@ def test_no_messages_come_after_it_is_closed(robot):
     time.sleep(0.1)
     assert came.qsize() == n
     assert threading.active_count() == threads
+    for use in (link.topics, lambda: link.set_parameters("/robot/slam", {"voxel_size": 1.0})):
+        with pytest.raises(LinkError, match="session closed"):
+            use()
 
 
 def test_another_domain_is_another_world(robot, monkeypatch):

@@ -17,9 +17,11 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 SET, GET = "rcl_interfaces/srv/SetParameters", "rcl_interfaces/srv/GetParameters"
 REASON = "parameter 'rings' cannot be set because it is read-only"
 SERVICES = {
-    SET: "rcl_interfaces/Parameter[] parameters\n---\n"
-    "rcl_interfaces/SetParametersResult[] results\n",
-    GET: "string[] names\n---\nrcl_interfaces/ParameterValue[] values\n",
+    SET: (
+        "rcl_interfaces/Parameter[] parameters",
+        "rcl_interfaces/SetParametersResult[] results",
+    ),
+    GET: ("string[] names", "rcl_interfaces/ParameterValue[] values"),
 }
 
 
@@ -55,14 +57,9 @@ def write_definitions(folder, *messages):
             name, _, text = other.removeprefix("MSG: ").partition("\n")
             texts[name.replace("/", "/msg/")] = text
         for name, text in texts.items():
-            write(folder / f"{name}.msg", text)
-    for name, text in SERVICES.items():
-        write(folder / f"{name}.srv", text)
-
-
-def write(file, text):
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text)
+            file = folder / f"{name}.msg"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
 
 
 class Parameters:
@@ -97,25 +94,32 @@ def main(port, folder):
     )
 
     folder = Path(folder)
-    write_definitions(folder, POINTS, ODOMETRY, *(f"rcl_interfaces/msg/{name}" for name in (
-        "Parameter", "SetParametersResult",
-    )))  # fmt: skip
+    used = [f"rcl_interfaces/msg/{name}" for name in ("Parameter", "SetParametersResult")]
+    write_definitions(folder, POINTS, ODOMETRY, *used)
     session = ZenohSession.get_instance("127.0.0.1", int(port))
-    get_registry(str(folder))
-    store, parameters = session.store, Parameters(session.store, session)
+    registry = get_registry(str(folder))
+    for name in used:
+        registry.load_message_type(name)
+    parameters = Parameters(session.store, session)
     points, echo = ROS2Publisher("/points", POINTS), ROS2Publisher("/robot/echo", ODOMETRY)
+
+    def serve(name, kind, callback=None):
+        mode = "callback" if callback else "queue"
+        # With the definitions it looks for no file, and so downloads none.
+        return ROS2ServiceServer(name, kind, callback, *SERVICES[kind], mode=mode)
+
     kept = [
         ROS2Subscriber("/odometry", ODOMETRY, lambda message: echo.publish(**vars(message))),
-        ROS2ServiceServer("/robot/slam/set_parameters", SET, parameters.set),
-        ROS2ServiceServer("/robot/slam/get_parameters", GET, parameters.get),
-        ROS2ServiceServer("/secret/set_parameters", SET, parameters.set),
-        ROS2ServiceServer("/deaf/set_parameters", SET, mode="queue"),
+        serve("/robot/slam/set_parameters", SET, parameters.set),
+        serve("/robot/slam/get_parameters", GET, parameters.get),
+        serve("/secret/set_parameters", SET, parameters.set),
+        serve("/deaf/set_parameters", SET),
     ]
     ended = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
     n = 0
     while not ended.wait(1.0 / HZ):
-        points.publish(**cloud(store.types, n))
+        points.publish(**cloud(session.store.types, n))
         n += 1
     for each in (points, echo, *kept):
         each.close()
