@@ -68,7 +68,7 @@ class _Service(NamedTuple):
 
 
 class Ros2:
-    """A `Link` to a robot whose ROS 2 runs on rmw_zenoh.
+    """A `RosLink` to a robot whose ROS 2 runs on rmw_zenoh.
 
     It is a client of the robot's router: routers pass messages on between clients and all others,
     wherever they are, but not between two nodes that could reach each other.

@@ -12,7 +12,7 @@ class LinkError(AdaptuneError):
     """A robot that cannot be reached, or that refuses what is asked of it."""
 
 
-class Link(Protocol):
+class RosLink(Protocol):
     """A node of adaptune's in a robot's ROS.
 
     Messages are those of `store`, by names such as ``sensor_msgs/msg/PointCloud2`` in ROS 1, too.
