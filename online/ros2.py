@@ -26,7 +26,7 @@ _CONNECT, _ANSWER = 2.0, 2.0
 _PAUSE = 0.05
 """Seconds between calls of a service that is not there, or not yet."""
 _WAITING = 10_000
-"""Messages of a topic that may wait to be taken."""
+"""Messages of a topic that may wait to be taken; with more, all else waits, too."""
 _NODE = "adaptune"
 
 _DEFINITIONS = {
@@ -70,8 +70,8 @@ class _Service(NamedTuple):
 class Ros2:
     """A `RosLink` to a robot whose ROS 2 runs on rmw_zenoh.
 
-    It is a client of the robot's router: routers pass messages on between clients and all others,
-    wherever they are, but not between two nodes that could reach each other.
+    It is a client of the robot's router. A router passes messages on to its clients, which may be
+    on any machine; the nodes on the robot reach each other without it.
 
     Parameters
     ----------
@@ -118,15 +118,31 @@ class Ros2:
         """Have every message of a topic taken, one after the other, in a thread of its own.
 
         An error in `take` is logged, and the next message is taken.
+
+        Raises
+        ------
+        LinkError
+            If the topic is published, but not with this type as it is known here.
         """
+        self._check_type(topic, kind)
         with self._naming(topic):
             channel = self._packages.zenoh.handlers.FifoChannel(_WAITING)
             subscriber = self._session.declare_subscriber(self._key(topic, kind), channel)
             self._announce("SUBSCRIPTION", topic, kind)
-        what = topic, kind, take
-        thread = threading.Thread(target=self._take_all, args=(subscriber, *what), daemon=True)
+        what = subscriber, topic, kind, take
+        thread = threading.Thread(target=self._take_all, args=what, daemon=True)
         self._threads.append(thread)
         thread.start()
+
+    def _check_type(self, topic: str, kind: str) -> None:
+        """Refuse what would never bring a message: its place depends on the type's hash."""
+        type_hash = self._hash(topic, kind)
+        there = [(k, h) for name, k, h in self._tokens("PUBLISHER") if name == _full(topic)]
+        if there and (kind, type_hash) not in there:
+            raise LinkError(
+                f"{topic} is published as {there[0][0]} with the type hash {there[0][1]}, not as "
+                f"{kind} with {type_hash}; known are the types of ROS 2 Jazzy"
+            )
 
     def _take_all(
         self, subscriber: Any, topic: str, kind: str, take: Callable[[Any], None]
@@ -233,26 +249,30 @@ class Ros2:
     def _silence(self, node: str, service: str) -> str:
         """What to say of a node that does not answer."""
         ending = "/set_parameters"
-        nodes = [name.removesuffix(ending) for name in self._tokens("SERVICE") if ending in name]
+        services = sorted({name for name, *_ in self._tokens("SERVICE")})
+        nodes = [name.removesuffix(ending) for name in services if name.endswith(ending)]
         there = f"the nodes there are {', '.join(nodes)}" if nodes else "no node there has any"
         silent = "is there, but does not answer" if node in nodes else "is not there"
         return f"{node} {silent}: {service} in ROS domain {self._domain}; {there}"
 
     def topics(self) -> Mapping[str, str]:
         """The topics that somebody publishes now, and their types."""
-        return self._tokens("PUBLISHER")
+        return {name: kind for name, kind, _ in self._tokens("PUBLISHER")}
 
-    def _tokens(self, kind: str) -> dict[str, str]:
-        """Names and types of what there is of a kind: nodes keep a token for each of theirs."""
+    def _tokens(self, kind: str) -> list[tuple[str, str, str]]:
+        """Names, types and their hashes of what there is: nodes keep a token for each of theirs."""
         utils, space = self._packages.utils, self._packages.keys.ADMIN_SPACE
         kind = self._packages.entity.EntityKind[kind].value
         pattern = f"{space}/{self._domain}/*/*/*/{kind}/**"
         with self._naming(pattern):
             replies = self._session.liveliness().get(pattern, timeout=_ANSWER)
         keys = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
-        # The name and the type follow the enclave, the namespace and the node's name.
-        found = {utils.demangle_name(key[9]): key[10] for key in keys if len(key) > 10}
-        return {name: utils.dds_to_ros_type(found[name]) for name in sorted(found)}
+        # These follow the enclave, the namespace and the node's name.
+        return sorted(
+            (utils.demangle_name(key[9]), utils.dds_to_ros_type(key[10]), key[11])
+            for key in keys
+            if len(key) > 11
+        )
 
     def close(self) -> None:
         """Leave; messages that wait to be taken are dropped."""
@@ -265,10 +285,14 @@ class Ros2:
 
     def _key(self, topic: str, kind: str) -> str:
         """Where a topic's messages pass."""
+        dds, type_hash = _dds(self._packages, kind), self._hash(topic, kind)
+        return str(self._packages.keys.topic_keyexpr(self._domain, _full(topic), dds, type_hash))
+
+    def _hash(self, topic: str, kind: str) -> str:
+        """What ROS 2 tells versions of a type apart by."""
         if kind not in self.store.types:
             raise LinkError(f"{topic}: the message type {kind} is not known")
-        dds, type_hash = _dds(self._packages, kind), self.store.hash_rihs01(kind)
-        return str(self._packages.keys.topic_keyexpr(self._domain, _full(topic), dds, type_hash))
+        return self.store.hash_rihs01(kind)
 
     def _announce(self, entity: str, topic: str, kind: str) -> None:
         """Let the robot's nodes see that a topic is published, or subscribed to."""

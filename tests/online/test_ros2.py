@@ -64,7 +64,7 @@ def robot(router, port, tmp_path_factory):
     )
     try:
         end = time.monotonic() + 20.0
-        while not tokens(router, "SS", "deaf"):
+        while not tokens(router, "SS", "deaf%"):
             assert process.poll() is None
             assert time.monotonic() < end
             time.sleep(0.02)
@@ -216,7 +216,7 @@ def test_type_hashes_are_those_of_ros(router):
     for service in ("Set", "Get"):
         name = f"{service}Parameters"
         # The service is called by this key above.
-        (token,) = tokens(router, "SS", f"robot%slam%{service.lower()}_parameters")
+        (token,) = tokens(router, "SS", f"robot%slam%{service.lower()}_parameters/")
         assert f"/rcl_interfaces::srv::dds_::{name}_/{HASHES[name]}/" in token
     (token,) = tokens(router, "MP", "points")
     assert HASHES["PointCloud2"] == STORE.hash_rihs01(ros2_node.POINTS)
@@ -228,6 +228,12 @@ def test_an_unknown_type_is_refused(link):
         link.subscribe("/a", "a_msgs/msg/A", print)
     with pytest.raises(LinkError, match="/a#b: "):
         link.advertise("/a#b", ros2_node.POINTS)
+
+
+def test_another_type_than_what_is_published_is_refused(link):
+    told = "/points is published as sensor_msgs/msg/PointCloud2 with the type hash RIHS01_9198c"
+    with pytest.raises(LinkError, match=f"^{told}.*, not as nav_msgs/msg/Odometry with RIHS01_"):
+        link.subscribe("/points", ros2_node.ODOMETRY, print)
 
 
 def test_no_messages_come_after_it_is_closed(robot):

@@ -112,6 +112,7 @@ def main(port, folder):
         ROS2Subscriber("/odometry", ODOMETRY, lambda message: echo.publish(**vars(message))),
         serve("/robot/slam/set_parameters", SET, parameters.set),
         serve("/robot/slam/get_parameters", GET, parameters.get),
+        serve("/robot/slam/set_parameters_atomically", SET),
         serve("/secret/set_parameters", SET, parameters.set),
         serve("/deaf/set_parameters", SET),
     ]
