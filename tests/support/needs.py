@@ -17,3 +17,9 @@ def needs_evalio() -> None:
     """Skip where evalio is not installed."""
     if importlib.util.find_spec("evalio") is None:
         lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")
+
+
+def needs_ros2() -> None:
+    """Skip where what speaks to ROS 2 is not installed."""
+    if importlib.util.find_spec("zenoh_ros2_sdk") is None:
+        lacking("ros2", "zenoh-ros2-sdk is not installed: pip install 'adaptune[ros2]'")

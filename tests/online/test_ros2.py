@@ -1,0 +1,279 @@
+import os
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import needs
+import numpy as np
+import pytest
+import ros2_node
+
+from adaptune.odometry.base import import_extra
+from online.ros2 import Ros2, message_types
+from online.ros_link import LinkError
+
+STORE = message_types()
+HASHES = {  # as ROS 2 Jazzy has them
+    "SetParameters": "RIHS01_56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
+    "GetParameters": "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+    "PointCloud2": "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _installed():
+    needs.needs_ros2()
+
+
+@pytest.fixture(scope="module")
+def port():
+    return free_port()
+
+
+def free_port():
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        return bound.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def router(port):
+    import zenoh
+
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        yield session
+
+
+@pytest.fixture(scope="module")
+def robot(router, port, tmp_path_factory):
+    """Where the router of a robot listens whose node, in a process of its own, can be seen."""
+    command = [sys.executable, ros2_node.__file__, str(port)]
+    folder = tmp_path_factory.mktemp("definitions")
+    # Nothing is downloaded; an attempt would leave the first of these folders.
+    aside = {"ZENOH_ROS2_SDK_CACHE": str(folder / "cache"), "GIT_ALLOW_PROTOCOL": "none"}
+    aside["GIT_CONFIG_GLOBAL"] = str(folder / "gitconfig")
+    process = subprocess.Popen(
+        [*command, str(folder)], stdin=subprocess.PIPE, env=os.environ | aside
+    )
+    try:
+        end = time.monotonic() + 20.0
+        while not tokens(router, "SS", "deaf%"):
+            assert process.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert not (folder / "cache").exists()
+        yield f"127.0.0.1:{port}"
+    finally:
+        process.stdin.close()
+        try:
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def tokens(session, kind, name):
+    keys = [str(r.ok.key_expr) for r in session.liveliness().get("@ros2_lv/0/**", timeout=2.0)]
+    return [key for key in keys if f"/{kind}/" in key and f"%{name}" in key]
+
+
+@pytest.fixture(scope="module")
+def link(robot):
+    made = Ros2(robot, 0)
+    yield made
+    made.close()
+
+
+def taken(link, topic, kind, n):
+    """The first messages that come, and the threads that bring them."""
+    messages = queue.SimpleQueue()
+    link.subscribe(topic, kind, lambda m: messages.put((m, threading.current_thread())))
+    return zip(*(messages.get(timeout=5.0) for _ in range(n)), strict=True)
+
+
+def test_clouds_arrive_whole_in_order_and_in_a_thread_of_their_own(link):
+    clouds, threads = taken(link, "/points", ros2_node.POINTS, 10)
+    first = clouds[0].header.stamp.sec
+    for n, cloud in enumerate(clouds, first):
+        assert isinstance(cloud, STORE.types[ros2_node.POINTS])
+        sent = STORE.types[ros2_node.POINTS](**ros2_node.cloud(STORE.types, n))
+        assert STORE.serialize_cdr(cloud, ros2_node.POINTS) == STORE.serialize_cdr(
+            sent, ros2_node.POINTS
+        )
+        assert cloud.data.base is not None  # a view
+    assert len(set(threads)) == 1
+    assert threads[0] is not threading.main_thread()
+
+
+def odometry(n):
+    rng, types = np.random.default_rng(n), STORE.types
+    pose = types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](*rng.normal(size=3)),
+        types["geometry_msgs/msg/Quaternion"](*rng.normal(size=4)),
+    )
+    vector = types["geometry_msgs/msg/Vector3"]
+    twist = types["geometry_msgs/msg/Twist"](
+        vector(*rng.normal(size=3)), vector(*rng.normal(size=3))
+    )
+    return types[ros2_node.ODOMETRY](
+        ros2_node.header(types, n),
+        "base_link",
+        types["geometry_msgs/msg/PoseWithCovariance"](pose, rng.normal(size=36)),
+        types["geometry_msgs/msg/TwistWithCovariance"](twist, rng.normal(size=36)),
+    )
+
+
+def test_the_robot_gets_what_is_published(link, router):
+    echoed = queue.SimpleQueue()
+    link.subscribe("robot/echo", ros2_node.ODOMETRY, echoed.put)
+    publish = link.advertise("odometry", ros2_node.ODOMETRY)
+    assert link.topics()["/odometry"] == ros2_node.ODOMETRY
+    for n in range(5):
+        publish(odometry(n))
+        back = echoed.get(timeout=5.0)
+        assert STORE.serialize_cdr(back, ros2_node.ODOMETRY) == STORE.serialize_cdr(
+            odometry(n), ros2_node.ODOMETRY
+        )
+    (token,) = tokens(router, "MP", "odometry")
+    assert "/%/%/adaptune/%odometry/nav_msgs::msg::dds_::Odometry_/" in token
+
+
+def test_parameters_are_set_and_read_back(link):
+    given = {
+        "deskew": True,
+        "rate": 10,
+        "voxel_size": 0.25,
+        "frame": "odom",
+        "max_range": np.float64(80.0),
+        "threads": np.int32(2),
+        "bounds": np.bool_(False),
+    }
+    held = link.set_parameters("/robot/slam", given)
+    assert held == given
+    assert [type(value) for value in held.values()] == [bool, int, float, str, float, int, bool]
+    assert link.set_parameters("robot/slam", {"voxel_size": 0.5}) == {"voxel_size": 0.5}
+
+
+def test_a_refusal_gives_the_reason(link):
+    with pytest.raises(LinkError) as refused:
+        link.set_parameters("/robot/slam", {"voxel_size": 1.0, "rings": 64})
+    assert str(refused.value) == f"/robot/slam refuses rings = 64 ({ros2_node.REASON})"
+    with pytest.raises(LinkError, match="bounds = \\[1\\] is not a boolean, a number or a text"):
+        link.set_parameters("/robot/slam", {"bounds": [1]})
+
+
+def test_a_node_that_is_not_there_is_named(link):
+    begin = time.monotonic()
+    with pytest.raises(LinkError) as error:
+        link.set_parameters("/other", {"voxel_size": 1.0})
+    assert time.monotonic() - begin < 3.0
+    assert str(error.value) == (
+        "/other is not there: /other/set_parameters in ROS domain 0; "
+        "the nodes there are /deaf, /robot/slam, /secret"
+    )
+
+
+def test_a_node_that_does_not_answer_is_told_from_one_that_is_not_there(link):
+    with pytest.raises(LinkError, match="/deaf is there, but does not answer"):
+        link.set_parameters("/deaf", {"voxel_size": 1.0})
+
+
+def test_a_node_may_keep_its_parameters_to_itself(link, caplog):
+    assert link.set_parameters("/secret", {"voxel_size": 0.75}) == {"voxel_size": 0.75}
+    assert "/secret has set its parameters, but does not tell them" in caplog.text
+
+
+def test_topics_are_those_that_somebody_publishes(link):
+    topics = link.topics()
+    assert topics["/points"] == ros2_node.POINTS
+    assert topics["/robot/echo"] == ros2_node.ODOMETRY
+
+
+def test_an_error_while_a_message_is_taken_is_logged_and_the_next_one_comes(link, caplog):
+    came = queue.SimpleQueue()
+
+    def take(message):
+        came.put(message)
+        if came.qsize() == 1:
+            raise RuntimeError("a mistake")
+
+    link.subscribe("/points", ros2_node.POINTS, take)
+    for _ in range(3):
+        came.get(timeout=5.0)
+    assert "a message on /points is lost" in caplog.text
+    assert "RuntimeError: a mistake" in caplog.text
+
+
+@pytest.mark.usefixtures("robot")
+def test_type_hashes_are_those_of_ros(router):
+    for service in ("Set", "Get"):
+        name = f"{service}Parameters"
+        # The service is called by this key above.
+        (token,) = tokens(router, "SS", f"robot%slam%{service.lower()}_parameters/")
+        assert f"/rcl_interfaces::srv::dds_::{name}_/{HASHES[name]}/" in token
+    (token,) = tokens(router, "MP", "points")
+    assert HASHES["PointCloud2"] == STORE.hash_rihs01(ros2_node.POINTS)
+    assert f"/{HASHES['PointCloud2']}/" in token
+
+
+def test_an_unknown_type_is_refused(link):
+    with pytest.raises(LinkError, match="/a: the message type a_msgs/msg/A is not known"):
+        link.subscribe("/a", "a_msgs/msg/A", print)
+    with pytest.raises(LinkError, match="/a#b: "):
+        link.advertise("/a#b", ros2_node.POINTS)
+
+
+def test_another_type_than_what_is_published_is_refused(link):
+    told = "/points is published as sensor_msgs/msg/PointCloud2 with the type hash RIHS01_9198c"
+    with pytest.raises(LinkError, match=f"^{told}.*, not as nav_msgs/msg/Odometry with RIHS01_"):
+        link.subscribe("/points", ros2_node.ODOMETRY, print)
+
+
+def test_no_messages_come_after_it_is_closed(robot):
+    threads = threading.active_count()
+    link, came = Ros2(robot, 0), queue.SimpleQueue()
+    link.subscribe("/points", ros2_node.POINTS, came.put)
+    came.get(timeout=5.0)
+    link.close()
+    link.close()
+    n = came.qsize()
+    time.sleep(0.1)
+    assert came.qsize() == n
+    assert threading.active_count() == threads
+    for use in (link.topics, lambda: link.set_parameters("/robot/slam", {"voxel_size": 1.0})):
+        with pytest.raises(LinkError, match="session closed"):
+            use()
+
+
+def test_another_domain_is_another_world(robot, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    link = Ros2(robot)
+    assert not link.topics()
+    link.close()
+    monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
+    with pytest.raises(LinkError, match="the ROS domain: Invalid ROS_DOMAIN_ID value: 'seven'"):
+        Ros2(robot)
+
+
+def test_a_router_must_answer():
+    begin = time.monotonic()
+    with pytest.raises(LinkError, match=r"no Zenoh router answers at tcp/.*rmw_zenohd.*7447"):
+        Ros2(f"127.0.0.1:{free_port()}")
+    assert time.monotonic() - begin < 5.0
+    with pytest.raises(LinkError, match="'robot:here' is not the place of a Zenoh router"):
+        Ros2("robot:here")
+
+
+def test_without_the_extra_it_says_what_to_install(monkeypatch):
+    import_extra.cache_clear()
+    monkeypatch.setitem(sys.modules, "zenoh_ros2_sdk.keyexpr", None)
+    with pytest.raises(LinkError, match=r"run `pip install 'adaptune\[ros2\]'`"):
+        Ros2()
+    import_extra.cache_clear()
