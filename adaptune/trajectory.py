@@ -144,14 +144,19 @@ def read_tum(path: Path) -> Trajectory:
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write ``timestamp tx ty tz qx qy qz qw`` lines, stamps to the nanosecond."""
-    quaternions = geometry.to_quaternions(trajectory.T_world_sensor)
-    values = np.hstack([trajectory.T_world_sensor[:, :3, 3], quaternions])
+    write_text(path, "".join(tum_lines(trajectory.stamps, trajectory.T_world_sensor)))
+
+
+def tum_lines(stamps: NDArray[np.int64], T_world_sensor: Poses) -> list[str]:
+    """The lines of `write_tum`, for stamps of shape (n,) and poses of shape (n, 4, 4)."""
+    quaternions = geometry.to_quaternions(T_world_sensor)
+    values = np.hstack([T_world_sensor[:, :3, 3], quaternions])
     lines = []
-    for stamp, row in zip(trajectory.stamps.tolist(), values, strict=True):
+    for stamp, row in zip(stamps.tolist(), values, strict=True):
         sign, (seconds, nanoseconds) = "-" if stamp < 0 else "", divmod(abs(stamp), 10**9)
         numbers = " ".join(f"{value:.9f}" for value in row)
         lines.append(f"{sign}{seconds}.{nanoseconds:09d} {numbers}\n")
-    write_text(path, "".join(lines))
+    return lines
 
 
 def read_kitti(path: Path) -> Poses:

@@ -20,6 +20,7 @@ from adaptune.sequence.part import part_name
 from adaptune.space import ParameterSet
 from adaptune.study.config import RealTimeConfig, SwitchingConfig
 from adaptune.study.driven import RIVALS, ModeError, bank_members, mechanism_of
+from adaptune.study.inputs import check_model
 from adaptune.study.study import Mechanism, Study
 
 BASELINE, UNTRAINED = "baseline", "untrained"
@@ -86,6 +87,23 @@ class ReplaySetup:
         """
         rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
         return (BASELINE, *rivals, "fixed", *self.rules)
+
+    def model(self, study: Study, path: Path) -> ErrorModel:
+        """An error model, with what is pinned.
+
+        Raises
+        ------
+        AdaptuneError
+            If it is of another odometry, other parameters or other sub-trajectories, or what the
+            study's own model was fitted to has changed.
+        """
+        model = ErrorModel.load(path)
+        if path.resolve() == study.model_path.resolve():
+            check_model(study, model.sequences, model.provenance)
+        length = study.config.sub_trajectory
+        model.check_study(study.odometry.identity, study.odometry.space, length, path)
+        self.check(model, path)
+        return self.pinned(model)
 
     def pinned(self, model: ErrorModel) -> ErrorModel:
         """The model with what is pinned in all its sets."""

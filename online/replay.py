@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, MutableSequence, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -35,10 +35,10 @@ class RealTimeRecord:
     dropped: int = 0  # scans that the odometry did not get
     missed: int = 0  # selections that were not there at their deadline
     unseen: int = 0  # scans that the selector did not get
-    late: list[float] = field(
+    late: MutableSequence[float] = field(
         default_factory=list
     )  # (n,): seconds from a scan's arrival to its pose
-    waited: list[float] = field(default_factory=list)  # seconds for each selection
+    waited: MutableSequence[float] = field(default_factory=list)  # seconds for each selection
     late_members: dict[int, int] = field(default_factory=dict)  # scans at which they were, by trial
     removed: tuple[int, ...] = ()  # trials of members that were always late
 
@@ -63,8 +63,7 @@ class Replay:
     restarted: NDArray[np.bool_]  # (n,): frames at which the health check restarted the odometry
     # (n,): false where the scan was too poor to register and the last motion went on.
     registered: NDArray[np.bool_]
-    prepare_seconds: NDArray[np.float64]  # (n,)
-    register_seconds: NDArray[np.float64]  # (n,)
+    steps: Sequence[RegisteredScan]  # (n,)
     choices: list[Choice]  # those that were applied
     rejected: list[Choice]  # those that were not
     seconds: float  # the whole replay, reading included
@@ -172,13 +171,12 @@ def recorded(
     """A replay from what became of its scans, and of all selections."""
     if not steps:
         raise AdaptuneError("there is no scan to replay; check start, stop and views")
-    stamps, poses, registered, unhealthy, prepare, register = zip(*steps, strict=True)
+    stamps, poses, registered, unhealthy, _, _ = zip(*steps, strict=True)
     return Replay(
         Trajectory(np.array(stamps, np.int64), np.array(poses)),
         np.array([what is not None for what in unhealthy]),
         np.array(registered),
-        np.array(prepare),
-        np.array(register),
+        steps,
         [choice for choice in choices if not choice.why_not],
         [choice for choice in choices if choice.why_not],
         meter.seconds,

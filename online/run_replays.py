@@ -13,7 +13,7 @@ from adaptune.model import ErrorModel
 from adaptune.selection import Selection
 from adaptune.sequence.sequence import Sequence as Recording
 from adaptune.study.config import StudyConfig
-from adaptune.study.inputs import check_model, odometry_inputs
+from adaptune.study.inputs import odometry_inputs
 from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
 from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
@@ -71,14 +71,8 @@ def run_replays(
         If there is no test sequence, the model is of another odometry, other parameters or other
         sub-trajectories, or what the study's own model was fitted to has changed.
     """
-    model = ErrorModel.load(model_path)
-    if model_path.resolve() == study.model_path.resolve():
-        check_model(study, model.sequences, model.provenance)
-    length = study.config.sub_trajectory
-    model.check_study(study.odometry.identity, study.odometry.space, length, model_path)
     setup = ReplaySetup.of(study)
-    setup.check(model, model_path)
-    model = setup.pinned(model)
+    model = setup.model(study, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     of = _Modes(setup, setup.modes(model), look, model, model_path)

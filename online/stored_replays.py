@@ -14,10 +14,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
+from adaptune.odometry.tracker import RegisteredScan
 from adaptune.plain_words import in_one_line
 from adaptune.study.run_folder import differences
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
 from online.replay import Replay
+from online.safety import Choice
 
 _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
@@ -168,17 +170,10 @@ def write_replay(
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     _write_selections(folder / "selections.csv", replay)
-    columns = {
-        "stamp_ns": replay.trajectory.stamps,
-        "registered": replay.registered.astype(int),
-        "restarted": replay.restarted.astype(int),
-        "prepare_ms": np.round(1e3 * replay.prepare_seconds, 3),
-        "register_ms": np.round(1e3 * replay.register_seconds, 3),
-    }
+    late = np.full(len(replay.trajectory), np.nan)
     if replay.real_time is not None:
-        columns["late_ms"] = np.round(1e3 * np.array(replay.real_time.late), 3)
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    _write_csv(folder / "frames.csv", list(columns), rows)
+        late = np.array(replay.real_time.late)
+    _write_csv(folder / "frames.csv", FRAME_COLUMNS, map(frame_row, replay.steps, late.tolist()))
     stamps = replay.trajectory.stamps
     summary = ReplaySummary(
         scans=len(stamps),
@@ -235,37 +230,51 @@ def _mean_estimated(replay: Replay) -> float | None:
 
 
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
-_SELECTION = (
+SELECTION_COLUMNS = (
     *("stamp_ns", "trial", "predicted_error_percent", "predicted_fixed_percent"),
     *("familiarity", "sequences", *_ESTIMATED, "lost", "weights", "ms", "why_not", "fallen_back"),
 )
 """Columns of ``selections.csv`` before the parameters."""
+FRAME_COLUMNS = ("stamp_ns", "registered", "restarted", "prepare_ms", "register_ms", "late_ms")
+"""Columns of ``frames.csv``."""
 
 
 def _write_selections(path: Path, replay: Replay) -> None:
     # Sets of several odometries have other parameters.
     every = (name for choice in replay.choices for name in choice.selection.parameters)
     names = list(dict.fromkeys(every))
-    rows = []
     made = sorted([*replay.choices, *replay.rejected], key=lambda choice: choice.stamp)
-    for stamp, selection, seconds, why_not, fallen_back in made:
-        numbers = (
-            selection.predicted_error,
-            selection.predicted_fixed,
-            selection.familiarity,
-            selection.n_sequences,
-            selection.estimated_error,
-            selection.estimated_low,
-            selection.estimated_high,
-        )
-        weights = (selection.weights or {}).items()
-        rows.append(
-            [stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)]
-            + [" ".join(f"{trial}:{weight:.3f}" for trial, weight in weights)]
-            + [f"{1e3 * seconds:.3f}", why_not, fallen_back]
-            + [selection.parameters.get(name, "") for name in names]
-        )
-    _write_csv(path, [*_SELECTION, *names], rows)
+    rows = (selection_row(choice, names) for choice in made)
+    _write_csv(path, (*SELECTION_COLUMNS, *names), rows)
+
+
+def selection_row(choice: Choice, names: Sequence[str]) -> list[Any]:
+    """A row of ``selections.csv``: `SELECTION_COLUMNS`, and the parameters of these names."""
+    stamp, selection, seconds, why_not, fallen_back = choice
+    numbers = (
+        selection.predicted_error,
+        selection.predicted_fixed,
+        selection.familiarity,
+        selection.n_sequences,
+        selection.estimated_error,
+        selection.estimated_low,
+        selection.estimated_high,
+    )
+    weights = (selection.weights or {}).items()
+    return [
+        *(stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)),
+        " ".join(f"{trial}:{weight:.3f}" for trial, weight in weights),
+        *(f"{1e3 * seconds:.3f}", why_not, fallen_back),
+        *(selection.parameters.get(name, "") for name in names),
+    ]
+
+
+def frame_row(step: RegisteredScan, late: float) -> list[Any]:
+    """A row of ``frames.csv``, see `FRAME_COLUMNS`; `late` in seconds, NaN in lockstep."""
+    restarted = int(step.unhealthy is not None)
+    ms = (1e3 * seconds for seconds in (step.prepare_seconds, step.register_seconds, late))
+    rounded = (round(value, 3) if math.isfinite(value) else "" for value in ms)
+    return [step.stamp, int(step.registered), restarted, *rounded]
 
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
@@ -299,7 +308,7 @@ def _choices(path: Path) -> _Choices:
     except (TypeError, ValueError) as error:
         raise _damaged(path, error) from error
     parameters: dict[str, Sequence[Any]] = {
-        name: _numbers(values) for name, values in columns.items() if name not in _SELECTION
+        name: _numbers(values) for name, values in columns.items() if name not in SELECTION_COLUMNS
     }
     return _Choices(stamps, parameters, weights, estimated, lost)
 

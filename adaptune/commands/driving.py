@@ -1,8 +1,9 @@
 """Commands of the online stage."""
 
+import logging
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,6 +11,11 @@ from adaptune.commands.options import Folder, Override, StudyFile, load
 from adaptune.errors import AdaptuneError
 from adaptune.next_command import say_next, say_next_of_study, say_next_online
 from adaptune.terminal import begin_work, console, progress, say
+
+if TYPE_CHECKING:
+    from offline.offline_study import OfflineStudy
+
+log = logging.getLogger(__name__)
 
 Rate = Annotated[
     float | None,
@@ -24,6 +30,15 @@ Pin = Annotated[
     list[str],
     typer.Option(
         metavar="KEY=VALUE", help="Hold a parameter at this value in all sets. May be repeated."
+    ),
+]
+
+
+Mode = Annotated[
+    str | None,
+    typer.Option(
+        help="On a robot, what to drive: baseline, fixed, paired or paper.",
+        show_default="the first of online.rules",
     ),
 ]
 
@@ -43,6 +58,11 @@ def online(
         bool,
         typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
     ] = False,
+    ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")
+    ] = False,
+    mode: Mode = None,
 ) -> None:
     """Replay the test sequences: baseline, fixed, and adaptive by every rule.
 
@@ -55,6 +75,8 @@ def online(
 
     With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
     so are scans that wait too long.
+
+    With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C.
     """
     if untrained and model is not None:
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
@@ -62,6 +84,23 @@ def online(
     if rate is not None:
         override = [*override, f"online.real_time.rate={rate:g}"]
     loaded = load(study, override, folder)
+    if ros or ros2:
+        if (ros and ros2) or rate is not None:
+            raise AdaptuneError("give only one of --ros, --ros2 and --rate")
+        _drive(loaded, mode, model, untrained=untrained, ros2=ros2)
+        return
+    if mode is not None:
+        raise AdaptuneError(f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed")
+    made, n = _replay(loaded, model, again, untrained)
+    there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
+    say(f"{there}: {loaded.folder / 'replays'}/")
+    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+
+
+def _replay(
+    loaded: "OfflineStudy", model: Path | None, again: bool, untrained: bool
+) -> tuple[int, int]:
+    """Make the replays that are missing; how many were made, and how many there are."""
     from adaptune.cores import pin as bind
     from adaptune.model import ErrorModel
     from online.dashboard import Dashboard
@@ -71,24 +110,48 @@ def online(
     # Ask for the number of cores before the replays are bound to one.
     _ = loaded.mechanism
     unbind = bind(os.getpid(), alone=True)
-    dashboard = Dashboard()
+    dashboard, path = Dashboard(), model or loaded.model_path
     try:
         with progress(dashboard) as show:
             if untrained:
                 made = run_untrained(loaded, again, show, dashboard.look)
             else:
-                path = model or loaded.model_path
                 made = run_replays(loaded, path, again, show, dashboard.look)
     finally:
         unbind()
     if untrained:
-        n = len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
-    else:
-        modes = ReplaySetup.of(loaded).modes(ErrorModel.load(model or loaded.model_path))
-        n = len(loaded.config.test) * len(modes)
-    there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
-    say(f"{there}: {loaded.folder / 'replays'}/")
-    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+        return made, len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
+    modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
+    return made, len(loaded.config.test) * len(modes)
+
+
+def _drive(
+    loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
+) -> None:
+    """Drive on a robot until Ctrl-C."""
+    from adaptune.cores import pin as bind
+    from online.dashboard import Dashboard
+    from online.live import Live
+    from online.modes import UNTRAINED, WITHOUT_MODEL
+    from online.ros1 import Ros1
+    from online.ros2 import Ros2
+
+    mode = UNTRAINED if untrained else mode or loaded.rules[0]
+    path = None if mode in WITHOUT_MODEL else model or loaded.model_path
+    live = Live(loaded, mode, path)
+    link = Ros2(loaded.config.online.ros.router) if ros2 else Ros1()
+    _ = loaded.mechanism
+    unbind = bind(os.getpid(), alone=True)
+    dashboard = Dashboard()
+    try:
+        with progress(dashboard):
+            log.info("drive, %s: Ctrl-C ends it", mode)
+            driven = live.drive(link, dashboard.look)
+    finally:
+        link.close()
+        unbind()
+    dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
+    say(f"{driven.scans} scans{dropped}: {driven.folder}/")
 
 
 def switching(

@@ -162,7 +162,7 @@ def _recorded(config: SequenceConfig) -> RecordedSequence:
     section = _section(config)
     if config.part is not None and (span := source.span()) is not None:
         section = section.part(config.part, (span[1] - span[0]) * 1e-9)
-    return RecordedSequence(source, section, settings, _imu(config.imu), key)
+    return RecordedSequence(source, section, settings, imu_settings(config.imu), key)
 
 
 def _source(config: SequenceConfig) -> tuple[Source, str | None]:
@@ -195,7 +195,8 @@ def _section(config: SequenceConfig) -> Section:
     return Section(config.start, config.stop, config.stride)
 
 
-def _imu(config: ImuConfig | None) -> ImuSettings | None:
+def imu_settings(config: ImuConfig | None) -> ImuSettings | None:
+    """How to read an IMU that a sequence names."""
     if config is None:
         return None
     T = None if config.extrinsic is None else to_pose(config.extrinsic)

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import Limits
-from adaptune.sequence.config import SequenceConfig, ViewConfig
+from adaptune.sequence.config import SequenceConfig, Transform, ViewConfig
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
 from adaptune.strict import StrictModel
@@ -135,6 +135,67 @@ class RealTimeConfig(StrictModel):
     queue: int = Field(1, ge=0, le=10_000)
 
 
+class SteerConfig(StrictModel):
+    """Somebody else's odometry node, of which only the parameters are set.
+
+    Attributes
+    ----------
+    node : str
+        Its name.
+    odometry : str
+        Topic of its poses, nav_msgs/Odometry.
+    extrinsic : pose, optional
+        The LiDAR's pose in the frame whose poses the node publishes.
+    command : tuple of str, optional
+        A program that sets a parameter, and its arguments, with ``{node}``, ``{name}`` and
+        ``{value}``; otherwise they are set through ROS.
+    """
+
+    node: str = Field(min_length=1)
+    odometry: str = Field(min_length=1)
+    extrinsic: Transform | None = None
+    command: Annotated[tuple[str, ...] | None, Field(min_length=1)] = None
+
+    @field_validator("command")
+    @classmethod
+    def _sets(cls, command: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        words = " ".join(command or ("{name} {value}",))
+        if lacking := [key for key in ("{name}", "{value}") if key not in words]:
+            raise ValueError(f"names no {' and no '.join(lacking)} in its arguments")
+        return command
+
+
+class RosConfig(StrictModel):
+    """How to drive on a robot with ROS.
+
+    Attributes
+    ----------
+    points : str, optional
+        Topic of the point clouds; that of `like` if left out.
+    like : str, optional
+        The sequence of the study with the same sensor: its `stamp`, `time_unit`, `period` and `imu`
+        count. The first training sequence if left out.
+    frame : str
+        Name of the odometry's frame.
+    odometry : str
+        Topic to publish poses on.
+    tf : bool
+        Whether to publish the transform from `frame` to the sensor.
+    steer : SteerConfig, optional
+        Set the parameters of this node instead of running an odometry.
+    router : str
+        Address of Zenoh's router, in ROS 2.
+    """
+
+    points: str | None = None
+    like: str | None = None
+    frame: str = Field("odom", min_length=1)
+    odometry: str = Field("adaptune/odometry", min_length=1)
+    tf: bool = True
+    steer: SteerConfig | None = None
+    router: str = "127.0.0.1:7447"
+
+
 class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, switching, and what it may cost.
 
@@ -150,6 +211,7 @@ class OnlineConfig(StrictModel):
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
     real_time: RealTimeConfig | None = None
+    ros: RosConfig = RosConfig()
 
 
 class StudyConfig(StrictModel):

@@ -73,9 +73,9 @@ class Answering:
     unseen: int = 0
     cpu: float = 1.0
     period: float = 1.0
-    fixed: Selection = Selection(1, {"fine": 1})
 
     def __post_init__(self):
+        self.fixed = Selection(1, {"fine": 1})
         self.turns = itertools.cycle((2, 1))
         self.shown = {}
 

@@ -1,0 +1,268 @@
+"""Drive on a robot: scans from a topic, poses and selections on others."""
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import invert
+from adaptune.live.untrained import UntrainedSelector
+from adaptune.model import ErrorModel
+from adaptune.odometry.base import OdometryInstance
+from adaptune.odometry.tracker import RegisteredScan
+from adaptune.selector import Selector
+from adaptune.sequence.config import ImuConfig, SequenceConfig
+from adaptune.sequence.opening import imu_settings
+from adaptune.sequence.timing import Timing
+from adaptune.space import nearest
+from adaptune.study.config import RealTimeConfig
+from adaptune.study.driven import ModeError
+from adaptune.study.study import Study
+from online.drive_log import DriveLog
+from online.live_scans import CLOUD, IMU, LiveScans
+from online.modes import ReplaySetup, needed
+from online.real_time import RealTimeDrive
+from online.replay import Progressed, RealTimeRecord
+from online.ros_link import RosLink
+from online.ros_messages import Messages, Uncertainty
+from online.safety import Choice
+from online.selector_process import SelectorProcess
+from online.steered_node import ODOMETRY, SteeredNode
+
+SELECTION_TOPIC, DIAGNOSTICS_TOPIC = "adaptune/selection", "/diagnostics"
+_KEPT = 1000
+"""Scans whose times are kept."""
+_EVERY = 10**9
+"""Nanoseconds from one message of diagnostics to the next."""
+
+_PUBLISHED = 5.0
+"""Seconds in which a topic that nobody has named must be published."""
+
+Look = Callable[[str, int, Progressed], None]
+
+
+class Driven(NamedTuple):
+    """What became of a drive."""
+
+    folder: Path  # of its trajectory, selections and scans
+    scans: int
+    record: RealTimeRecord  # of its last part, where the clock went back
+    ignored: int  # scans that came twice or too late
+
+
+class Live:
+    """A study's odometry, or somebody else's node, on a robot.
+
+    Parameters
+    ----------
+    study
+        The study; ``drives/<time>`` in its folder receives the drive.
+    mode
+        One of `ReplaySetup.modes`, or `untrained`.
+    model_path
+        The error model; None for `untrained` and `baseline`.
+
+    Raises
+    ------
+    AdaptuneError
+        If the mode, the model and the study do not go together.
+    """
+
+    def __init__(self, study: Study, mode: str, model_path: Path | None):
+        config = study.config
+        real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
+        setup = replace(ReplaySetup.of(study), real_time=real_time)
+        self._study, self._mode, self._setup, self._settings = study, mode, setup, real_time
+        self._ros = config.online.ros
+        self._model = None if model_path is None else setup.model(study, model_path)
+        self._like = _like(study)
+        if self._ros.steer is not None:
+            if mode not in setup.rules:
+                raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
+        elif study.odometry.description.whole:
+            raise ModeError(
+                f"{study.odometry.name} runs whole recordings: name the node that runs it on the "
+                f"robot (online.ros.steer)"
+            )
+
+    def drive(self, link: RosLink, look: Look = lambda *_: None) -> Driven:
+        """Drive until Ctrl-C, or until `stop` is called.
+
+        Where the clock goes back, all begins anew.
+
+        Parameters
+        ----------
+        link
+            To the robot.
+        look
+            Called after every scan, see `online.dashboard.Dashboard.look`.
+        """
+        with ExitStack() as stack:
+            odometry = stack.enter_context(closing(self._odometry(link)))
+            selector = None
+            if self._ros.steer is not None or self._setup.adapts(self._mode):
+                make = partial(_selector, self._setup, self._mode, self._model, self._steers)
+                period = self._study.config.online.period
+                selector = stack.enter_context(closing(SelectorProcess(make, period)))
+            self._scans = self._topics(link)
+            driven = None
+            while not self._scans.stopped:
+                driven = self._part(link, odometry, selector, look)
+        assert driven is not None
+        return driven
+
+    def stop(self) -> None:
+        """End the drive; any thread may call it."""
+        self._scans.stop()
+
+    @property
+    def _steers(self) -> bool:
+        return self._ros.steer is not None
+
+    def _odometry(self, link: RosLink) -> OdometryInstance:
+        if self._ros.steer is not None:
+            return SteeredNode(link, self._ros.steer)
+        return self._setup.instance(self._mode, self._model)
+
+    def _topics(self, link: RosLink) -> LiveScans:
+        """Subscribe to scans, and to an IMU if the odometry needs one."""
+        like, imu = self._like, None
+        timing = Timing(like.stamp, like.time_unit, like.period)
+        needs = self._study.odometry.description.needs_imu and not self._steers
+        if needs:
+            settings = imu_settings(like.imu) or imu_settings(ImuConfig())
+            assert settings is not None
+            imu = replace(settings, topic=_topic(link, settings.topic, IMU, "imu.topic"))
+        points = _topic(link, self._ros.points or like.points, CLOUD, "online.ros.points")
+        return LiveScans(link, points, timing, self._settings.queue, imu)
+
+    def _part(
+        self,
+        link: RosLink,
+        odometry: OdometryInstance,
+        selector: SelectorProcess | None,
+        look: Look,
+    ) -> Driven:
+        """Drive until the clock goes back."""
+        folder = _new_folder(self._study.folder / "drives")
+        names = self._study.odometry.space.names
+        with closing(DriveLog(folder, list(names))) as log:
+            publisher = _Publisher(link, self._study, self._scans, log)
+            if selector is not None:
+                odometry.apply(selector.fixed)
+            drive = RealTimeDrive(
+                odometry,
+                self._study.config.health,
+                self._settings,
+                selector,
+                publisher.choice,
+                "drive",
+            )
+            drive.record.late = deque(maxlen=_KEPT)
+            drive.record.waited = deque(maxlen=_KEPT)
+            done = 0
+            try:
+                for arrival in self._scans.arrivals():
+                    step = drive.step(arrival)
+                    done += 1 + arrival.dropped
+                    publisher.step(step, drive.record)
+                    look("drive", 0, Progressed(done, step, publisher.newest, drive.record))
+            except KeyboardInterrupt:
+                self._scans.stop()
+            return Driven(folder, done, drive.finished(), self._scans.ignored)
+
+
+class _Publisher:
+    """Publishes and records what a drive finds."""
+
+    def __init__(self, link: RosLink, study: Study, scans: LiveScans, log: DriveLog):
+        ros, self._scans, self._log = study.config.online.ros, scans, log
+        self.newest: Choice | None = None
+        self._messages = Messages(link.store, ros.frame)
+        self._uncertainty = Uncertainty(study.config.sub_trajectory)
+        self._last: RegisteredScan | None = None
+        self._told: int | None = None
+        self._selection = link.advertise(SELECTION_TOPIC, "std_msgs/msg/String")
+        diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
+        self._diagnostics = link.advertise(DIAGNOSTICS_TOPIC, diagnostics)
+        # A node that is steered publishes its own poses.
+        own = ros.steer is None
+        self._odometry = link.advertise(ros.odometry, ODOMETRY) if own else None
+        tf = own and ros.tf
+        self._tf = link.advertise("/tf", "tf2_msgs/msg/TFMessage") if tf else None
+
+    def choice(self, choice: Choice) -> None:
+        """Tell of a selection."""
+        self.newest = choice
+        self._log.choice(choice)
+        if not choice.why_not:
+            self._uncertainty.learn(choice.selection)
+        self._selection(self._messages.selection(choice.stamp, choice.selection, choice.why_not))
+
+    def step(self, step: RegisteredScan, record: RealTimeRecord) -> None:
+        """Tell of a pose."""
+        self._log.scan(step, record.late[-1])
+        if self._last is not None:
+            self._uncertainty.move(invert(self._last.T_odom_sensor) @ step.T_odom_sensor)
+        self._last = step
+        where = step.stamp, step.T_odom_sensor, self._scans.frame
+        if self._odometry is not None:
+            self._odometry(self._messages.odometry(*where, self._uncertainty))
+        if self._tf is not None:
+            self._tf(self._messages.transform(*where))
+        if self._told is None or step.stamp - self._told >= _EVERY:
+            self._told = step.stamp
+            selection = None if self.newest is None else self.newest.selection
+            ignored = self._scans.ignored
+            self._diagnostics(self._messages.diagnostics(step.stamp, selection, record, ignored))
+
+
+def _like(study: Study) -> SequenceConfig:
+    """The sequence of the study that was recorded with the robot's sensor."""
+    name = study.config.online.ros.like or study.config.training[0]
+    known = (*study.config.sequences, *study.config.courses)
+    if name not in known:
+        raise AdaptuneError(f"online.ros.like: no sequence {name!r}; {nearest(name, known)}")
+    return study.sequences.config(name)
+
+
+def _selector(
+    setup: ReplaySetup, mode: str, model: ErrorModel | None, steers: bool
+) -> Selector | UntrainedSelector | None:
+    """Make the selector; a node that is steered has one set at a time."""
+    if not steers:
+        return setup.selector(mode, model)
+    cost, names, dwell = setup.switch_cost, setup.descriptors, setup.dwell
+    return Selector(needed(mode, model), mode, (), cost, names, dwell)
+
+
+def _topic(link: RosLink, name: str | None, kind: str, key: str) -> str:
+    """A topic, or the only one of a kind that is published."""
+    if name is not None:
+        return name
+    end = time.monotonic() + _PUBLISHED
+    found: list[str] = []
+    while not found and time.monotonic() < end:
+        found = sorted(topic for topic, of in link.topics().items() if of == kind)
+        time.sleep(0.0 if found else 0.2)
+    if len(found) != 1:
+        there = ", ".join(found) or "none"
+        raise AdaptuneError(f"{key}: name the topic; of {kind}, {there} is published")
+    return found[0]
+
+
+def _new_folder(parent: Path) -> Path:
+    """A folder named by the time, which is not there yet."""
+    name = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
+    numbers = itertools.count(2)
+    folder = parent / name
+    while folder.exists():
+        folder = parent / f"{name}_{next(numbers)}"
+    return folder

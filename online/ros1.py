@@ -1,0 +1,180 @@
+"""A link to ROS 1, by a node that the Python of a ROS installation runs."""
+
+import itertools
+import logging
+import os
+import shutil
+import socket
+import subprocess
+import threading
+from collections.abc import Callable, Mapping
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from adaptune.errors import in_a_line
+from adaptune.odometry import wire
+from online import ros1_node
+from online.ros_link import LinkError
+
+_START = 20.0
+"""Seconds in which the node must be ready."""
+_ANSWER = 5.0
+"""Seconds in which it must answer; it waits less for others."""
+
+_log = logging.getLogger(__name__)
+
+
+def ros_python() -> str:
+    """The Python that imports ROS 1: the first ``python3`` of the system's that does.
+
+    Raises
+    ------
+    LinkError
+        If there is none.
+    """
+    found = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
+    for python in dict.fromkeys([*filter(None, found), "/usr/bin/python3"]):
+        done = subprocess.run([python, "-c", "import rospy"], capture_output=True, check=False)
+        if done.returncode == 0:
+            return python
+    raise LinkError(
+        "no python3 on PATH can import rospy: source the setup of your ROS 1 first (`source "
+        "/opt/ros/noetic/setup.bash`), or install it (`apt-get install python3-rospy`)"
+    )
+
+
+class Ros1:
+    """A node in a running ROS 1, see `online.ros_link.RosLink`.
+
+    A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
+    through it as bytes.
+
+    Parameters
+    ----------
+    python
+        The Python that imports ROS; found if left out, see `ros_python`.
+
+    Raises
+    ------
+    LinkError
+        If ROS cannot be imported, or no roscore answers.
+    """
+
+    def __init__(self, python: str | None = None):
+        self.store = get_typestore(Stores.ROS1_NOETIC)
+        text = "geometry_msgs/TransformStamped[] transforms\n"
+        self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        here, there = socket.socketpair()
+        command = [python or ros_python(), ros1_node.__file__, str(there.fileno())]
+        # A session of its own: Ctrl-C ends adaptune, and that ends the node.
+        self._process = subprocess.Popen(
+            command, pass_fds=[there.fileno()], stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        there.close()
+        self._stream = wire.SocketStream(here)
+        self._sending = threading.Lock()
+        self._numbers = itertools.count()
+        self._answers: dict[int, SimpleQueue[dict[str, Any]]] = {}
+        self._takes: dict[str, tuple[str, SimpleQueue[bytes | None]]] = {}
+        self._mistaken: set[str] = set()
+        ready = wire.receive(self._stream) if self._stream.ready(_START) else None
+        if ready is None or ready.header["type"] == "failed":
+            self.close()
+            what = "its node did not start" if ready is None else ready.header["message"]
+            raise LinkError(f"ROS 1: {what}; start `roscore`, and source your ROS's setup")
+        threading.Thread(target=self._receive, daemon=True).start()
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+        """See `RosLink.subscribe`."""
+        received: SimpleQueue[bytes | None] = SimpleQueue()
+        self._takes[topic] = kind, received
+
+        def work() -> None:
+            while (data := received.get()) is not None:
+                try:
+                    take(self.store.deserialize_ros1(data, kind))
+                except Exception as error:
+                    _log.warning("a message on %s is lost: %s", topic, in_a_line(error))
+
+        threading.Thread(target=work, daemon=True).start()
+        self._send({"type": "subscribe", "topic": topic})
+
+    def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
+        """See `RosLink.advertise`."""
+        text, md5 = self.store.generate_msgdef(kind, ros_version=1)
+        names = {"kind": kind.replace("/msg/", "/"), "text": text, "md5": md5}
+        self._send({"type": "advertise", "topic": topic, **names})
+
+        def publish(message: Any) -> None:
+            data = np.frombuffer(self.store.serialize_ros1(message, kind), np.uint8)
+            self._send({"type": "publish", "topic": topic}, data)
+
+        return publish
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """See `RosLink.set_parameters`.
+
+        They are set by dynamic_reconfigure where the node has it, and otherwise at the parameter
+        server: then only what the server holds is known.
+        """
+        answer = self._ask({"type": "set_parameters", "node": node, "values": dict(values)})
+        if "refused" in answer:
+            raise LinkError(f"{node}: {answer['refused']}")
+        held: dict[str, Any] = answer["found"]["held"]
+        return held
+
+    def topics(self) -> Mapping[str, str]:
+        """See `RosLink.topics`."""
+        found: dict[str, str] = self._ask({"type": "topics"})["found"]
+        return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
+
+    def close(self) -> None:
+        """See `RosLink.close`."""
+        for _, received in self._takes.values():
+            received.put(None)
+        self._stream.close()
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _send(self, header: dict[str, Any], data: Any = None) -> None:
+        try:
+            with self._sending:
+                wire.send(self._stream, header, data=data)
+        except (OSError, ValueError) as error:
+            raise LinkError("ROS 1: adaptune's node has ended") from error
+
+    def _ask(self, header: dict[str, Any]) -> dict[str, Any]:
+        number = next(self._numbers)
+        answer = self._answers[number] = SimpleQueue()
+        try:
+            self._send({**header, "number": number})
+            return answer.get(timeout=_ANSWER)
+        except Empty as error:
+            raise LinkError(f"ROS 1: no answer in {_ANSWER:g} s") from error
+        finally:
+            del self._answers[number]
+
+    def _receive(self) -> None:
+        """Pass on what the node sends, until it ends."""
+        try:
+            while (message := wire.receive(self._stream)) is not None:
+                header = message.header
+                if header["type"] == "answer":
+                    if (waiting := self._answers.get(header["number"])) is not None:
+                        waiting.put(header)
+                    continue
+                kind, received = self._takes[header["topic"]]
+                if header["kind"].replace("/", "/msg/") == kind:
+                    received.put(message.arrays["data"].tobytes())
+                elif header["topic"] not in self._mistaken:
+                    self._mistaken.add(header["topic"])
+                    is_not = "%s is %s, not %s: its messages are ignored"
+                    _log.warning(is_not, header["topic"], header["kind"], kind)
+        except (OSError, wire.WireError):
+            pass  # it was closed

@@ -1,0 +1,197 @@
+"""Somebody else's odometry node, of which only parameters are set."""
+
+import logging
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from adaptune.geometry import Poses, invert
+from adaptune.odometry.base import (
+    LastMotion,
+    Motions,
+    OdometryError,
+    OdometryInstance,
+    Registration,
+    Usage,
+)
+from adaptune.selection import Selection
+from adaptune.sequence.config import to_pose
+from adaptune.sequence.pose_messages import POSES
+from adaptune.sequence.scan import Scan
+from adaptune.study.config import SteerConfig
+from adaptune.trajectory import Trajectory
+from online.ros_link import RosLink
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+PATIENCE = 0.3
+"""Seconds after a scan in which the node's pose must be there."""
+_COMMAND = 5.0
+"""Seconds for a command that sets a parameter."""
+_KEPT = 1000
+"""Poses that are kept."""
+_GAP = 1.0
+"""Seconds between poses over which a pose is interpolated."""
+
+_log = logging.getLogger(__name__)
+
+
+class SteeredNode(OdometryInstance):
+    """An odometry that runs elsewhere and publishes its poses.
+
+    Parameters
+    ----------
+    link
+        To the robot.
+    settings
+        The node, its topic, and how its parameters are set.
+    """
+
+    faults = ()
+
+    def __init__(self, link: RosLink, settings: SteerConfig):
+        self._link, self._settings = link, settings
+        extrinsic = settings.extrinsic
+        self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
+        self._news = threading.Condition()
+        self._poses: deque[tuple[int, Poses]] = deque(maxlen=_KEPT)
+        self._last_motion = LastMotion()
+        self._begun: tuple[int, Poses] | None = None
+        self._T_odom_node: Poses | None = None
+        self._told: set[str] = set()
+        link.subscribe(settings.odometry, ODOMETRY, self._take)
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(0.0, None)
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
+
+    def prepare(self, scan: Scan) -> Scan:
+        return scan
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        # The node goes on; its motions continue from here.
+        self._begun, self._T_odom_node = (prepared.stamp, np.array(T_odom_sensor)), None
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+
+    def submit(self, prepared: Scan) -> None:
+        self._submitted = prepared.stamp
+
+    def collect(self) -> Registration:
+        T_node = self._pose(self._submitted, PATIENCE)
+        T_odom_sensor = np.full((4, 4), np.nan)
+        if np.isfinite(T_node).all():
+            if self._T_odom_node is None:
+                assert self._begun is not None
+                stamp, T = self._begun
+                T_begin = self._pose(stamp, 0.0)
+                known = T_begin if np.isfinite(T_begin).all() else T_node
+                self._T_odom_node = T @ invert(known)
+            T_odom_sensor = self._T_odom_node @ T_node
+        self._last_motion.move(T_odom_sensor)
+        return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
+
+    def apply(self, selection: Selection) -> None:
+        """Set the parameters, and make sure that the node holds them where it tells.
+
+        Raises
+        ------
+        OdometryError
+            If it cannot be reached, or holds other values.
+        LinkError
+            If it refuses them.
+        """
+        if self._settings.command is not None:
+            for name, value in selection.parameters.items():
+                self._run(name, value)
+            return
+        held = self._link.set_parameters(self._settings.node, selection.parameters)
+        self._compare(selection.parameters, held)
+
+    def close(self) -> None:
+        return  # it runs on without adaptune
+
+    def _compare(self, wanted: Mapping[str, Any], held: Mapping[str, Any]) -> None:
+        for name, value in wanted.items():
+            if name not in held:
+                if name not in self._told:
+                    self._told.add(name)
+                    _log.warning(
+                        "%s: nobody says whether %s takes effect before the node starts again",
+                        self._settings.node,
+                        name,
+                    )
+            elif not _equal(value, held[name]):
+                raise OdometryError(f"{self._settings.node} holds {name} = {held[name]}")
+
+    def _run(self, name: str, value: Any) -> None:
+        assert self._settings.command is not None
+        values = {"{node}": self._settings.node, "{name}": name, "{value}": _text(value)}
+        command = []
+        for argument in self._settings.command:
+            for key, text in values.items():
+                argument = argument.replace(key, text)  # noqa: PLW2901
+            command.append(argument)
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=_COMMAND, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise OdometryError(f"{command[0]}: {error}") from error
+        if done.returncode:
+            words = " | ".join((done.stderr or done.stdout).split("\n")[-4:]).strip(" |")
+            raise OdometryError(f"{' '.join(command)}: exit code {done.returncode}: {words}")
+
+    def _take(self, message: Any) -> None:
+        for stamp, _, position, orientation in POSES[ODOMETRY](message):
+            values = (position.x, position.y, position.z)
+            quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
+            try:
+                T = to_pose((*values, *quaternion))
+            except ValueError:
+                continue  # no pose, which the health check sees
+            with self._news:
+                if not self._poses or stamp > self._poses[-1][0]:
+                    self._poses.append((stamp, T @ self._T_base_sensor))
+                elif stamp < self._poses[0][0]:
+                    # The clock went back.
+                    self._poses.clear()
+                self._news.notify()
+
+    def _pose(self, stamp: int, seconds: float) -> Poses:
+        """The node's pose at a stamp, of shape (4, 4); NaN if it does not come in time."""
+        with self._news:
+            self._news.wait_for(lambda: self._poses and self._poses[-1][0] >= stamp, seconds)
+            poses = list(self._poses)
+        if not poses:
+            return np.full((4, 4), np.nan)
+        stamps, T = zip(*poses, strict=True)
+        # Only the poses around it are needed.
+        i = int(np.searchsorted(stamps, stamp))
+        part = slice(max(i - 1, 0), i + 2)
+        known = Trajectory(np.array(stamps[part], np.int64), np.array(T[part]))
+        found: Poses = known.at(np.array([stamp], np.int64), _GAP)[0]
+        return found
+
+
+def _equal(wanted: Any, held: Any) -> bool:
+    if isinstance(wanted, float) or isinstance(held, float):
+        return bool(np.isclose(float(wanted), float(held), rtol=1e-5, atol=1e-9))
+    return bool(wanted == held)
+
+
+def _text(value: Any) -> str:
+    # `1e-05` is a text to some readers of YAML, and `True` to others.
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return np.format_float_positional(value, trim="0")
+    return str(value)
