@@ -186,7 +186,9 @@ class _Sender:
         self._stream.log(entity, lines, static=True, strict=True)
 
     def _texts(self, entity: str, words: Words, mode: str) -> None:
-        colours = [_rgb(LINES[mode]["color"])] * len(words.texts)
+        # A list of one colour could be three numbers.
+        packed = int.from_bytes([*_rgb(LINES[mode]["color"]), 255])
+        colours = np.full(len(words.texts), packed, np.uint32)
         self._send(entity, words.stamps, self._rr.TextLog.columns(text=words.texts, color=colours))
 
     def _send(self, entity: str, stamps: NDArray[np.int64], columns: Any) -> None:
