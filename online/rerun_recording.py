@@ -171,6 +171,8 @@ class _Sender:
         points = cloud.points @ T[:3, :3].T + T[:3, 3]
         columns = self._rr.Points3D.columns(positions=points).partition([len(points)])
         self._send("/world/scan", np.array([cloud.stamp]), columns)
+        # A slow disk does not fill the memory.
+        self._stream.flush()
 
     def _path(self, entity: str, xyz: NDArray[np.float64], colour: str) -> None:
         strips = self._rr.LineStrips3D(
