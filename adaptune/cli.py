@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from adaptune import tools
-from adaptune.commands import driving, learning, referencing, training
+from adaptune.commands import driving, learning, looking, referencing, training
 from adaptune.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -31,7 +31,8 @@ app = typer.Typer(
         "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
         "    adaptune switching configs/demo.yaml   # what a switch costs\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
-        "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive"
+        "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
+        "    adaptune record   configs/demo.yaml    # replays to look at in Rerun or Foxglove"
     ),
 )
 
@@ -42,7 +43,7 @@ for _command in (
     *(tools.inspect, tools.cache, tools.serve),
     *(training.simulate, referencing.reference),
     *(training.offline, learning.learn, training.trials, training.validate),
-    *(driving.online, driving.switching, driving.compare),
+    *(driving.online, driving.switching, driving.compare, looking.record),
 ):
     app.command()(_command)
 

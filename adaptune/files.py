@@ -71,15 +71,17 @@ def replacing(path: Path) -> Iterator[Path]:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Rename a folder into place, also over an existing one, when the block ends well.
 
-    The block receives an unused name and makes a folder of this name.
+    The block receives an unused path, whose name is that of `path`, and makes a folder of it. See
+    `needing_room`.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:
-        temporary = Path(name) / "new"
-        yield temporary
-        if path.exists():
-            path.rename(Path(name) / "old")
-        temporary.rename(path)
+    with needing_room(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as name:
+            temporary = Path(name) / path.name
+            yield temporary
+            if path.exists():
+                path.rename(temporary.with_name(f"{path.name}.old"))
+            temporary.rename(path)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -30,7 +30,7 @@ from online.statistics import (
     compare_modes,
     pooled,
 )
-from online.stored_reference import is_reference_of
+from online.stored_reference import check_reference
 from online.stored_replays import ReplaySummary, StoredReplay, StoredReplayError
 
 
@@ -225,11 +225,8 @@ def _check_replays(
             )
     option = " --untrained" if UNTRAINED in modes and "fixed" not in modes else ""
     for name in names:
-        if not is_reference_of(study.folder / "replays" / name, study.sequences.reference(name)):
-            raise StoredReplayError(
-                f"{study.folder / 'replays' / name}: was judged by another reference; run "
-                f"`adaptune online{option}` with this study, which replays nothing for it"
-            )
+        folder = study.folder / "replays" / name
+        check_reference(folder, study.sequences.reference(name), option)
     return model
 
 

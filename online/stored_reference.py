@@ -9,6 +9,7 @@ import numpy as np
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.trajectory import Trajectory, write_tum
+from online.stored_replays import StoredReplayError
 
 
 class StoredReferenceError(AdaptuneError):
@@ -22,6 +23,29 @@ def is_reference_of(folder: Path, about: dict[str, Any]) -> bool:
     except (OSError, ValueError):
         return False
     return bool(made["about"] == about and made["known"] == (folder / "reference.tum").exists())
+
+
+def check_reference(folder: Path, about: dict[str, Any], option: str = "") -> None:
+    """Refuse a reference that was made from something else.
+
+    Parameters
+    ----------
+    folder
+        Of the sequence's replays.
+    about
+        What the reference should be made from.
+    option
+        Of the command that makes it again.
+
+    Raises
+    ------
+    StoredReplayError
+    """
+    if not is_reference_of(folder, about):
+        raise StoredReplayError(
+            f"{folder}: was judged by another reference; run `adaptune online{option}` with this "
+            f"study, which replays nothing for it"
+        )
 
 
 def write_reference(

@@ -84,7 +84,7 @@ class ReplaySummary(BaseModel):
         try:
             return cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
-            raise _damaged(path, error) from error
+            raise damaged(path, error) from error
 
 
 def other_keys(folder: Path, about: ReplayIdentity) -> list[str] | None:
@@ -132,14 +132,14 @@ class StoredReplay:
         except TrajectoryError as error:
             help_ = "run `adaptune online --again`"
             raise StoredReplayError(f"{error}; {help_}") from error
-        frames = _columns(folder / "frames.csv")
+        frames = read_columns(folder / "frames.csv")
         restarted = np.array(frames.get("restarted", [])) == "1"
         if len(restarted) != len(trajectory):
-            raise _damaged(folder / "frames.csv", ValueError("not a row for every scan"))
+            raise damaged(folder / "frames.csv", ValueError("not a row for every scan"))
         try:
             seconds = 1e-3 * sum(float(ms) for key in _TIMES for ms in frames[key])
         except (KeyError, ValueError) as error:
-            raise _damaged(folder / "frames.csv", error) from error
+            raise damaged(folder / "frames.csv", error) from error
         chosen = _choices(folder / "selections.csv")
         if not len(chosen.stamps):
             kept = summary.about.parameters or {}
@@ -295,7 +295,7 @@ class _Choices(NamedTuple):
 
 
 def _choices(path: Path) -> _Choices:
-    columns = _applied(_columns(path))
+    columns = _applied(read_columns(path))
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
         weights = _weights(columns.get("weights", []))
@@ -306,7 +306,7 @@ def _choices(path: Path) -> _Choices:
                 estimated[:, i] = np.array(columns[name], np.float64)
         lost = np.array([text == "1" for text in columns.get("lost", ["0"] * len(stamps))], bool)
     except (TypeError, ValueError) as error:
-        raise _damaged(path, error) from error
+        raise damaged(path, error) from error
     parameters: dict[str, Sequence[Any]] = {
         name: _numbers(values) for name, values in columns.items() if name not in SELECTION_COLUMNS
     }
@@ -330,12 +330,19 @@ def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:
     return {int(trial): [float(row[trial]) for row in rows] for trial in (rows[0] if rows else {})}
 
 
-def _columns(path: Path) -> dict[str, list[str]]:
+def read_columns(path: Path) -> dict[str, list[str]]:
+    """Columns of a table of a replay as they are written; none if it has no rows.
+
+    Raises
+    ------
+    StoredReplayError
+        If it is missing or damaged.
+    """
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
-        raise _damaged(path, error) from error
+        raise damaged(path, error) from error
     return {key: [row[key] for row in rows] for key in (rows[0] if rows else {})}
 
 
@@ -347,6 +354,7 @@ def _numbers(values: Sequence[str]) -> list[Any]:
         return list(values)
 
 
-def _damaged(path: Path, error: Exception) -> StoredReplayError:
+def damaged(path: Path, error: Exception) -> StoredReplayError:
+    """What is raised on a file of a replay that cannot be understood."""
     what = f"is damaged ({in_one_line(error)})"
     return StoredReplayError(f"{path}: {what}; run `adaptune online --again`")

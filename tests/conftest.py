@@ -61,6 +61,7 @@ SLOW = [
     "adaptune/reference/test_registering.py",
     "adaptune/reference/test_consensus.py",
     "offline/test_progress.py",
+    "online/test_recordings.py",
     "adaptune/test_interrupt.py",
     "online/test_replay_picture.py",
     "offline/test_pictures.py",

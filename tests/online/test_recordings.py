@@ -1,0 +1,414 @@
+"""Replays as recordings to look at."""
+
+import csv
+import errno
+import re
+import resource
+import sys
+from contextlib import contextmanager
+
+import drives
+import numpy as np
+import pyarrow.parquet
+import pytest
+from commands import call
+from rosbags.highlevel import AnyReader
+
+from adaptune.geometry import invert
+from adaptune.odometry.base import import_extra
+from adaptune.selection import Selection
+from adaptune.sequence.scan import Scan
+from adaptune.trajectory import Trajectory
+from offline.offline_study import load_study
+from online.mcap_recording import topic
+from online.record_replays import record_replays
+from online.recordings import clouds, gather
+from online.replay import Choice, RealTimeRecord, Replay
+from online.run_replays import shared_identity
+from online.stored_reference import write_reference
+from online.stored_replays import ReplayIdentity, StoredReplayError, write_replay
+
+N = 40
+STAMPS = drives.FIRST_STAMP + np.arange(N) * 100_000_000
+ALL = ["rerun", "mcap", "parquet"]
+FIXED = {"max_correspondence_distance": 2.5, "kernel": "huber"}
+
+
+def along_x(drift=0.0):
+    T = np.tile(np.eye(4), (N, 1, 1))
+    T[:, 0, 3], T[:, 1, 3] = 0.3 * np.arange(N), drift * np.arange(N)
+    return Trajectory(STAMPS, T)
+
+
+def replay_of(trajectory, choices=(), real_time=None):
+    yes, ms = np.ones(N, bool), np.arange(N) * 1e-3
+    restarted = np.arange(N) == 7
+    return Replay(
+        trajectory, restarted, yes, ms, 2.0 * ms, list(choices), 4.0, {}, 1.0, 1.0, real_time
+    )
+
+
+def selections():
+    for i in range(4):
+        estimated = (np.nan,) * 3 if i == 0 else (1.0 + i, 0.5, 3.0)
+        chosen = Selection(
+            2 if i < 2 else 5,
+            {"max_correspondence_distance": 1.0 + i, "kernel": ["none", "huber"][i % 2]},
+            predicted_error=0.7,
+            predicted_fixed=0.9,
+            weights={2: 0.75, 5: 0.25},
+            estimated_error=estimated[0],
+            estimated_low=estimated[1],
+            estimated_high=estimated[2],
+            lost=i == 2,
+        )
+        yield Choice(int(STAMPS[10 * i]), chosen, 0.004 * (i + 1))
+
+
+@pytest.fixture
+def study(study_file, tmp_path):
+    """A study with replays that were made up."""
+    study = load_study(study_file, [], tmp_path / "run")
+    folder = study.folder / "replays/three"
+    shared = shared_identity(study, "three")
+    in_time = RealTimeRecord(1.0, late=[0.02] * N)
+    for mode, made, kept in (
+        ("baseline", replay_of(along_x(0.02)), {"max_correspondence_distance": 2.0}),
+        ("fixed", replay_of(along_x(0.01)), FIXED),
+        ("paired", replay_of(along_x(0.005), selections(), in_time), None),
+    ):
+        about = ReplayIdentity(mode=mode, parameters=kept, model=None, switching=None, **shared)
+        write_replay(folder / mode, made, about, None)
+    elsewhere = np.eye(4)
+    elsewhere[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    elsewhere[:3, 3] = 5.0, -3.0, 1.0
+    reference = Trajectory(STAMPS, elsewhere @ along_x().T_world_sensor)
+    poses = study.sequences.reference("three")
+    write_reference(folder, reference, along_x(), poses)
+    return study
+
+
+def command(study, study_file, *words):
+    return call("record", study_file, *words, "--folder", study.folder)
+
+
+def left(study):
+    return sorted(str(p.relative_to(study.folder)) for p in study.folder.rglob("*") if p.is_file())
+
+
+def messages(folder):
+    """Stamp and message of all topics."""
+    found = {}
+    with AnyReader([folder]) as reader:
+        last = 0
+        for connection, stamp, raw in reader.messages():
+            assert stamp >= last
+            last = stamp
+            message = reader.deserialize(raw, connection.msgtype)
+            found.setdefault(connection.topic, []).append((stamp, message))
+    return found
+
+
+def numbers(found, name):
+    return [stamp for stamp, _ in found[name]], [message.data for _, message in found[name]]
+
+
+def test_an_mcap_holds_what_foxglove_shows(study):
+    (file,) = record_replays(study, "three", ["mcap"])
+    assert file == study.folder / "recordings/three/three.mcap"
+    found = messages(file.parent)
+    assert [len(found[name]) for name in ("/points", "/tf", "/paired/odometry")] == [4, N, N]
+    for mode, drift in (("baseline", 0.02), ("fixed", 0.01), ("paired", 0.005), ("reference", 0.0)):
+        ((stamp, path),) = found[f"/{mode}/path"]
+        assert (stamp, path.header.frame_id) == (STAMPS[0], "odom")
+        xyz = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses]
+        np.testing.assert_allclose(xyz, along_x(drift).T_world_sensor[:, :3, 3], atol=1e-8)
+    for (stamp, sent), (at, odometry) in zip(found["/tf"], found["/paired/odometry"], strict=True):
+        (moved,) = sent.transforms
+        assert (moved.header.frame_id, moved.child_frame_id) == ("odom", "sensor")
+        assert stamp == at == moved.header.stamp.sec * 10**9 + moved.header.stamp.nanosec
+        assert moved.transform.translation.x == odometry.pose.pose.position.x
+    assert found["/fixed/odometry"][0][1].child_frame_id == "sensor_fixed"
+    scans = {scan.stamp: scan for scan in study.sequences.open("three")}
+    for (stamp, cloud), expected in zip(found["/points"], STAMPS[::10], strict=True):
+        assert (stamp, cloud.header.frame_id) == (expected, "sensor")
+        points = cloud.data.view("<f4").reshape(-1, 3)
+        np.testing.assert_array_equal(points, scans[stamp].points)
+
+
+def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
+    record_replays(study, "three", ["mcap"])
+    found = messages(study.folder / "recordings/three")
+    made, end = STAMPS[::10].tolist(), int(STAMPS[-1])
+    assert numbers(found, "/paired/predicted_error") == (made, [0.7] * 4)
+    assert numbers(found, "/paired/predicted_fixed_error") == (made, [0.9] * 4)
+    # What is not known yet is left out.
+    assert numbers(found, "/paired/estimated_error") == (made[1:], [2.0, 3.0, 4.0])
+    assert numbers(found, "/paired/estimated_error_high") == (made[1:], [3.0] * 3)
+    # A choice stays until the end.
+    name = "/paired/parameters/max_correspondence_distance"
+    assert numbers(found, name) == ([*made, end], [1.0, 2.0, 3.0, 4.0, 4.0])
+    assert numbers(found, "/paired/weights/2") == ([*made, end], [0.75] * 5)
+    assert numbers(found, "/paired/lost")[1] == [0.0, 0.0, 1.0, 0.0, 0.0]
+    assert numbers(found, "/paired/parameters/kernel")[1] == ["none", "huber"] * 2
+    assert numbers(found, "/fixed/parameters/kernel") == (made[:1], ["huber"])
+    assert numbers(found, "/paired/selection")[1][2] == "trial 2: 75%, trial 5: 25% (lost)"
+    assert numbers(found, "/fixed/selection")[1] == [
+        "max_correspondence_distance 2.5, kernel huber"
+    ]
+    assert numbers(found, "/paired/selection_ms")[1] == [4.0, 8.0, 12.0, 16.0]
+    assert numbers(found, "/paired/register_ms")[1] == pytest.approx(2.0 * np.arange(N))
+    assert numbers(found, "/paired/late_ms")[1] == [20.0] * N
+    assert "/fixed/late_ms" not in found
+    assert np.flatnonzero(numbers(found, "/fixed/restarted")[1]).tolist() == [7]
+    stamps, errors = numbers(found, "/baseline/true_error")
+    assert stamps == STAMPS[: len(stamps)].tolist()
+    # 11 steps are longer than 3 m; but for rounding, 10 are not.
+    assert errors == pytest.approx([100.0 * 10.5 * 0.02 / 3.0] * len(errors), rel=0.06)
+
+
+def test_topics_have_names_that_ros_allows():
+    assert topic("paired", "parameters", "ndt.max-range") == "/paired/parameters/ndt_max_range"
+    assert topic("paired", "errors", "true_error") == "/paired/true_error"
+
+
+def chunks(path):
+    """Rows of an ``.rrd`` by entity and component, without the times of logging."""
+    try:
+        from rerun.chunk import RrdReader
+
+        found = RrdReader(path).store().stream().to_chunks()
+    except ImportError:  # before 0.32
+        from rerun.recording import load_recording
+
+        found = load_recording(path).chunks()
+    columns = {}
+    for chunk in found:
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if not name.startswith("rerun.controls"):
+                key = chunk.entity_path, name, chunk.is_static
+                columns.setdefault(key, []).extend(batch.column(name).to_pylist())
+    return columns
+
+
+def test_a_rerun_file_holds_all_of_it(study):
+    (file,) = record_replays(study, "three", ["rerun"])
+    assert file == study.folder / "recordings/three.rrd"
+    found = chunks(file)
+    assert not any(name in ("log_time", "log_tick") for _, name, _ in found)
+    at = "/errors/paired/estimated_error"
+    assert found[at, "Scalars:scalars", False] == [[2.0], [3.0], [4.0]]
+    stamps = [int(time.value) for time in as_arrow(found[at, "stamp", False])]
+    assert stamps == STAMPS[10::10].tolist()
+    assert found[at, "SeriesLines:names", True] == [["paired estimated_error"]]
+    assert found["/words/paired/kernel", "TextLog:text", False] == [["none"], ["huber"]] * 2
+    for entity, n in {
+        "/parameters/paired/max_correspondence_distance": 5,
+        "/weights/paired/5": 5,
+        "/milliseconds/paired/late_ms": N,
+        "/health/fixed/restarted": N,
+        "/errors/paired/predicted_fixed_error": 4,
+    }.items():
+        assert len(found[entity, "Scalars:scalars", False]) == n, entity
+    for mode in ("baseline", "fixed", "paired", "reference"):
+        ((path,),) = found[f"/world/{mode}", "LineStrips3D:strips", True]
+        assert len(path) == N
+    scans = {scan.stamp: scan for scan in study.sequences.open("three")}
+    placed = found["/world/scan", "Points3D:positions", False]
+    for stamp, points in zip(STAMPS[::10], placed, strict=True):
+        moved = scans[stamp].points + gather(study, "three").modes["paired"].trajectory.at(
+            np.array([stamp])
+        )[0, :3, 3].astype(np.float32)
+        np.testing.assert_allclose(points, moved, atol=1e-5)
+
+
+def as_arrow(values):
+    return pyarrow.array(values, pyarrow.timestamp("ns")) if values else []
+
+
+def test_recordings_are_the_same_again_and_replays_stay(study):
+    before = {p: p.read_bytes() for p in (study.folder / "replays").rglob("*") if p.is_file()}
+    first = [path.read_bytes() for path in record_replays(study, "three", ["mcap", "parquet"])]
+    (rerun,) = record_replays(study, "three", ["rerun"])
+    held = chunks(rerun)
+    # Over those that are there, and all of them in one go.
+    written = record_replays(study, "three", ALL)
+    again = [path.read_bytes() for path in written if path.suffix != ".rrd"]
+    assert again[-1:] + again[:-1] == first[-1:] + first[:-1]
+    assert chunks(rerun) == held
+    after = {p: p.read_bytes() for p in (study.folder / "replays").rglob("*") if p.is_file()}
+    assert after == before
+
+
+def test_parquet_equals_csv(study):
+    files = record_replays(study, "three", ["parquet"])
+    assert [file.name for file in files[-2:]] == [
+        "three_paired_selections.parquet",
+        "three_paired_frames.parquet",
+    ]
+    for file in files:
+        _, mode, name = file.stem.split("_")
+        with (study.folder / "replays/three" / mode / f"{name}.csv").open() as read:
+            names, *rows = csv.reader(read)
+        table = pyarrow.parquet.read_table(file)
+        assert table.column_names == names
+        assert table.num_rows == len(rows)
+        for of, row in zip(rows, table.to_pylist(), strict=True):
+            for text, value in zip(of, row.values(), strict=True):
+                if isinstance(value, list):
+                    assert text == " ".join(f"{k}:{v:.3f}" for k, v in value)
+                elif isinstance(value, str):
+                    assert text == value
+                else:
+                    assert float(value) == pytest.approx(float(text), nan_ok=True, rel=1e-15)
+    types = {f.name: str(f.type) for f in pyarrow.parquet.read_schema(files[-2])}
+    assert (types["stamp_ns"], types["trial"], types["ms"]) == ("int64", "int64", "double")
+    assert (types["lost"], types["kernel"]) == ("bool", "string")
+    assert types["weights"].startswith("map<int64, double")
+    # A table without rows has the same types.
+    empty = {f.name: str(f.type) for f in pyarrow.parquet.read_schema(files[0])}
+    assert empty.items() <= types.items()
+
+
+def test_the_command_says_what_it_wrote(study, study_file):
+    done = command(study, study_file)
+    assert done.exit_code == 0, done.stderr
+    folder = study.folder / "recordings"
+    for name in ("three.rrd", "three/three.mcap", "three_fixed_frames.parquet"):
+        assert (folder / name).stat().st_size > 0
+        assert f"{folder / name} (" in done.stdout
+    assert done.stdout.splitlines()[-1] == f"Next: rerun {folder / 'three.rrd'}    # look at it"
+    assert f"`Open local file`, and {folder / 'three/three.mcap'}" in done.stdout
+    assert command(study, study_file, "three", "--to", "mcap", "--to", "parquet").exit_code == 0
+
+
+@contextmanager
+def files_of_at_most(size):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("format_", ["rerun", "mcap"])
+@pytest.mark.parametrize("size", [1_000, 100_000])
+def test_a_full_disk_leaves_nothing_half_written(study, study_file, format_, size):
+    list(study.sequences.open("three"))  # which is in the cache then
+    for earlier in (False, True):
+        if earlier:
+            assert command(study, study_file, "--to", format_).exit_code == 0
+        before = left(study)
+        with files_of_at_most(size):
+            done = command(study, study_file, "--to", format_)
+        assert done.exit_code == 2
+        name = "three.rrd" if format_ == "rerun" else "three"
+        (line,) = done.stderr.strip().splitlines()
+        assert line.startswith(f"error: {study.folder / 'recordings' / name}: cannot be written (")
+        assert line.endswith("; make room, and run the same command again")
+        assert left(study) == before
+        assert not [p for p in (study.folder / "recordings").iterdir() if p.name.startswith(".")]
+
+
+def test_a_disk_that_is_full_for_a_table(study, study_file, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = left(study)
+    monkeypatch.setattr(pyarrow.parquet, "write_table", fail)
+    done = command(study, study_file, "--to", "parquet")
+    assert done.exit_code == 2
+    assert "three_baseline_selections.parquet: cannot be written (No space" in done.stderr
+    assert left(study) == before
+
+
+def test_ctrl_c_leaves_nothing_half_written(study):
+    def interrupt(_what, done, _n):
+        if done == 15:
+            raise KeyboardInterrupt
+
+    before = left(study)
+    with pytest.raises(KeyboardInterrupt):
+        record_replays(study, "three", ["rerun", "mcap"], interrupt)
+    assert left(study) == before
+    assert list((study.folder / "recordings").iterdir()) == []
+
+
+@pytest.mark.parametrize(("format_", "package"), [("rerun", "rerun"), ("parquet", "pyarrow")])
+def test_a_package_that_is_missing_is_named(study, study_file, monkeypatch, format_, package):
+    import_extra.cache_clear()
+    monkeypatch.setitem(sys.modules, package, None)
+    before = left(study)
+    done = command(study, study_file, "--to", format_)
+    assert done.exit_code == 2
+    assert f"run `pip install 'adaptune[{format_}]'`" in done.stderr
+    assert left(study) == before
+    done = command(study, study_file)
+    assert done.exit_code == 0, done.stderr
+    assert f"Not written: {format_}; `pip install 'adaptune[{format_}]'` adds it" in done.stdout
+    suffixes = {".rrd", ".parquet"} - {{"rerun": ".rrd"}.get(format_, ".parquet")}
+    written = {p.suffix for p in (study.folder / "recordings").iterdir() if p.is_file()}
+    assert written == suffixes
+
+
+def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_path):
+    for words, said in (
+        (["one"], "one: there is no replay of it; .* `adaptune online`"),
+        (["thre"], "thre: there is no such sequence in the study: .*three"),
+    ):
+        done = command(study, study_file, *words)
+        assert done.exit_code == 2
+        assert re.search(said, done.stderr), done.stderr
+    done = call("record", study_file, "--folder", tmp_path / "other")
+    assert done.exit_code == 2
+    assert "there is no replay; run `adaptune online`" in done.stderr
+
+
+def test_replays_of_something_else_are_refused(study, study_file):
+    other = load_study(study_file, ["sequences.three.stop=2"], study.folder)
+    with pytest.raises(StoredReplayError, match="was replayed with another sequence; run"):
+        gather(other, "three")
+    other = load_study(study_file, ["sequences.three.reference=none"], study.folder)
+    with pytest.raises(StoredReplayError, match="was judged by another reference; run"):
+        gather(other, "three")
+    path = study.folder / "replays/three/paired/selections.csv"
+    path.write_text(path.read_text().replace("0.7000", "many"))
+    with pytest.raises(StoredReplayError, match=r"selections\.csv: is damaged"):
+        gather(study, "three")
+
+
+def test_all_begin_where_they_first_overlap_the_reference(study):
+    folder = study.folder / "replays/three"
+    truth = along_x()
+    late = Trajectory(STAMPS[10:], truth.T_world_sensor[10:])
+    write_reference(folder, late, truth, study.sequences.reference("three"))
+    replays = gather(study, "three")
+    np.testing.assert_allclose(replays.reference.T_world_sensor[0], np.eye(4), atol=1e-9)
+    placed = replays.modes["baseline"].trajectory.T_world_sensor
+    np.testing.assert_allclose(placed[10], np.eye(4), atol=1e-9)
+    own = along_x(0.02).T_world_sensor
+    np.testing.assert_allclose(placed, invert(own[10]) @ own, atol=1e-8)
+    write_reference(folder, None, truth, study.sequences.reference("three"))
+    without = gather(study, "three")
+    assert without.reference is None
+    assert "true_error" not in without.modes["baseline"].series["errors"]
+    np.testing.assert_allclose(without.modes["fixed"].trajectory.T_world_sensor[0], np.eye(4))
+
+
+def test_clouds_are_thinned_and_have_a_pose(monkeypatch):
+    monkeypatch.setattr("online.recordings.MAX_POINTS", 100)
+    rng = np.random.default_rng(1)
+    scans = [Scan(int(s), rng.normal(size=(500, 3)).astype(np.float32)) for s in STAMPS]
+    seen = []
+    made = list(clouds(scans, along_x(), lambda: seen.append(1)))
+    assert len(seen) == N
+    assert [cloud.stamp for cloud in made] == STAMPS[::10].tolist()
+    for cloud, scan in zip(made, scans[::10], strict=True):
+        assert cloud.points.shape == (100, 3)
+        same = (scan.points[:, None] == cloud.points).all(axis=2)
+        assert (np.diff(same.argmax(axis=0)) > 0).all()
+    # No pose, no cloud: the second second is beyond the path.
+    short = Trajectory(STAMPS[:10], along_x().T_world_sensor[:10])
+    assert len(list(clouds(scans, short))) == 1
