@@ -265,7 +265,9 @@ class ReplaySetup:
         return model.costs.adaptive(members) / min(len(members), self.cores)
 
     def _bank(self, sets: Mapping[int, ParameterSet]) -> Bank:
-        rate = None if self.real_time is None else self.real_time.rate
+        # Where no scan is dropped, no member is left behind either.
+        waits = self.real_time is None or not self.real_time.queue
+        rate = None if self.real_time is None or waits else self.real_time.rate
         return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores, rate)
 
     def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:

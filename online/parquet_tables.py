@@ -8,6 +8,7 @@ from adaptune.files import replacing
 from adaptune.odometry.base import import_extra
 from online.stored_replays import damaged
 
+_WORDS = ("why_not", "fallen_back")
 TABLES = ("selections", "frames")
 """Names of the tables of a replay, without their suffix."""
 _TRUTHS = ("lost", "registered", "restarted")
@@ -62,6 +63,8 @@ def _column(arrow: Any, name: str, cells: list[str | None]) -> Any:
     texts = arrow.array(cells, arrow.string())
     if name == _WEIGHTS:
         return _weights(arrow, cells)
+    if name in _WORDS:
+        return texts
     if name in _TRUTHS:
         return texts.cast(arrow.int64()).cast(arrow.bool_())
     if name in _MEASURES:

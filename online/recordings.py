@@ -18,7 +18,13 @@ from adaptune.trajectory import Trajectory
 from online.modes import sequences_without_model
 from online.statistics import Reference
 from online.stored_reference import check_reference
-from online.stored_replays import StoredReplay, StoredReplayError, damaged, read_columns
+from online.stored_replays import (
+    StoredReplay,
+    StoredReplayError,
+    damaged,
+    read_applied,
+    read_columns,
+)
 
 CLOUD_PERIOD = 1.0
 """Seconds from one cloud to the next."""
@@ -197,8 +203,9 @@ def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
 def _mode(folder: Path, replay: StoredReplay, reference: Reference) -> RecordedMode:
     trajectory = replay.trajectory
     stamps, end = trajectory.stamps, int(trajectory.stamps[-1])
-    frames = _Table(folder / "frames.csv", stamps)
-    selections = _Table(folder / "selections.csv", replay.choice_stamps)
+    frames = _Table(folder / "frames.csv", read_columns(folder / "frames.csv"), stamps)
+    path = folder / "selections.csv"
+    selections = _Table(path, read_applied(path), replay.choice_stamps)
     errors = {name: selections.series(column) for name, column in _ERRORS.items()}
     # The one looks ahead, as predictions do, the other back, as estimates do.
     errors["true_error"] = _finite(stamps, reference.errors(trajectory))
@@ -250,9 +257,8 @@ def _placed(odometry: Trajectory, reference: Trajectory | None) -> Trajectory:
 class _Table:
     """A table of a replay, and the stamps of its rows."""
 
-    def __init__(self, path: Path, stamps: NDArray[np.int64]):
-        self._path, self._stamps = path, stamps
-        self.columns = read_columns(path)
+    def __init__(self, path: Path, columns: dict[str, list[str]], stamps: NDArray[np.int64]):
+        self._path, self.columns, self._stamps = path, columns, stamps
 
     def series(self, column: str) -> Series:
         """The finite numbers of a column; none where there is no such column."""

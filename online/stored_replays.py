@@ -170,10 +170,12 @@ def write_replay(
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     _write_selections(folder / "selections.csv", replay)
-    late = np.full(len(replay.trajectory), np.nan)
+    rows = [frame_row(step, math.nan) for step in replay.steps]
+    columns: tuple[str, ...] = FRAME_COLUMNS[:-1]
     if replay.real_time is not None:
-        late = np.array(replay.real_time.late)
-    _write_csv(folder / "frames.csv", FRAME_COLUMNS, map(frame_row, replay.steps, late.tolist()))
+        columns, late = FRAME_COLUMNS, replay.real_time.late
+        rows = [frame_row(*pair) for pair in zip(replay.steps, late, strict=True)]
+    _write_csv(folder / "frames.csv", columns, (row[: len(columns)] for row in rows))
     stamps = replay.trajectory.stamps
     summary = ReplaySummary(
         scans=len(stamps),
@@ -295,7 +297,7 @@ class _Choices(NamedTuple):
 
 
 def _choices(path: Path) -> _Choices:
-    columns = _applied(read_columns(path))
+    columns = read_applied(path)
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
         weights = _weights(columns.get("weights", []))
@@ -313,8 +315,9 @@ def _choices(path: Path) -> _Choices:
     return _Choices(stamps, parameters, weights, estimated, lost)
 
 
-def _applied(columns: dict[str, list[str]]) -> dict[str, list[str]]:
-    """The rows of what was applied; of the same scan, the last one."""
+def read_applied(path: Path) -> dict[str, list[str]]:
+    """The columns of ``selections.csv``, of what was applied; of the same scan, the last one."""
+    columns = read_columns(path)
     stamps = columns.get("stamp_ns", [])
     whys = columns.get("why_not", [""] * len(stamps))
     rows = [i for i, why in enumerate(whys) if not why]

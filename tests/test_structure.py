@@ -13,6 +13,7 @@ PACKAGES = ("adaptune", "offline", "online")
 SOURCES = (*PACKAGES, "benchmarks")
 SHARED_NAMES = {"__init__", "base", "config"}
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_NESTING = 450, 60, 8, 4
+MAX_OPTIONS = 12
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)

@@ -1,0 +1,142 @@
+import threading
+import time
+
+import local_link
+import numpy as np
+import pytest
+
+from adaptune.sequence.imu import USUAL
+from adaptune.sequence.recorded import ImuSettings
+from adaptune.sequence.timing import Timing
+from online import live_scans
+from online.live_scans import LiveScans
+
+TENTH = 10**8
+START = 1_700_000_000 * 10**9
+
+
+def points(i):
+    return np.random.default_rng(i).normal(5.0, 1.0, (50, 3)).astype(np.float32)
+
+
+@pytest.fixture
+def link():
+    return local_link.LocalLink()
+
+
+def topic(link, queue=0, imu=None):
+    return LiveScans(link, "/points", Timing(), queue, imu)
+
+
+def play(link, numbers):
+    for i in numbers:
+        link.play("/points", local_link.cloud(START + i * TENTH, points(i)))
+
+
+def numbers(scans):
+    """Play what waits to its end; the scans by their numbers."""
+    found = []
+    # What is to come ends the iteration.
+    for arrival in scans.arrivals():
+        found.append(round((arrival.scan.stamp - START) / TENTH))
+        if not scans._waiting:
+            scans.stop()
+    return found
+
+
+def test_scans_come_as_they_are(link):
+    scans = topic(link)
+    play(link, range(3))
+    arrivals = []
+    for arrival in scans.arrivals():
+        arrivals.append(arrival)
+        if len(arrivals) == 3:
+            scans.stop()
+    for i, (scan, due, dropped) in enumerate(arrivals):
+        np.testing.assert_array_equal(scan.points, points(i))
+        assert scan.stamp == START + i * TENTH
+        assert 0.0 <= time.perf_counter() - due < 5.0
+        assert dropped == 0
+    assert scans.frame == "lidar"
+
+
+def test_doubled_and_reordered_scans_are_ignored_and_missing_ones_are_missed(link):
+    scans = topic(link)
+    play(link, [0, 1, 1, 2, 4, 3, 4, 9])
+    assert numbers(scans) == [0, 1, 2, 4, 9]
+    assert scans.ignored == 3
+
+
+def test_the_newest_wait(link):
+    scans = topic(link, queue=2)
+    play(link, range(5))
+    first = next(scans.arrivals())
+    assert (round((first.scan.stamp - START) / TENTH), first.dropped) == (3, 3)
+
+
+def test_where_the_clock_goes_back_another_drive_begins(link, caplog):
+    scans = topic(link)
+    play(link, [30, 31, 0, 1, 2])
+    first = [round((a.scan.stamp - START) / TENTH) for a in scans.arrivals()]
+    assert first == [30, 31]
+    assert not scans.stopped
+    assert numbers(scans) == [0, 1, 2]
+    assert caplog.messages == ["the clock went back by 3.1 s: a new drive"]
+    assert scans.ignored == 0
+
+
+def test_what_is_no_point_cloud_is_left_out(link, caplog):
+    scans = topic(link)
+    play(link, [0])
+    link.play("/points", local_link.cloud(START + TENTH, points(1), names="abc"))
+    short = local_link.cloud(START + TENTH, points(1))
+    short.data = short.data[:100]
+    link.play("/points", short)
+    play(link, [2])
+    assert numbers(scans) == [0, 2]
+    assert scans.damaged == 2
+    assert "no field x, y, z; there is a, b, c; the scan is left out" in caplog.text
+
+
+def test_a_topic_that_falls_silent_and_comes_back(link, caplog, monkeypatch):
+    monkeypatch.setattr(live_scans, "SILENCE", 0.05)
+    scans = LiveScans(link, "/other", Timing())
+    later = threading.Timer(0.5, lambda: link.play("/other", local_link.cloud(START, points(0))))
+    later.start()
+    next(scans.arrivals())
+    said = caplog.messages
+    hint = "; nobody publishes it (point clouds come on /points)"
+    assert said[0] == f"/other: no scan for 0 s{hint}"
+    # After 0.05, 0.1, 0.2 and 0.4 s.
+    assert 3 <= len(said) - 1 <= 5
+    assert said[-1].startswith("/other: scans come again, after ")
+
+
+def test_scans_bring_along_what_the_imu_measured(link, monkeypatch):
+    monkeypatch.setattr(live_scans, "IMU_WAIT", 0.01)
+    settings = ImuSettings("/imu", None, 2.0, USUAL)
+    scans = topic(link, imu=settings)
+    for i in range(-50, 250):
+        link.play("/imu", local_link.imu(START + i * 10**6, rate=float(i)))
+    play(link, range(3))
+    found = []
+    for arrival in scans.arrivals():
+        found.append(arrival.scan.imu)
+        if len(found) == 3:
+            scans.stop()
+    # All but the first, up to the first measurement at the scan or after it.
+    rates = [imu.angular_velocity[:, 2].tolist() for imu in found]
+    assert rates[0][-1] == 0.0
+    assert rates[1] == list(range(1, 101))
+    assert rates[2] == list(range(101, 201))
+    assert found[1].acceleration[0, 2] == pytest.approx(2.0 * 9.81)
+
+
+def test_an_imu_that_is_silent_does_not_hold_up_the_scans(link, monkeypatch):
+    monkeypatch.setattr(live_scans, "IMU_WAIT", 0.01)
+    scans = topic(link, imu=ImuSettings("/imu", None, 1.0, USUAL))
+    play(link, range(2))
+    for i, arrival in enumerate(scans.arrivals()):
+        assert len(arrival.scan.imu) == 0
+        if i == 1:
+            scans.stop()
