@@ -4,13 +4,15 @@ PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python
 VENV ?= .venv
 BIN := $(VENV)/bin
 STUDY := configs/demo.yaml
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
-.PHONY: help demo test quick lint types pytest format clean
+.PHONY: help demo test quick lint types pytest services format clean
 
 help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests"
 	@echo "make quick   run linters and the fast tests, in about a minute"
+	@echo "make services  install what pip cannot bring: ROS 1 (Debian and Ubuntu)"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 
@@ -35,6 +37,11 @@ types: $(VENV)/.installed
 
 pytest: $(VENV)/.installed
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder $(PYTEST_OPTIONS)
+
+services:
+	$(SUDO) apt-get update
+	DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install --yes --no-install-recommends \
+		ros-core python3-rospy python3-dynamic-reconfigure
 
 format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .

@@ -135,9 +135,12 @@ class Ros1:
         """See `RosLink.close`."""
         for _, received in self._takes.values():
             received.put(None)
+        # A thread reads; without it the node would not notice.
+        self._stream.end()
         self._stream.close()
         try:
-            self._process.wait(2.0)
+            # It takes leave of the roscore.
+            self._process.wait(5.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

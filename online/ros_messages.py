@@ -49,7 +49,7 @@ class Uncertainty:
             self.rotation += self._share**2 * metres / self._length
 
 
-class Messages:
+class RosMessages:
     """Makes messages of one ROS.
 
     Parameters

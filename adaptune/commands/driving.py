@@ -131,14 +131,14 @@ def _drive(
     """Drive on a robot until Ctrl-C."""
     from adaptune.cores import pin as bind
     from online.dashboard import Dashboard
-    from online.live import Live
     from online.modes import UNTRAINED, WITHOUT_MODEL
+    from online.robot_drive import RobotDrive
     from online.ros1 import Ros1
     from online.ros2 import Ros2
 
     mode = UNTRAINED if untrained else mode or loaded.rules[0]
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
-    live = Live(loaded, mode, path)
+    drive = RobotDrive(loaded, mode, path)
     link = Ros2(loaded.config.online.ros.router) if ros2 else Ros1()
     _ = loaded.mechanism
     unbind = bind(os.getpid(), alone=True)
@@ -146,7 +146,7 @@ def _drive(
     try:
         with progress(dashboard):
             log.info("drive, %s: Ctrl-C ends it", mode)
-            driven = live.drive(link, dashboard.look)
+            driven = drive.run(link, dashboard.look)
     finally:
         link.close()
         unbind()

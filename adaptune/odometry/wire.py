@@ -31,6 +31,7 @@ arrays hold what an IMU measured since the scan before: imu_stamps, int64; imu, 
 see `adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
 """
 
+import contextlib
 import json
 import resource
 import select
@@ -114,6 +115,11 @@ class SocketStream:
             self._writer.close()
         finally:
             self._socket.close()
+
+    def end(self) -> None:
+        """End the conversation, for all processes that share the socket and threads that read."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
 
 
 class WireError(AdaptuneError):

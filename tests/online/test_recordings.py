@@ -16,6 +16,7 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert
 from adaptune.odometry.base import import_extra
+from adaptune.odometry.tracker import RegisteredScan
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
@@ -23,8 +24,9 @@ from offline.offline_study import load_study
 from online.mcap_recording import topic
 from online.record_replays import record_replays
 from online.recordings import clouds, gather
-from online.replay import Choice, RealTimeRecord, Replay
+from online.replay import RealTimeRecord, Replay
 from online.run_replays import shared_identity
+from online.safety import Choice
 from online.stored_reference import write_reference
 from online.stored_replays import ReplayIdentity, StoredReplayError, write_replay
 
@@ -41,11 +43,16 @@ def along_x(drift=0.0):
 
 
 def replay_of(trajectory, choices=(), real_time=None):
-    yes, ms = np.ones(N, bool), np.arange(N) * 1e-3
-    restarted = np.arange(N) == 7
-    return Replay(
-        trajectory, restarted, yes, ms, 2.0 * ms, list(choices), 4.0, {}, 1.0, 1.0, real_time
-    )
+    steps = [
+        RegisteredScan(stamp, T, True, "max_speed" if i == 7 else None, i * 1e-3, i * 2e-3)
+        for i, (stamp, T) in enumerate(
+            zip(trajectory.stamps.tolist(), trajectory.T_world_sensor, strict=True)
+        )
+    ]
+    yes, restarted = np.ones(N, bool), np.arange(N) == 7
+    kept = [choice for choice in choices if not choice.why_not]
+    others = [choice for choice in choices if choice.why_not]
+    return Replay(trajectory, restarted, yes, steps, kept, others, 4.0, {}, 1.0, 1.0, real_time)
 
 
 def selections():
@@ -75,7 +82,7 @@ def study(study_file, tmp_path):
     for mode, made, kept in (
         ("baseline", replay_of(along_x(0.02)), {"max_correspondence_distance": 2.0}),
         ("fixed", replay_of(along_x(0.01)), FIXED),
-        ("paired", replay_of(along_x(0.005), selections(), in_time), None),
+        ("paired", replay_of(along_x(0.005), list(selections()), in_time), None),
     ):
         about = ReplayIdentity(mode=mode, parameters=kept, model=None, switching=None, **shared)
         write_replay(folder / mode, made, about, None)

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import shutil
 
 import pytest
 
@@ -23,3 +24,9 @@ def needs_ros2() -> None:
     """Skip where what speaks to ROS 2 is not installed."""
     if importlib.util.find_spec("zenoh_ros2_sdk") is None:
         lacking("ros2", "zenoh-ros2-sdk is not installed: pip install 'adaptune[ros2]'")
+
+
+def needs_ros1() -> None:
+    """Skip where there is no ROS 1."""
+    if shutil.which("roscore") is None:
+        lacking("ros1", "there is no roscore: make services")

@@ -31,7 +31,7 @@ from online.modes import ReplaySetup, needed
 from online.real_time import RealTimeDrive
 from online.replay import Progressed, RealTimeRecord
 from online.ros_link import RosLink
-from online.ros_messages import Messages, Uncertainty
+from online.ros_messages import RosMessages, Uncertainty
 from online.safety import Choice
 from online.selector_process import SelectorProcess
 from online.steered_node import ODOMETRY, SteeredNode
@@ -48,7 +48,7 @@ _PUBLISHED = 5.0
 Look = Callable[[str, int, Progressed], None]
 
 
-class Driven(NamedTuple):
+class DriveRecord(NamedTuple):
     """What became of a drive."""
 
     folder: Path  # of its trajectory, selections and scans
@@ -57,7 +57,7 @@ class Driven(NamedTuple):
     ignored: int  # scans that came twice or too late
 
 
-class Live:
+class RobotDrive:
     """A study's odometry, or somebody else's node, on a robot.
 
     Parameters
@@ -92,7 +92,7 @@ class Live:
                 f"robot (online.ros.steer)"
             )
 
-    def drive(self, link: RosLink, look: Look = lambda *_: None) -> Driven:
+    def run(self, link: RosLink, look: Look = lambda *_: None) -> DriveRecord:
         """Drive until Ctrl-C, or until `stop` is called.
 
         Where the clock goes back, all begins anew.
@@ -149,7 +149,7 @@ class Live:
         odometry: OdometryInstance,
         selector: SelectorProcess | None,
         look: Look,
-    ) -> Driven:
+    ) -> DriveRecord:
         """Drive until the clock goes back."""
         folder = _new_folder(self._study.folder / "drives")
         names = self._study.odometry.space.names
@@ -176,7 +176,7 @@ class Live:
                     look("drive", 0, Progressed(done, step, publisher.newest, drive.record))
             except KeyboardInterrupt:
                 self._scans.stop()
-            return Driven(folder, done, drive.finished(), self._scans.ignored)
+            return DriveRecord(folder, done, drive.finished(), self._scans.ignored)
 
 
 class _Publisher:
@@ -185,7 +185,7 @@ class _Publisher:
     def __init__(self, link: RosLink, study: Study, scans: LiveScans, log: DriveLog):
         ros, self._scans, self._log = study.config.online.ros, scans, log
         self.newest: Choice | None = None
-        self._messages = Messages(link.store, ros.frame)
+        self._messages = RosMessages(link.store, ros.frame)
         self._uncertainty = Uncertainty(study.config.sub_trajectory)
         self._last: RegisteredScan | None = None
         self._told: int | None = None

@@ -1,0 +1,201 @@
+"""Against a real roscore."""
+
+import json
+import os
+import queue
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drives
+import local_link
+import numpy as np
+import pytest
+from needs import needs_ros1
+
+from adaptune.trajectory import read_tum
+from online.ros1 import Ros1, ros_python
+from online.ros_link import LinkError
+
+ROBOT = Path(drives.__file__).with_name("ros1_robot.py")
+"""Only the Python of ROS can import it."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def master():
+    """A roscore, and its address in the environment."""
+    needs_ros1()
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        port = bound.getsockname()[1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{port}")
+        patch.setenv("ROS_IP", "127.0.0.1")
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        core = subprocess.Popen(["roscore", "-p", str(port)], start_new_session=True, **quiet)
+        try:
+            yield core
+        finally:
+            os.killpg(core.pid, signal.SIGTERM)
+            core.wait(20.0)
+
+
+@pytest.fixture(scope="module")
+def link(master):
+    end = time.monotonic() + 30.0
+    while True:
+        assert master.poll() is None
+        try:
+            made = Ros1()
+            break
+        except LinkError:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def robot(link):  # noqa: ARG001
+    """A node of somebody else's."""
+    process = subprocess.Popen(
+        [ros_python(), str(ROBOT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert process.stdout.readline() == b"ready\n"
+    yield "/robot"
+    process.communicate()
+
+
+def taken(link, topic, kind):
+    messages = queue.SimpleQueue()
+    link.subscribe(topic, kind, messages.put)
+    return messages
+
+
+def until(true, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def connected(link, topic, kind, message):
+    """Publish until the first message arrives: rospy connects on its own time."""
+    messages, publish = taken(link, topic, kind), link.advertise(topic, kind)
+    until(lambda: publish(message) or not messages.empty())
+    return messages, publish
+
+
+def test_messages_arrive_whole(link):
+    points = np.random.default_rng(0).normal(size=(100_000, 3)).astype(np.float32)
+    sent = local_link.cloud(drives.FIRST_STAMP, points)
+    messages, _ = connected(link, "/points", "sensor_msgs/msg/PointCloud2", sent)
+    found = messages.get(timeout=5.0)
+    assert link.store.serialize_ros1(found, found.__msgtype__) == local_link.STORE.serialize_ros1(
+        sent, sent.__msgtype__
+    )
+    assert link.topics()["/points"] == "sensor_msgs/msg/PointCloud2"
+
+
+def test_messages_of_another_type_are_ignored_and_named(link, caplog):
+    imu = local_link.imu(0)
+    connected(link, "/imu", "sensor_msgs/msg/Imu", imu)
+    other = Ros1()
+    messages, publish = taken(other, "/imu", "sensor_msgs/msg/PointCloud2"), link.advertise
+    publish = publish("/imu", "sensor_msgs/msg/Imu")
+    until(lambda: publish(imu) or "/imu is sensor_msgs/Imu, not" in caplog.text)
+    assert messages.empty()
+    other.close()
+
+
+def test_parameters_are_set_while_a_node_runs(link, robot):
+    assert link.set_parameters(robot, {"voxel": 0.25}) == {"voxel": 0.25}
+    # The node holds to its bounds.
+    assert link.set_parameters(robot, {"voxel": 7.0}) == {"voxel": 1.0}
+    # What it does not know goes to the parameter server.
+    assert link.set_parameters(robot, {"voxel": 0.5, "rings": 4}) == {"voxel": 0.5}
+    get = ["rosparam", "get", "/robot/rings"]
+    assert subprocess.run(get, capture_output=True, check=True, text=True).stdout == "4\n"
+
+
+def test_a_node_that_is_not_there_is_named(link):
+    with pytest.raises(LinkError, match="/nobody: unknown node"):
+        link.set_parameters("/nobody", {"voxel": 0.5})
+
+
+def test_without_a_roscore_it_says_so(monkeypatch):
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9")
+    with pytest.raises(LinkError, match=r"no roscore answers at .*127\.0\.0\.1:9; start `roscore`"):
+        Ros1()
+
+
+def test_a_python_without_rospy_is_named():
+    with pytest.raises(LinkError, match="cannot import ROS"):
+        Ros1(sys.executable)
+
+
+@pytest.mark.parametrize("steers", [False, True])
+def test_the_command_drives_until_ctrl_c(link, robot, study_file, trained_folder, tmp_path, steers):
+    """A bag is played to `adaptune online --ros`."""
+    folder = shutil.copytree(trained_folder, tmp_path / "run")
+    extra = ["-o", "online.ros.points=/velodyne", "-o", "online.ros.odometry=/found"]
+    # The first selection is made in time, also where the tests share a core.
+    extra += ["-o", "online.real_time.deadline=5"]
+    if steers:
+        extra += ["-o", f"online.ros.steer={{node: {robot}, odometry: /truth}}"]
+    poses = taken(link, "/found", "nav_msgs/msg/Odometry")
+    chosen = taken(link, "/adaptune/selection", "std_msgs/msg/String")
+    cloud = link.advertise("/velodyne", "sensor_msgs/msg/PointCloud2")
+    truth = link.advertise("/truth", "nav_msgs/msg/Odometry")
+    command = [sys.executable, "-m", "adaptune", "online", str(study_file), "--ros"]
+    process = subprocess.Popen(
+        [*command, "--folder", str(folder), *extra],
+        stderr=subprocess.PIPE,
+        text=True,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        (first, points, T), *others = drives.scans(2, 40)
+        here = local_link.cloud(first, points)
+        # Whoever comes late sees the first scan, and once.
+        until(lambda: cloud(here) or truth(local_link.odometry(first, T)) or chosen.qsize(), 60.0)
+        for stamp, points, T in others:
+            truth(local_link.odometry(stamp, T))
+            cloud(local_link.cloud(stamp, points))
+            time.sleep(0.1)
+        until(lambda: chosen.qsize() >= 4)
+        process.send_signal(signal.SIGINT)
+        said, log = process.communicate(timeout=30.0)
+    except AssertionError:
+        process.send_signal(signal.SIGINT)
+        print(process.communicate()[1])  # noqa: T201
+        raise
+    finally:
+        process.kill()
+    assert process.returncode == 0, log
+    (drive,) = (folder / "drives").iterdir()
+    assert f"scans: {drive}/" in said or "dropped" in said
+    found = read_tum(drive / "trajectory.tum")
+    assert len(found) >= 30
+    moved = found.T_world_sensor[-1, 0, 3] - found.T_world_sensor[0, 0, 3]
+    seconds = (found.stamps[-1] - found.stamps[0]) * 1e-9
+    assert moved == pytest.approx(3.0 * seconds, rel=0.05)
+    selections = [json.loads(chosen.get().data) for _ in range(4)]
+    assert [s["stamp"] for s in selections[1:]] == sorted(s["stamp"] for s in selections[1:])
+    if not steers:
+        last = None
+        while not poses.empty():
+            last = poses.get()
+        assert last.header.frame_id == "odom"
+        assert last.pose.pose.position.x == pytest.approx(moved, abs=0.5)
+        assert last.pose.covariance[0] > 0.0
+    else:
+        names = ("max_correspondence_distance", "keyframe_interval")
+        get = ["rosparam", "get", "/robot"]
+        held = subprocess.run(get, capture_output=True, check=True, text=True).stdout
+        assert all(name in held for name in names)
+        assert poses.empty()
