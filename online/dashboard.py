@@ -73,15 +73,15 @@ class Dashboard:
         speed = driven / max(self._now - self._begun, 1e-9)
         yield _Line(self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded")
         of = f" of {self._total}" if self._total else ""
-        restarts = f", {self._restarts} restarts" if self._restarts else ""
+        restarts = f", restarted {self._restarts} times" if self._restarts else ""
         yield _Line("scans", f"{at.done}{of}{restarts}; {_in_ms(self._scan_ms)} a scan")
         if real_time is not None:
             late = 1e3 * np.array(list(real_time.late)[-NEWEST:])
-            words = f"pose {_in_ms(late)} after the scan; {real_time.dropped} scans dropped"
+            words = f"pose {_in_ms(late)} after the scan; scans dropped: {real_time.dropped}"
             if real_time.missed:
-                words += f", {real_time.missed} selections missed"
+                words += f", selections missed: {real_time.missed}"
             is_late = real_time.dropped + real_time.missed > 0
-            yield _Line("in time", words, "yellow" if is_late else "")
+            yield _Line("latency", words, "yellow" if is_late else "")
         if self._choice is None:
             return
         rejected = f", {self._rejected} not applied" if self._rejected else ""

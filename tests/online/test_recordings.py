@@ -265,8 +265,8 @@ def test_parquet_equals_csv(study):
             for text, value in zip(of, row.values(), strict=True):
                 if isinstance(value, list):
                     assert text == " ".join(f"{k}:{v:.3f}" for k, v in value)
-                elif isinstance(value, str):
-                    assert text == value
+                elif value is None or isinstance(value, str):
+                    assert text == (value or "")
                 else:
                     assert float(value) == pytest.approx(float(text), nan_ok=True, rel=1e-15)
     types = {f.name: str(f.type) for f in pyarrow.parquet.read_schema(files[-2])}

@@ -1,5 +1,6 @@
 """A robot in this process: what is published is taken at once."""
 
+import threading
 from collections import defaultdict
 
 import numpy as np
@@ -16,9 +17,13 @@ TYPES = STORE.types
 
 
 class LocalLink:
-    """Stands for `online.ros1.Ros1`; `holds` are the parameters of its only node, ``/node``."""
+    """Stands for `online.ros1.Ros1`; `holds` are the parameters of its only node, ``/node``.
 
-    def __init__(self):
+    What is `played`, topics and messages, begins when somebody subscribes to ``/points``.
+    """
+
+    def __init__(self, played=()):
+        self._played = played
         self.store = STORE
         self.published = defaultdict(list)
         self.kinds = {}
@@ -28,6 +33,13 @@ class LocalLink:
 
     def subscribe(self, topic, _kind, take):
         self._takers[topic].append(take)
+        if topic == "/points":
+            threading.Thread(target=self._play_all, daemon=True).start()
+
+    def _play_all(self):
+        played, self._played = self._played, ()
+        for topic, message in played:
+            self.play(topic, message)
 
     def advertise(self, topic, kind):
         self.kinds[topic] = kind
