@@ -22,11 +22,14 @@ from adaptune.odometry.member_process import spread
 from adaptune.odometry.pool import Factory
 from adaptune.odometry.preparations import Preparations, PreparedScan
 from adaptune.odometry.short_registrations import ShortRegistrations
-from adaptune.odometry.warm_up import Make, RecentScans, catch_up_together
+from adaptune.odometry.warm_up import Make, RecentScans, Successor, catch_up_together
 from adaptune.pooled_space import ODOMETRY
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
+
+CATCH_UP = 3
+"""Scans of the past that a member that restarts sees with every new scan, in real time."""
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +55,8 @@ class Bank(OdometryInstance):
         That the members may use, if `make` is a factory, see `spread`. The motions are the same.
     rate
         Times as fast as recorded at which scans come: members that are late are not waited for,
-        see `Lateness`. None waits for all.
+        see `Lateness`, and those that restart see scans of the past `CATCH_UP` at a time. None
+        waits for all.
 
     Attributes
     ----------
@@ -88,6 +92,8 @@ class Bank(OdometryInstance):
         ]
         self._told: set[int] = set()
         self.late = Lateness(self._members, self._names, rate)
+        self._rate = rate
+        self._returning: list[Successor] = []
         self._weights = np.eye(len(sets))[0]
         self._agreement = Agreement(len(sets), lost_track)
         self._short = ShortRegistrations()
@@ -147,6 +153,7 @@ class Bank(OdometryInstance):
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self.late.settle()
+        self._returning.clear()
         for member in self._present:
             member.start(prepared.by(member), T_odom_sensor, T_previous_current)
         self._T_previous_current = self._member_motions(T_odom_sensor)
@@ -190,6 +197,7 @@ class Bank(OdometryInstance):
         self._recent.add(scan, T_odom_sensor)
         self.late.given(T_odom_sensor)
         self._last_motion.move(T_odom_sensor)
+        self._catch_up()
         self._restart(self._agreement.due)
         registered = np.array([registration.registered for registration in registrations])
         return Registration(T_odom_sensor, bool(registered[agreeing].any()))
@@ -207,10 +215,31 @@ class Bank(OdometryInstance):
         members &= ~self.late.working
         due = [self._members[i] for i in np.flatnonzero(members)]
         in_order = [member for member in self._apart_first if member in due]
-        catch_up_together([self._recent.replay_to(member) for member in in_order])
+        successors = [self._recent.replay_to(member) for member in in_order]
+        # Somebody has to go on meanwhile.
+        if self._rate is None or (self.late.absent | members).all():
+            catch_up_together(successors)
+        else:
+            self._returning += successors
+            self.late.away |= members
+            self.late.absent |= members
         self.restarts += int(members.sum())
         self._agreement.restarted(members)
         self._tell()
+
+    def _catch_up(self) -> None:
+        """Let those that restart see the newest scan, and one of them scans of the past."""
+        for one in self._returning:
+            one.waiting.append(self._recent.last)
+        if not self._returning or self._returning[0].odometry.busy:
+            return
+        first = self._returning[0]
+        first.catch_up(CATCH_UP)
+        if not first.waiting:
+            i = self._members.index(first.odometry)
+            self.late.back(i, self._recent.last.T_odom_sensor)
+            self._agreement.restarted(np.arange(len(self._members)) == i)
+            del self._returning[0]
 
     def _tell(self) -> None:
         """Log which members have ended, or are back, since this was last called."""

@@ -36,6 +36,8 @@ class Lateness:
         At how many scans each member was late.
     removed : ndarray of shape (n_members,)
         Members that were always late: they take no part any more.
+    away : ndarray of shape (n_members,)
+        Members that are restarting.
     absent : ndarray of shape (n_members,)
         Members that have no motion over the newest scan.
     """
@@ -45,7 +47,7 @@ class Lateness:
     ):
         n = len(members)
         self.scans = np.zeros(n, np.intp)
-        self.removed, self.absent = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self.removed, self.absent, self.away = (np.zeros(n, np.bool_) for _ in range(3))
         self._members, self._names, self._rate = members, names, rate
         self._owing = np.zeros(n, np.bool_)
         self._in_a_row = np.zeros(n, np.intp)
@@ -56,7 +58,7 @@ class Lateness:
         """Wait for all that is owed, as before everybody starts again."""
         for i in np.flatnonzero(self._owing & ~self.removed).tolist():
             self._members[i].collect()
-        self._owing[:] = False
+        self._owing[:] = self.away[:] = False
         self.absent[:] = self.removed
 
     def begin(self) -> None:
@@ -69,7 +71,7 @@ class Lateness:
                 self._members[i].collect()
                 self._owing[i] = False
         busy = [member.busy for member in self._members]
-        self.absent = self._owing | self.removed | np.array(busy)
+        self.absent = self._owing | self.removed | self.away | np.array(busy)
 
     def collect(self, i: int, interval: float) -> Registration:
         """A member's pose; NaN if it is absent, or late.
@@ -93,7 +95,7 @@ class Lateness:
         return Registration(np.full((4, 4), np.nan), registered=False)
 
     def _note(self, i: int) -> None:
-        if self.removed[i]:
+        if self.removed[i] or self.away[i]:
             return
         self.scans[i] += 1
         self._in_a_row[i] += 1
@@ -129,7 +131,12 @@ class Lateness:
         if self._rate is not None:
             self._T_odom_given[~self.absent] = T_odom_sensor
 
+    def back(self, i: int, T_odom_sensor: Poses) -> None:
+        """A member has restarted, and seen the scan of this pose of the bank's."""
+        self.away[i] = False
+        self._T_odom_given[i] = T_odom_sensor
+
     @property
     def working(self) -> NDArray[np.bool_]:
         """Members that cannot be restarted now, of shape (n_members,)."""
-        return self._owing | self.absent
+        return self._owing | self.absent | self.away

@@ -130,3 +130,42 @@ def test_in_lockstep_nobody_is_late(make, scans):
     if not in_time.late.scans.any():
         np.testing.assert_array_equal(poses, others)
         assert np.isfinite(moved).all()
+
+
+def test_a_member_that_restarts_sees_the_past_bit_by_bit(make, scans):
+    waits, goes_on = make(None), make(0.1)
+    for bank in (waits, goes_on):
+        bank.start(bank.prepare(scans[0]), np.eye(4))
+        for i, scan in enumerate(scans[1:], 1):
+            if i == 15:
+                bank.apply(EVEN._replace(restart=frozenset({5})))
+            T = bank.register(bank.prepare(scan)).T_odom_sensor
+            np.testing.assert_allclose(T[0, 3], STEP * i, atol=0.05)
+            moved = bank.motions.members[5]
+            # Ten scans of the past and those that come meanwhile, two more at a time.
+            is_away = bank is goes_on and 15 <= i < 20
+            assert np.isnan(moved[0, 3]) == is_away, i
+            if not is_away:
+                np.testing.assert_allclose(moved[0, 3], STEP, atol=0.05)
+        assert bank.restarts == 1
+    assert not goes_on.late.removed.any()
+
+
+def test_a_bank_may_start_while_a_member_restarts(make, scans):
+    bank = make(0.1)
+    run(bank, scans[:15], {})
+    bank.apply(EVEN._replace(restart=frozenset({5})))
+    bank.register(bank.prepare(scans[15]))
+    assert list(bank.late.away) == [False, True]
+    bank.start(bank.prepare(scans[16]), np.eye(4))
+    T = bank.register(bank.prepare(scans[17])).T_odom_sensor
+    np.testing.assert_allclose(T[0, 3], STEP, atol=0.05)
+
+
+def test_where_all_restart_it_waits_for_them(make, scans):
+    bank = make(0.1)
+    run(bank, scans[:15], {})
+    bank.apply(EVEN._replace(restart=frozenset({3, 5})))
+    T = bank.register(bank.prepare(scans[15])).T_odom_sensor
+    assert not bank.late.away.any()
+    np.testing.assert_allclose(T[0, 3], STEP * 15, atol=0.05)
