@@ -1,6 +1,7 @@
 """Drive on a robot: scans from a topic, poses and selections on others."""
 
 import itertools
+import logging
 import time
 from collections import deque
 from collections.abc import Callable
@@ -10,6 +11,8 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
@@ -28,7 +31,7 @@ from adaptune.study.study import Study
 from online.drive_log import DriveLog
 from online.live_scans import CLOUD, IMU, LiveScans
 from online.modes import ReplaySetup, needed
-from online.real_time import RealTimeDrive
+from online.real_time import RealTimeDrive, outlook
 from online.replay import Progressed, RealTimeRecord
 from online.ros_link import RosLink
 from online.ros_messages import RosMessages, Uncertainty
@@ -44,6 +47,11 @@ _EVERY = 10**9
 
 _PUBLISHED = 5.0
 """Seconds in which a topic that nobody has named must be published."""
+
+_FIRST = 10
+"""Scans from which the sensor's rate is known."""
+
+_log = logging.getLogger(__name__)
 
 Look = Callable[[str, int, Progressed], None]
 
@@ -167,16 +175,25 @@ class RobotDrive:
             )
             drive.record.late = deque(maxlen=_KEPT)
             drive.record.waited = deque(maxlen=_KEPT)
-            done = 0
+            done, stamps = 0, list[int]()
             try:
                 for arrival in self._scans.arrivals():
                     step = drive.step(arrival)
                     done += 1 + arrival.dropped
+                    self._tell_of_rate(stamps, step.stamp)
                     publisher.step(step, drive.record)
                     look("drive", 0, Progressed(done, step, publisher.newest, drive.record))
             except KeyboardInterrupt:
                 self._scans.stop()
             return DriveRecord(folder, done, drive.finished(), self._scans.ignored)
+
+    def _tell_of_rate(self, stamps: list[int], stamp: int) -> None:
+        """Log whether this machine holds the sensor's rate, as soon as that is known."""
+        if len(stamps) < _FIRST:
+            stamps.append(stamp)
+            core_ms = np.nan if self._steers else self._setup.core_ms(self._mode, self._model)
+            if len(stamps) == _FIRST and (said := outlook(stamps, self._settings, core_ms)):
+                _log.info("%s", said)
 
 
 class _Publisher:

@@ -145,6 +145,9 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
         RobotDrive(make(STEER), "fixed", make().model_path)
     with pytest.raises(AdaptuneError, match=r"online\.ros\.like: no sequence 'tree'.*three"):
         RobotDrive(make("online.ros.like=tree"), "baseline", None)
+    other = make("odometry.settings.min_range=0.9")
+    with pytest.raises(AdaptuneError, match="min_range"):
+        RobotDrive(other, "paired", other.model_path)
     monkeypatch.setattr(robot_drive, "_PUBLISHED", 0.0)
     study = make("online.ros.points=null", "sequences.one.points=null")
     link = local_link.LocalLink()
