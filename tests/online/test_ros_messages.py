@@ -1,0 +1,87 @@
+import json
+import math
+
+import local_link
+import numpy as np
+import pytest
+
+from adaptune.selection import Selection
+from online.replay import RealTimeRecord
+from online.ros_messages import UNKNOWN, RosMessages, Uncertainty
+
+MESSAGES = RosMessages(local_link.STORE, "odom")
+
+
+def ahead(metres):
+    T = np.eye(4)
+    T[0, 3] = metres
+    return T
+
+
+@pytest.mark.parametrize(
+    ("selection", "percent"),
+    [
+        (None, UNKNOWN),
+        (Selection(1, {}), UNKNOWN),
+        (Selection(1, {}, predicted_error=2.0), 2.0),
+        (Selection(1, {}, predicted_error=2.0, estimated_error=3.0), 3.0),
+    ],
+)
+def test_over_a_sub_trajectory_the_uncertainty_is_the_error(selection, percent):
+    uncertainty = Uncertainty(25.0)
+    if selection is not None:
+        uncertainty.learn(selection)
+    for _ in range(50):
+        uncertainty.move(ahead(0.5))
+    assert math.sqrt(uncertainty.position) == pytest.approx(25.0 * 1e-2 * percent)
+    assert math.sqrt(uncertainty.rotation) == pytest.approx(1e-2 * percent)
+    # Errors are independent: four times the way is twice as uncertain.
+    uncertainty.move(ahead(75.0))
+    assert math.sqrt(uncertainty.position) == pytest.approx(50.0 * 1e-2 * percent)
+    uncertainty.move(ahead(np.nan))
+    assert math.isfinite(uncertainty.position)
+
+
+def test_a_pose_in_either_ros():
+    T = ahead(3.0)
+    T[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    stamp = 1_700_000_000_123_456_789
+    found = MESSAGES.odometry(stamp, T, "lidar", Uncertainty(25.0))
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == divmod(stamp, 10**9)
+    q = found.pose.pose.orientation
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    assert found.twist.covariance[0] == -1.0
+    from rosbags.typesys import Stores, get_typestore
+
+    newer = RosMessages(get_typestore(Stores.ROS2_JAZZY), "odom")
+    assert not hasattr(newer.odometry(stamp, T, "lidar", Uncertainty(25.0)).header, "seq")
+
+
+def test_what_is_not_known_is_null():
+    text = MESSAGES.selection(5, Selection(3, {"voxel": 0.5}), "too late").data
+    found = json.loads(text)
+    assert found["predicted_error"] is found["estimated_error"] is found["weights"] is None
+    assert (found["trial"], found["parameters"], found["why_not"]) == (
+        3,
+        {"voxel": 0.5},
+        "too late",
+    )
+
+
+@pytest.mark.parametrize(
+    ("selection", "record", "level", "said"),
+    [
+        (None, {}, 0, "keeps up"),
+        (None, {"dropped": 1}, 1, "was too late"),
+        (None, {"missed": 1}, 1, "was too late"),
+        (Selection(3, {}, lost=True), {"missed": 1}, 2, "is lost"),
+    ],
+)
+def test_diagnostics(selection, record, level, said):
+    record = RealTimeRecord(1.0, late=[0.0123], **record)
+    (status,) = MESSAGES.diagnostics(0, selection, record, 4).status
+    assert (status.level, status.message) == (level, said)
+    values = {one.key: one.value for one in status.values}
+    assert values["pose after the scan [ms]"] == "12.3"
+    assert values["ignored scans"] == "4"
+    assert ("trial" in values) == (selection is not None)
