@@ -16,6 +16,7 @@ from typing import Any
 
 _LENGTH = struct.Struct("<I")
 _SECONDS = 2.0  # in which another node must answer
+_BUFFER = 1 << 24  # bytes
 
 
 class _Stream:
@@ -71,8 +72,10 @@ class _Node:
             found = {"kind": message._connection_header["type"], "topic": topic, "type": "message"}
             self._stream.send(found, message._buff)
 
+        # With the usual buffer, a cloud would be read in many pieces.
+        settings = {"queue_size": 10, "buff_size": _BUFFER, "tcp_nodelay": True}
         self._subscribers.append(
-            self._rospy.Subscriber(topic, self._rospy.AnyMsg, take, queue_size=10, tcp_nodelay=True)
+            self._rospy.Subscriber(topic, self._rospy.AnyMsg, take, **settings)
         )
 
     def advertise(self, header: dict[str, Any], _: bytes) -> None:
