@@ -50,7 +50,7 @@ class Robot:
         self.store = get_typestore(Stores.ROS1_NOETIC)
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        self.free = Semaphore(2)
+        self.free, self.alive = Semaphore(2), True
         self._clouds = [self._cloud(scan) for scan in scans]
         self._n = n
 

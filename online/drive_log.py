@@ -5,7 +5,7 @@ import io
 import logging
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -29,16 +29,33 @@ class DriveLog:
         Where to; it is made.
     names
         Of the parameters, for the columns of ``selections.csv``.
+    goes_on
+        Whether the drive goes on where nothing can be recorded from the start.
 
     Attributes
     ----------
     lost : str
         Why the log ended; empty while it lasts.
+
+    Raises
+    ------
+    OSError
+        If the files cannot be made, unless the drive goes on.
     """
 
-    def __init__(self, folder: Path, names: list[str]):
+    def __init__(self, folder: Path, names: list[str], *, goes_on: bool = False):
         self.folder, self.lost = folder, ""
         self._names = names
+        self._files: dict[str, IO[str]] = {}
+        try:
+            self._open()
+        except OSError as error:
+            if not goes_on:
+                raise
+            self._end(error)
+
+    def _open(self) -> None:
+        folder, names = self.folder, self._names
         folder.mkdir(parents=True)
         heads = {
             "trajectory.tum": "",
@@ -46,7 +63,7 @@ class DriveLog:
             "selections.csv": _csv((*SELECTION_COLUMNS, *names)),
         }
         # A line is on disk when it is written: the robot may be switched off.
-        self._files = {
+        self._files |= {
             name: (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
             for name in heads
         }

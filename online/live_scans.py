@@ -73,6 +73,7 @@ class LiveScans:
         self.frame = "sensor"
         self._link, self._points, self._timing, self._queue = link, points, timing, queue
         self._settings = imu
+        _warm_up(timing)
         self._news = threading.Condition()
         self._waiting: deque[tuple[Scan, float]] = deque()
         self._measured: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MOST_IMU)
@@ -110,12 +111,14 @@ class LiveScans:
     def _next(self, last: int | None) -> tuple[tuple[Scan, float], int] | None:
         """The next scan, and how many were dropped before it; None at the end."""
         silent = 0.0
+        while not self._is_there():
+            silent += SILENCE
+            if not self._link.alive:
+                raise LinkError("adaptune's node in ROS has ended; start again")
+            # Again after twice as long.
+            if np.log2(silent / SILENCE) % 1.0 == 0.0:
+                self._tell_of_silence(silent)
         with self._news:
-            while not self._news.wait_for(lambda: self._waiting or self._stopped, SILENCE):
-                silent += SILENCE
-                # Again after twice as long.
-                if np.log2(silent / SILENCE) % 1.0 == 0.0:
-                    self._tell_of_silence(silent)
             if self._stopped:
                 return None
             stamp = self._waiting[0][0].stamp
@@ -127,6 +130,11 @@ class LiveScans:
                 _log.warning("%s: scans come again, after %.0f s", self._points, silent)
             dropped, self._dropped = self._dropped, 0
             return self._waiting.popleft(), dropped
+
+    def _is_there(self) -> bool:
+        """Whether there is a scan, or the end, before the silence is too long."""
+        with self._news:
+            return self._news.wait_for(lambda: bool(self._waiting or self._stopped), SILENCE)
 
     def _tell_of_silence(self, seconds: float) -> None:
         hint = ""
@@ -187,6 +195,12 @@ class LiveScans:
         acceleration = values[:, 3:] * self._settings.scale
         imu = Imu(stamps, values[:, :3], acceleration, T, self._settings.noise)
         return replace(scan, imu=imu)
+
+
+def _warm_up(timing: Timing) -> None:
+    """Load compiled code, for which the first scans should not wait."""
+    numbers = np.ones(1, np.float32)
+    from_fields(dict.fromkeys("xyz", numbers), 0, timing)
 
 
 def to_scan(message: Any, timing: Timing) -> Scan:

@@ -20,6 +20,7 @@ from adaptune.live.untrained import UntrainedSelector
 from adaptune.model import ErrorModel
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.tracker import RegisteredScan
+from adaptune.selection import Selection
 from adaptune.selector import Selector
 from adaptune.sequence.config import ImuConfig, SequenceConfig
 from adaptune.sequence.opening import imu_settings
@@ -30,11 +31,11 @@ from adaptune.study.driven import ModeError
 from adaptune.study.study import Study
 from online.drive_log import DriveLog
 from online.live_scans import CLOUD, IMU, LiveScans
-from online.modes import ReplaySetup, needed
+from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, needed
 from online.real_time import RealTimeDrive, outlook
 from online.replay import Progressed, RealTimeRecord
 from online.ros_link import RosLink
-from online.ros_messages import RosMessages, Uncertainty
+from online.ros_messages import RosMessages, Status, Uncertainty
 from online.safety import Choice
 from online.selector_process import SelectorProcess
 from online.steered_node import ODOMETRY, SteeredNode
@@ -91,6 +92,11 @@ class RobotDrive:
         self._ros = config.online.ros
         self._model = None if model_path is None else setup.model(study, model_path)
         self._like = _like(study)
+        self._scans: LiveScans | None = None
+        self._stopped = False
+        modes = WITHOUT_MODEL if self._model is None else (*setup.modes(self._model), UNTRAINED)
+        if mode not in modes:
+            raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
         if self._ros.steer is not None:
             if mode not in setup.rules:
                 raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
@@ -112,32 +118,33 @@ class RobotDrive:
         look
             Called after every scan, see `online.dashboard.Dashboard.look`.
         """
+        done = 0
         with ExitStack() as stack:
-            odometry = stack.enter_context(closing(self._odometry(link)))
+            steered = None if self._ros.steer is None else SteeredNode(link, self._ros.steer)
             selector = None
-            if self._ros.steer is not None or self._setup.adapts(self._mode):
+            if steered is not None or self._setup.adapts(self._mode):
                 make = partial(_selector, self._setup, self._mode, self._model, self._steers)
                 period = self._study.config.online.period
                 selector = stack.enter_context(closing(SelectorProcess(make, period)))
-            self._scans = self._topics(link)
+            self._scans = scans = self._topics(link)
+            publisher = _Publisher(link, self._study, scans)
             driven = None
-            while not self._scans.stopped:
-                driven = self._part(link, odometry, selector, look)
-        assert driven is not None
+            while driven is None or not (scans.stopped or self._stopped):
+                odometry = steered or self._setup.instance(self._mode, self._model)
+                with closing(odometry):
+                    driven = self._part(odometry, selector, publisher, look, done)
+                done = driven.scans
         return driven
 
     def stop(self) -> None:
         """End the drive; any thread may call it."""
-        self._scans.stop()
+        self._stopped = True
+        if self._scans is not None:
+            self._scans.stop()
 
     @property
     def _steers(self) -> bool:
         return self._ros.steer is not None
-
-    def _odometry(self, link: RosLink) -> OdometryInstance:
-        if self._ros.steer is not None:
-            return SteeredNode(link, self._ros.steer)
-        return self._setup.instance(self._mode, self._model)
 
     def _topics(self, link: RosLink) -> LiveScans:
         """Subscribe to scans, and to an IMU if the odometry needs one."""
@@ -153,59 +160,63 @@ class RobotDrive:
 
     def _part(
         self,
-        link: RosLink,
         odometry: OdometryInstance,
         selector: SelectorProcess | None,
+        publisher: "_Publisher",
         look: Look,
+        done: int,
     ) -> DriveRecord:
-        """Drive until the clock goes back."""
-        folder = _new_folder(self._study.folder / "drives")
-        names = self._study.odometry.space.names
-        with closing(DriveLog(folder, list(names))) as log:
-            publisher = _Publisher(link, self._study, self._scans, log)
+        """Drive until the clock goes back; so many scans were there before."""
+        assert self._scans is not None
+        folder, names = _new_folder(self._study.folder / "drives"), self._study.odometry.space.names
+        # A robot that drives goes on, whatever happens to its disk.
+        with closing(DriveLog(folder, list(names), goes_on=done > 0)) as log:
+            publisher.begin(log)
             if selector is not None:
-                odometry.apply(selector.fixed)
-            drive = RealTimeDrive(
-                odometry,
-                self._study.config.health,
-                self._settings,
-                selector,
-                publisher.choice,
-                "drive",
-            )
+                self._begin_with(odometry, selector.fixed, goes_on=done > 0)
+            health, note = self._study.config.health, publisher.choice
+            drive = RealTimeDrive(odometry, health, self._settings, selector, note, "drive")
             drive.record.late = deque(maxlen=_KEPT)
             drive.record.waited = deque(maxlen=_KEPT)
-            done, stamps = 0, list[int]()
+            arrived: list[int] = []
+            if self._stopped:
+                self._scans.stop()
             try:
                 for arrival in self._scans.arrivals():
                     step = drive.step(arrival)
                     done += 1 + arrival.dropped
-                    self._tell_of_rate(stamps, step.stamp)
+                    self._tell_of_rate(arrived, arrival.due)
                     publisher.step(step, drive.record)
                     look("drive", 0, Progressed(done, step, publisher.newest, drive.record))
             except KeyboardInterrupt:
                 self._scans.stop()
             return DriveRecord(folder, done, drive.finished(), self._scans.ignored)
 
-    def _tell_of_rate(self, stamps: list[int], stamp: int) -> None:
+    def _begin_with(self, odometry: OdometryInstance, fixed: Selection, *, goes_on: bool) -> None:
+        """Apply the fixed set; an error at the start of the drive if that fails."""
+        try:
+            odometry.apply(fixed)
+        except AdaptuneError as error:
+            if not goes_on:
+                raise
+            _log.warning("the fixed set cannot be applied: %s", error)
+
+    def _tell_of_rate(self, arrived: list[int], due: float) -> None:
         """Log whether this machine holds the sensor's rate, as soon as that is known."""
-        if len(stamps) < _FIRST:
-            stamps.append(stamp)
+        if len(arrived) < _FIRST:
+            arrived.append(round(due * 1e9))
             core_ms = np.nan if self._steers else self._setup.core_ms(self._mode, self._model)
-            if len(stamps) == _FIRST and (said := outlook(stamps, self._settings, core_ms)):
+            if len(arrived) == _FIRST and (said := outlook(arrived, self._settings, core_ms)):
                 _log.info("%s", said)
 
 
 class _Publisher:
     """Publishes and records what a drive finds."""
 
-    def __init__(self, link: RosLink, study: Study, scans: LiveScans, log: DriveLog):
-        ros, self._scans, self._log = study.config.online.ros, scans, log
-        self.newest: Choice | None = None
+    def __init__(self, link: RosLink, study: Study, scans: LiveScans):
+        ros, self._scans = study.config.online.ros, scans
         self._messages = RosMessages(link.store, ros.frame)
-        self._uncertainty = Uncertainty(study.config.sub_trajectory)
-        self._last: RegisteredScan | None = None
-        self._told: int | None = None
+        self._length = study.config.sub_trajectory
         self._selection = link.advertise(SELECTION_TOPIC, "std_msgs/msg/String")
         diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
         self._diagnostics = link.advertise(DIAGNOSTICS_TOPIC, diagnostics)
@@ -214,6 +225,15 @@ class _Publisher:
         self._odometry = link.advertise(ros.odometry, ODOMETRY) if own else None
         tf = own and ros.tf
         self._tf = link.advertise("/tf", "tf2_msgs/msg/TFMessage") if tf else None
+
+    def begin(self, log: DriveLog) -> None:
+        """Begin a drive, which has a log of its own."""
+        self._log = log
+        self.newest: Choice | None = None
+        self._uncertainty = Uncertainty(self._length)
+        self._last: RegisteredScan | None = None
+        self._told: int | None = None
+        self._status = Status()
 
     def choice(self, choice: Choice) -> None:
         """Tell of a selection."""
@@ -234,11 +254,13 @@ class _Publisher:
             self._odometry(self._messages.odometry(*where, self._uncertainty))
         if self._tf is not None:
             self._tf(self._messages.transform(*where))
+        self._status.restarts += step.unhealthy is not None
         if self._told is None or step.stamp - self._told >= _EVERY:
             self._told = step.stamp
             selection = None if self.newest is None else self.newest.selection
-            ignored = self._scans.ignored
-            self._diagnostics(self._messages.diagnostics(step.stamp, selection, record, ignored))
+            before, self._status = self._status, Status.of(record, self._scans.ignored)
+            message = self._messages.diagnostics(step.stamp, selection, self._status, before)
+            self._diagnostics(message)
 
 
 def _like(study: Study) -> SequenceConfig:

@@ -21,6 +21,8 @@ from online.ros_link import LinkError
 
 _START = 20.0
 """Seconds in which the node must be ready."""
+_WAITING = 1000
+"""Messages of a topic that may wait; more are dropped."""
 _ANSWER = 5.0
 """Seconds in which it must answer; it waits less for others."""
 
@@ -128,8 +130,16 @@ class Ros1:
 
     def topics(self) -> Mapping[str, str]:
         """See `RosLink.topics`."""
-        found: dict[str, str] = self._ask({"type": "topics"})["found"]
+        answer = self._ask({"type": "topics"})
+        if "refused" in answer:
+            raise LinkError(f"ROS 1: the roscore does not answer ({answer['refused']})")
+        found: dict[str, str] = answer["found"]
         return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
+
+    @property
+    def alive(self) -> bool:
+        """See `RosLink.alive`."""
+        return self._process.poll() is None
 
     def close(self) -> None:
         """See `RosLink.close`."""
@@ -174,7 +184,8 @@ class Ros1:
                     continue
                 kind, received = self._takes[header["topic"]]
                 if header["kind"].replace("/", "/msg/") == kind:
-                    received.put(message.arrays["data"].tobytes())
+                    if received.qsize() < _WAITING:
+                        received.put(message.arrays["data"].tobytes())
                 elif header["topic"] not in self._mistaken:
                     self._mistaken.add(header["topic"])
                     is_not = "%s is %s, not %s: its messages are ignored"

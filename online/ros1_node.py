@@ -6,6 +6,7 @@ It imports nothing of adaptune's, runs on Python 3.8 and newer, and speaks the f
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -30,9 +31,11 @@ class _Stream:
     def send(self, header: dict[str, Any], data: bytes = b"") -> None:
         header = dict(header, arrays=[["data", "|u1", [len(data)]]])
         encoded = json.dumps(header).encode()
-        with self._lock:
+        # Where the other side has gone, this process ends soon.
+        with self._lock, contextlib.suppress(OSError):
             self._socket.sendall(_LENGTH.pack(len(encoded)) + encoded)
-            self._socket.sendall(data)
+            if data:
+                self._socket.sendall(data)
 
     def receive(self) -> tuple[dict[str, Any], bytes] | None:
         first = self._reader.read(_LENGTH.size)
@@ -90,8 +93,10 @@ class _Node:
         publisher.publish(message)
 
     def topics(self, header: dict[str, Any], _: bytes) -> None:
-        found = self._rospy.get_published_topics()
-        self._answer(header, {"found": dict(found)})
+        try:
+            self._answer(header, {"found": dict(self._rospy.get_published_topics())})
+        except Exception as error:
+            self._answer(header, {"refused": str(error) or type(error).__name__})
 
     def set_parameters(self, header: dict[str, Any], _: bytes) -> None:
         try:

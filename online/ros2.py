@@ -274,6 +274,11 @@ class Ros2:
             if len(key) > 11
         )
 
+    @property
+    def alive(self) -> bool:
+        """See `RosLink.alive`; where the router has gone, it may come back."""
+        return not self._closed
+
     def close(self) -> None:
         """Leave; messages that wait to be taken are dropped."""
         self._closed = True

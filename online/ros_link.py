@@ -44,5 +44,9 @@ class RosLink(Protocol):
     def topics(self) -> Mapping[str, str]:
         """The topics that somebody publishes now, and their types."""
 
+    @property
+    def alive(self) -> bool:
+        """Whether messages still pass."""
+
     def close(self) -> None:
         """Leave."""

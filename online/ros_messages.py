@@ -2,7 +2,8 @@
 
 import json
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from rosbags.typesys.store import Typestore
@@ -141,16 +142,21 @@ class RosMessages:
         return self._make("std_msgs/msg/String", data=json.dumps(found))
 
     def diagnostics(
-        self, stamp: int, selection: Selection | None, record: RealTimeRecord, ignored: int
+        self, stamp: int, selection: Selection | None, status: "Status", before: "Status"
     ) -> Any:
-        """diagnostic_msgs/DiagnosticArray: whether it keeps up, and whether it is lost."""
-        lost = selection is not None and selection.lost
-        late = record.late[-1] if record.late else 0.0
+        """diagnostic_msgs/DiagnosticArray: what happened since the message before."""
+        level, said = _OK, "keeps up"
+        if (status.dropped, status.missed) != (before.dropped, before.missed):
+            level, said = _WARN, "was too late"
+        if before.restarts:
+            level, said = _ERROR, "restarts for want of healthy poses"
+        if selection is not None and selection.lost:
+            level, said = _ERROR, "is lost"
         values = {
-            "pose after the scan [ms]": f"{1e3 * late:.1f}",
-            "dropped scans": str(record.dropped),
-            "ignored scans": str(ignored),
-            "missed selections": str(record.missed),
+            "pose after the scan [ms]": f"{1e3 * status.late:.1f}",
+            "dropped scans": str(status.dropped),
+            "ignored scans": str(status.ignored),
+            "missed selections": str(status.missed),
         }
         if selection is not None:
             values |= {
@@ -158,18 +164,34 @@ class RosMessages:
                 "estimated error [%]": f"{selection.estimated_error:.3f}",
                 "predicted error [%]": f"{selection.predicted_error:.3f}",
             }
-        level = _ERROR if lost else _WARN if record.dropped or record.missed else _OK
         kind = "diagnostic_msgs/msg/KeyValue"
-        status = self._make(
+        found = self._make(
             "diagnostic_msgs/msg/DiagnosticStatus",
             level=level,
             name="adaptune: odometry",
-            message={_OK: "keeps up", _WARN: "was too late", _ERROR: "is lost"}[level],
+            message=said,
             hardware_id="",
             values=[self._make(kind, key=key, value=value) for key, value in values.items()],
         )
         header = self._header(stamp, "")
-        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
+        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[found])
+
+
+@dataclass
+class Status:
+    """Counts since the start, and restarts since a message."""
+
+    dropped: int = 0
+    missed: int = 0
+    ignored: int = 0
+    late: float = 0.0  # seconds from the newest scan to its pose
+    restarts: int = 0
+
+    @classmethod
+    def of(cls, record: RealTimeRecord, ignored: int) -> Self:
+        """The counts of a drive."""
+        late = record.late[-1] if record.late else 0.0
+        return cls(record.dropped, record.missed, ignored, late)
 
 
 def _number(value: float) -> float | None:

@@ -95,24 +95,26 @@ class Driver:
         applied, fixed = self._applied, self._fixed
         if applied is None or fixed is None or applied[:3] == fixed[:3]:
             return False
-        self._fall_back(stamp, applied, f"the health check found {what}")
-        return True
+        return self._fall_back(stamp, applied, f"the health check found {what}")
 
-    def _fall_back(self, stamp: int, failed: Selection, why: str) -> None:
+    def _fall_back(self, stamp: int, failed: Selection, why: str) -> bool:
+        """Apply the fixed set; whether that worked."""
         fixed = self._fixed
         assert fixed is not None
         if failed.weights is None and failed.trial != fixed.trial:
             self._avoided[failed.trial] = stamp + AVOIDED
         seconds = self._seconds(stamp)
+        # Where that fails, too, the next selection tries again.
+        self._applied = fixed
         try:
             self._odometry.apply(fixed)
         except AdaptuneError as error:
             what = "%s: %s at %.1f s; nor can the fixed set: %s"
             _log.warning(what, self._what, why, seconds, error)
-            return
+            return False
         _log.warning("%s: %s at %.1f s; the fixed set is used", self._what, why, seconds)
-        self._applied = fixed
         self._note(Choice(stamp, fixed, 0.0, fallen_back=why))
+        return True
 
     def _seconds(self, stamp: int) -> float:
         """Since the first scan."""

@@ -23,12 +23,15 @@ from adaptune.sequence.config import to_pose
 from adaptune.sequence.pose_messages import POSES
 from adaptune.sequence.scan import Scan
 from adaptune.study.config import SteerConfig
+from adaptune.timed_selector import BACK
 from adaptune.trajectory import Trajectory
 from online.ros_link import RosLink
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 PATIENCE = 0.3
 """Seconds after a scan in which the node's pose must be there."""
+SILENT = 10
+"""Scans in a row without a pose after which the log says so."""
 _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
 _KEPT = 1000
@@ -51,6 +54,7 @@ class SteeredNode(OdometryInstance):
     """
 
     faults = ()
+    rewinds = False
 
     def __init__(self, link: RosLink, settings: SteerConfig):
         self._link, self._settings = link, settings
@@ -62,6 +66,7 @@ class SteeredNode(OdometryInstance):
         self._begun: tuple[int, Poses] | None = None
         self._T_odom_node: Poses | None = None
         self._told: set[str] = set()
+        self._silent = 0
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
     @property
@@ -88,16 +93,25 @@ class SteeredNode(OdometryInstance):
     def collect(self) -> Registration:
         T_node = self._pose(self._submitted, PATIENCE)
         T_odom_sensor = np.full((4, 4), np.nan)
-        if np.isfinite(T_node).all():
+        known = bool(np.isfinite(T_node).all())
+        self._tell_of_silence(known)
+        if known:
             if self._T_odom_node is None:
                 assert self._begun is not None
                 stamp, T = self._begun
                 T_begin = self._pose(stamp, 0.0)
-                known = T_begin if np.isfinite(T_begin).all() else T_node
-                self._T_odom_node = T @ invert(known)
+                T_first = T_begin if np.isfinite(T_begin).all() else T_node
+                self._T_odom_node = T @ invert(T_first)
             T_odom_sensor = self._T_odom_node @ T_node
         self._last_motion.move(T_odom_sensor)
-        return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
+        return Registration(T_odom_sensor, known)
+
+    def _tell_of_silence(self, known: bool) -> None:
+        """Log that the node gives no poses, or gives some again."""
+        self._silent = 0 if known else self._silent + 1
+        if self._silent == SILENT:
+            what = "%s: no pose of %s for %d scans; is it the topic, and does the node run?"
+            _log.warning(what, self._settings.odometry, self._settings.node, SILENT)
 
     def apply(self, selection: Selection) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
@@ -159,11 +173,10 @@ class SteeredNode(OdometryInstance):
             except ValueError:
                 continue  # no pose, which the health check sees
             with self._news:
+                if self._poses and stamp < self._poses[-1][0] - BACK:
+                    self._poses.clear()
                 if not self._poses or stamp > self._poses[-1][0]:
                     self._poses.append((stamp, T @ self._T_base_sensor))
-                elif stamp < self._poses[0][0]:
-                    # The clock went back.
-                    self._poses.clear()
                 self._news.notify()
 
     def _pose(self, stamp: int, seconds: float) -> Poses:
@@ -183,8 +196,8 @@ class SteeredNode(OdometryInstance):
 
 
 def _equal(wanted: Any, held: Any) -> bool:
-    if isinstance(wanted, float) or isinstance(held, float):
-        return bool(np.isclose(float(wanted), float(held), rtol=1e-5, atol=1e-9))
+    if isinstance(wanted, float) and isinstance(held, int | float):
+        return bool(np.isclose(wanted, held, rtol=1e-5, atol=1e-9))
     return bool(wanted == held)
 
 

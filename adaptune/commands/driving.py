@@ -29,7 +29,8 @@ Rate = Annotated[
 Pin = Annotated[
     list[str],
     typer.Option(
-        metavar="KEY=VALUE", help="Hold a parameter at this value in all sets. May be repeated."
+        metavar="KEY=VALUE",
+        help="Hold a parameter at this value in all sets but the baseline. May be repeated.",
     ),
 ]
 
@@ -80,6 +81,10 @@ def online(
     """
     if untrained and model is not None:
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    if untrained and mode is not None:
+        raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
+    if wrong := [given for given in pin if "=" not in given]:
+        raise AdaptuneError(f"--pin {wrong[0]}: give a parameter and its value, KEY=VALUE")
     override = [*override, *(f"online.pin.{given}" for given in pin)]
     if rate is not None:
         override = [*override, f"online.real_time.rate={rate:g}"]

@@ -180,6 +180,9 @@ class Bank(OdometryInstance):
             member: self.late.collect(numbers[member], seconds)
             for member in reversed(self._apart_first)
         }
+        nobody = not any(np.isfinite(one.T_odom_sensor).all() for one in found.values())
+        if nobody and (first := self.late.collect_first()) is not None:
+            found[self._members[first[0]]] = first[1]
         registrations = [found[member] for member in self._members]
         self._tell()
         T_previous_current = self._member_motions(before.T_odom_sensor)

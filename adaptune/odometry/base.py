@@ -124,9 +124,12 @@ class OdometryInstance(Protocol):
     ----------
     apart : bool
         Whether it works in another process, from `submit` on; class attribute.
+    rewinds : bool
+        Whether it can be shown scans of the past again; class attribute.
     """
 
     apart: ClassVar[bool] = False
+    rewinds: ClassVar[bool] = True
 
     @property
     def faults(self) -> Sequence[str]:

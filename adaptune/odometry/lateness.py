@@ -2,7 +2,9 @@
 
 import logging
 import time
+from collections import deque
 from collections.abc import Sequence
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +12,12 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert
 from adaptune.odometry.base import OdometryInstance, Registration
 
-ALWAYS = 10
-"""A member that is late at so many scans in a row is removed."""
+ALWAYS = 5.0
+"""A member that is late at every scan for so many seconds is removed."""
+_INTERVALS = 11
+"""Newest intervals between scans whose median says when the next scan is due."""
+_POLL = 0.005
+"""Seconds from one look at a member to the next."""
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +56,8 @@ class Lateness:
         self.removed, self.absent, self.away = (np.zeros(n, np.bool_) for _ in range(3))
         self._members, self._names, self._rate = members, names, rate
         self._owing = np.zeros(n, np.bool_)
-        self._in_a_row = np.zeros(n, np.intp)
+        self._behind = np.zeros(n)  # seconds for which each member has been late
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
         # The bank's pose at the last scan that each member was given.
         self._T_odom_given = np.tile(np.eye(4), (n, 1, 1))
 
@@ -72,6 +79,26 @@ class Lateness:
                 self._owing[i] = False
         busy = [member.busy for member in self._members]
         self.absent = self._owing | self.removed | self.away | np.array(busy)
+        if self.absent.all() and (first := self._first(self._owing)) is not None:
+            self._members[first].collect()
+            self._owing[first] = self.absent[first] = False
+
+    def _first(self, owing: NDArray[np.bool_]) -> int | None:
+        """Wait for the first of these members that are not removed; None if there are none."""
+        members = np.flatnonzero(owing & ~self.removed).tolist()
+        while members:
+            for i in members:
+                if self._members[i].ready(_POLL):
+                    return int(i)
+        return None
+
+    def collect_first(self) -> tuple[int, Registration] | None:
+        """Wait for the first of the members that have the newest scan, where all were late."""
+        first = self._first(self._owing & ~self.absent)
+        if first is None:
+            return None
+        self._owing[first], self._behind[first] = False, 0.0
+        return first, self._members[first].collect()
 
     def collect(self, i: int, interval: float) -> Registration:
         """A member's pose; NaN if it is absent, or late.
@@ -86,23 +113,25 @@ class Lateness:
         if not self.absent[i]:
             if self._rate is None:
                 return self._members[i].collect()
-            left = self._begun + interval / self._rate - time.perf_counter()
+            self._intervals.append(interval)
+            left = self._begun + median(self._intervals) / self._rate - time.perf_counter()
             if self._members[i].ready(left):
-                self._in_a_row[i] = 0
+                self._behind[i] = 0.0
                 return self._members[i].collect()
             self._owing[i] = True
-        self._note(i)
+        self._note(i, interval)
         return Registration(np.full((4, 4), np.nan), registered=False)
 
-    def _note(self, i: int) -> None:
+    def _note(self, i: int, interval: float) -> None:
         if self.removed[i] or self.away[i]:
             return
         self.scans[i] += 1
-        self._in_a_row[i] += 1
+        # Another member of its process may be at work.
+        self._behind[i] += interval if self._owing[i] else 0.0
         # Somebody has to go on.
-        if self._in_a_row[i] >= ALWAYS and self.removed.sum() < len(self._members) - 1:
+        if self._behind[i] >= ALWAYS and self.removed.sum() < len(self._members) - 1:
             self.removed[i] = True
-            what = "%s was late at %d scans in a row; the bank goes on without it"
+            what = "%s was late for %g s; the bank goes on without it"
             _log.warning(what, self._names[i], ALWAYS)
 
     def motion(self, i: int, T_odom_previous: Poses) -> Poses:

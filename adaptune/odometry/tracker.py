@@ -103,7 +103,7 @@ class Tracker:
                     self.odometry.start(prepared, T_odom_sensor, T_healthy)
                 else:
                     T_odom_sensor = T_warm
-        if self.fall_back is not None and scan is not None:
+        if self.fall_back is not None and scan is not None and self.odometry.rewinds:
             self._remember(scan, prepared, T_odom_sensor, T_previous_current)
         seconds = time.perf_counter() - begin
         self._last = RegisteredScan(

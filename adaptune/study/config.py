@@ -135,6 +135,10 @@ class RealTimeConfig(StrictModel):
     queue: int = Field(1, ge=0, le=10_000)
 
 
+RosName = Annotated[str, Field(pattern=r"^[~/]?[A-Za-z]\w*(/[A-Za-z]\w*)*$", max_length=255)]
+"""A topic or a node of ROS."""
+
+
 class SteerConfig(StrictModel):
     """Somebody else's odometry node, of which only the parameters are set.
 
@@ -151,8 +155,8 @@ class SteerConfig(StrictModel):
         ``{value}``; otherwise they are set through ROS.
     """
 
-    node: str = Field(min_length=1)
-    odometry: str = Field(min_length=1)
+    node: RosName
+    odometry: RosName
     extrinsic: Transform | None = None
     command: Annotated[tuple[str, ...] | None, Field(min_length=1)] = None
 
@@ -180,18 +184,19 @@ class RosConfig(StrictModel):
     odometry : str
         Topic to publish poses on.
     tf : bool
-        Whether to publish the transform from `frame` to the sensor.
+        Whether to publish the transform from `frame` to the sensor; not where that frame has
+        another parent, such as the robot's base.
     steer : SteerConfig, optional
         Set the parameters of this node instead of running an odometry.
     router : str
         Address of Zenoh's router, in ROS 2.
     """
 
-    points: str | None = None
+    points: RosName | None = None
     like: str | None = None
     frame: str = Field("odom", min_length=1)
-    odometry: str = Field("adaptune/odometry", min_length=1)
-    tf: bool = True
+    odometry: RosName = "adaptune/odometry"
+    tf: bool = False
     steer: SteerConfig | None = None
     router: str = "127.0.0.1:7447"
 

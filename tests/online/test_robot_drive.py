@@ -20,8 +20,12 @@ from online import robot_drive
 from online.modes import ReplaySetup
 from online.replay import replay
 from online.robot_drive import RobotDrive
+from online.ros_link import LinkError
 
-PATIENT = ("online.real_time={deadline: 5, queue: 0}", "online.ros.points=/points")
+PATIENT = (
+    "online.real_time={deadline: 5, queue: 0}",
+    "online.ros={points: /points, tf: true}",
+)
 SCANS = drives.scans(2, 25)
 
 
@@ -117,6 +121,30 @@ def test_where_the_clock_goes_back_another_drive_begins(make):
     np.testing.assert_allclose(first.T_world_sensor, second.T_world_sensor, atol=1e-6)
 
 
+def test_a_drive_that_goes_on_does_not_need_the_disk(make, monkeypatch, caplog):
+    study = make()
+    monkeypatch.setattr(robot_drive, "_new_folder", lambda parent: parent / "same")
+    found, link, _ = drive(study, "fixed", [*clouds(10**11), *clouds()], 2 * len(SCANS))
+    # The second part cannot make its folder.
+    assert "nothing more is recorded" in caplog.text
+    assert found.scans == len(link.published["adaptune/odometry"]) == 2 * len(SCANS)
+    assert len(read_tum(study.folder / "drives/same/trajectory.tum")) == len(SCANS)
+
+
+def test_it_ends_where_the_node_in_ros_has_ended(make, monkeypatch):
+    monkeypatch.setattr("online.live_scans.SILENCE", 0.01)
+    link = local_link.LocalLink()
+    link.alive = False
+    with pytest.raises(LinkError, match="adaptune's node in ROS has ended"):
+        RobotDrive(make(), "baseline", None).run(link)
+
+
+def test_a_drive_that_was_stopped_before_ends_at_once(make):
+    robot = RobotDrive(make(), "baseline", None)
+    robot.stop()
+    assert robot.run(local_link.LocalLink()).scans == 0
+
+
 STEER = "online.ros.steer={node: /node, odometry: /odom}"
 
 
@@ -141,6 +169,8 @@ def test_a_node_is_steered(make):
 
 
 def test_what_does_not_go_together_is_refused(make, monkeypatch):
+    with pytest.raises(ModeError, match=r"--mode: there is no mode 'fxed'; .*fixed"):
+        RobotDrive(make(), "fxed", make().model_path)
     with pytest.raises(ModeError, match=r"online\.ros\.steer: in the mode fixed nothing is select"):
         RobotDrive(make(STEER), "fixed", make().model_path)
     with pytest.raises(AdaptuneError, match=r"online\.ros\.like: no sequence 'tree'.*three"):
@@ -162,6 +192,8 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
         (["--ros", "--ros2"], "give only one of --ros, --ros2 and --rate"),
         (["--ros", "--rate", "1"], "give only one of --ros, --ros2 and --rate"),
         (["--mode", "fixed"], "--mode fixed is for a robot"),
+        (["--ros", "--untrained", "--mode", "fixed"], "--untrained is a mode of its own"),
+        (["--pin", "voxel"], "--pin voxel: give a parameter and its value, KEY=VALUE"),
     ],
 )
 def test_options_that_exclude_each_other(study_file, folder, options, said):

@@ -133,6 +133,20 @@ def test_without_a_roscore_it_says_so(monkeypatch):
         Ros1()
 
 
+def test_a_node_that_is_killed_is_noticed(link):
+    other = Ros1()
+    assert other.alive
+    publish = other.advertise("/lost", "std_msgs/msg/String")
+    other._process.kill()
+    until(lambda: not other.alive)
+    with pytest.raises(LinkError, match="adaptune's node has ended"):
+        publish(local_link.TYPES["std_msgs/msg/String"]("lost"))
+    with pytest.raises(LinkError):
+        other.topics()
+    other.close()
+    assert link.alive
+
+
 def test_a_python_without_rospy_is_named():
     with pytest.raises(LinkError, match="cannot import ROS"):
         Ros1(sys.executable)
@@ -155,6 +169,8 @@ def test_the_command_drives_until_ctrl_c(link, robot, study_file, trained_folder
     process = subprocess.Popen(
         [*command, "--folder", str(folder), *extra],
         stderr=subprocess.PIPE,
+        # Processes in the background ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
         text=True,
         stdout=subprocess.PIPE,
     )

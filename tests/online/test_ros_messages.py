@@ -7,7 +7,7 @@ import pytest
 
 from adaptune.selection import Selection
 from online.replay import RealTimeRecord
-from online.ros_messages import UNKNOWN, RosMessages, Uncertainty
+from online.ros_messages import UNKNOWN, RosMessages, Status, Uncertainty
 
 MESSAGES = RosMessages(local_link.STORE, "odom")
 
@@ -69,19 +69,27 @@ def test_what_is_not_known_is_null():
 
 
 @pytest.mark.parametrize(
-    ("selection", "record", "level", "said"),
+    ("selection", "status", "before", "level", "said"),
     [
-        (None, {}, 0, "keeps up"),
-        (None, {"dropped": 1}, 1, "was too late"),
-        (None, {"missed": 1}, 1, "was too late"),
-        (Selection(3, {}, lost=True), {"missed": 1}, 2, "is lost"),
+        (None, {}, {}, 0, "keeps up"),
+        (None, {"dropped": 1}, {}, 1, "was too late"),
+        (None, {"missed": 1}, {}, 1, "was too late"),
+        (None, {"dropped": 1, "missed": 2}, {"dropped": 1, "missed": 2}, 0, "keeps up"),
+        (None, {"dropped": 1}, {"restarts": 1}, 2, "restarts for want of healthy poses"),
+        (Selection(3, {}, lost=True), {"missed": 1}, {"restarts": 1}, 2, "is lost"),
     ],
 )
-def test_diagnostics(selection, record, level, said):
-    record = RealTimeRecord(1.0, late=[0.0123], **record)
-    (status,) = MESSAGES.diagnostics(0, selection, record, 4).status
-    assert (status.level, status.message) == (level, said)
-    values = {one.key: one.value for one in status.values}
+def test_diagnostics(selection, status, before, level, said):
+    status = Status(late=0.0123, ignored=4, **status)
+    (found,) = MESSAGES.diagnostics(0, selection, status, Status(**before)).status
+    assert (found.level, found.message) == (level, said)
+    values = {one.key: one.value for one in found.values}
     assert values["pose after the scan [ms]"] == "12.3"
     assert values["ignored scans"] == "4"
     assert ("trial" in values) == (selection is not None)
+
+
+def test_the_status_of_a_drive():
+    record = RealTimeRecord(1.0, dropped=3, missed=2, late=[0.5, 0.25])
+    assert Status.of(record, 7) == Status(3, 2, 7, 0.25)
+    assert Status.of(RealTimeRecord(1.0), 0) == Status()

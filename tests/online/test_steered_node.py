@@ -72,6 +72,26 @@ def test_a_node_that_is_silent_gives_no_pose_and_goes_on(link, node):
     np.testing.assert_allclose(found.T_odom_sensor, pose(0.2), atol=1e-9)
 
 
+def test_where_the_clock_goes_back_old_poses_do_not_count(link, node):
+    odometry = node()
+    play(link, *range(0, 50 * TENTH, TENTH))
+    # The same stamps again, at three times the speed.
+    for stamp in range(0, 3 * TENTH, TENTH):
+        link.play("/odom", local_link.odometry(stamp, pose(3e-9 * stamp)))
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    np.testing.assert_allclose(odometry.register(scan(TENTH)).T_odom_sensor, pose(0.3), atol=1e-9)
+
+
+def test_a_topic_without_poses_is_named_once(node, caplog):
+    odometry = node()
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    for i in range(1, 30):
+        odometry.register(scan(i * TENTH))
+    assert caplog.messages == [
+        "/odom: no pose of /node for 10 scans; is it the topic, and does the node run?"
+    ]
+
+
 def test_poses_of_another_frame_become_those_of_the_sensor(link, node):
     turned = (0.0, 0.0, 1.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
     odometry = node(extrinsic=turned)
@@ -88,6 +108,9 @@ def test_what_the_node_holds_is_compared(link, node):
     assert link.holds == {"voxel": 0.5}
     link.refuses = ("voxel",)
     with pytest.raises(LinkError, match="refuses voxel"):
+        odometry.apply(Selection(2, {"voxel": 0.7}))
+    link.set_parameters = lambda *_: {"voxel": "fine"}
+    with pytest.raises(OdometryError, match="/node holds voxel = fine"):
         odometry.apply(Selection(2, {"voxel": 0.7}))
     link.set_parameters = lambda *_: {"voxel": 0.5}
     with pytest.raises(OdometryError, match=r"/node holds voxel = 0\.5"):

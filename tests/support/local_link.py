@@ -24,6 +24,7 @@ class LocalLink:
 
     def __init__(self, played=()):
         self._played = played
+        self.alive = True
         self.store = STORE
         self.published = defaultdict(list)
         self.kinds = {}
