@@ -1,5 +1,6 @@
 """A link to ROS 1, by a node that the Python of a ROS installation runs."""
 
+import contextlib
 import itertools
 import logging
 import os
@@ -147,7 +148,8 @@ class Ros1:
             received.put(None)
         # A thread reads; without it the node would not notice.
         self._stream.end()
-        self._stream.close()
+        with contextlib.suppress(OSError):
+            self._stream.close()
         try:
             # It takes leave of the roscore.
             self._process.wait(5.0)
