@@ -398,6 +398,8 @@ def _session(zenoh: ModuleType, router: str) -> Any:
         ("connect/timeout_ms", round(1e3 * _CONNECT)),
         ("connect/exit_on_failure", True),
         ("scouting/multicast/enabled", False),
+        # It leaves files in /dev/shm.
+        ("transport/shared_memory/enabled", False),
     ):
         config.insert_json5(name, json.dumps(value))
     try:

@@ -47,6 +47,7 @@ def router(port):
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
     config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("transport/shared_memory/enabled", "false")
     with zenoh.open(config) as session:
         yield session
 
@@ -58,6 +59,7 @@ def robot(router, port, tmp_path_factory):
     folder = tmp_path_factory.mktemp("definitions")
     # Nothing is downloaded; an attempt would leave the first of these folders.
     aside = {"ZENOH_ROS2_SDK_CACHE": str(folder / "cache"), "GIT_ALLOW_PROTOCOL": "none"}
+    aside["ZENOH_CONFIG_OVERRIDE"] = "transport/shared_memory/enabled=false"
     aside["GIT_CONFIG_GLOBAL"] = str(folder / "gitconfig")
     process = subprocess.Popen(
         [*command, str(folder)], stdin=subprocess.PIPE, env=os.environ | aside
