@@ -1,17 +1,23 @@
 import os
 import queue
+import shutil
 import socket
 import subprocess
 import sys
 import threading
 import time
 
+import drives
+import local_link
 import needs
 import numpy as np
 import pytest
 import ros2_node
 
 from adaptune.odometry.base import import_extra
+from adaptune.trajectory import read_tum
+from offline.offline_study import load_study
+from online.robot_drive import RobotDrive
 from online.ros2 import Ros2, message_types
 from online.ros_link import LinkError
 
@@ -279,3 +285,53 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch):
     with pytest.raises(LinkError, match=r"run `pip install 'adaptune\[ros2\]'`"):
         Ros2()
     import_extra.cache_clear()
+
+
+def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path):
+    """Scans come from another session, and poses go to it."""
+    folder = shutil.copytree(trained_folder, tmp_path / "run")
+    patient = ["online.real_time={deadline: 5, queue: 0}", "online.ros.points=/velodyne"]
+    study = load_study(study_file, patient, folder)
+    drive = RobotDrive(study, "fixed", study.model_path)
+    scans, poses = drives.scans(2, 15), []
+    cloud = link.advertise("/velodyne", "sensor_msgs/msg/PointCloud2")
+    link.subscribe("/adaptune/odometry", "nav_msgs/msg/Odometry", poses.append)
+    other = Ros2(robot, 0)
+
+    def play():
+        first, *others = (of_ros_2(local_link.cloud(stamp, xyz)) for stamp, xyz, _ in scans)
+        while not poses:  # whoever comes late sees the first scan, and once
+            cloud(first)
+            time.sleep(0.05)
+        for message in others:
+            cloud(message)
+
+    playing = threading.Thread(target=play, daemon=True)
+    playing.start()
+
+    def look(_what, _total, at):
+        if at.done == len(scans):
+            drive.stop()
+
+    found = drive.run(other, look)
+    playing.join(10.0)
+    end = time.monotonic() + 10.0
+    while len(poses) < len(scans):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    other.close()
+    trajectory = read_tum(found.folder / "trajectory.tum")
+    moved = [one.pose.pose.position.x for one in poses]
+    np.testing.assert_allclose(moved, trajectory.T_world_sensor[:, 0, 3], atol=1e-6)
+    np.testing.assert_allclose(moved, 0.3 * np.arange(len(scans)), atol=0.1)
+
+
+def of_ros_2(cloud):
+    """A cloud with the types of ROS 2."""
+    types, kind = STORE.types, "sensor_msgs/msg/PointCloud2"
+    stamp = types["builtin_interfaces/msg/Time"](cloud.header.stamp.sec, cloud.header.stamp.nanosec)
+    header = types["std_msgs/msg/Header"](stamp, cloud.header.frame_id)
+    field = types["sensor_msgs/msg/PointField"]
+    fields = [field(one.name, one.offset, one.datatype, one.count) for one in cloud.fields]
+    n = cloud.width
+    return types[kind](header, 1, n, fields, False, 12, 12 * n, cloud.data, True)
