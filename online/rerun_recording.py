@@ -215,10 +215,13 @@ def _rgb(colour: str) -> list[int]:
 
 def _blueprint(rrb: Any, replays: RecordedReplays) -> Any:
     """The places at the left; errors, selections and times at the right."""
+    # The modes have the colours of the pictures, one of which is black.
+    white = rrb.archetypes.PlotBackground(color=[255, 255, 255])
 
     def over_time(name: str, *parts: str, tall: tuple[float, float] | None = None) -> Any:
         axis = rrb.ScalarAxis(range=tall) if tall else None
-        return rrb.TimeSeriesView(origin=_entity(*parts), name=name, axis_y=axis)
+        origin = _entity(*parts)
+        return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis, background=white)
 
     def of_all(kind: str) -> dict[str, Series]:
         modes = replays.modes.values()
@@ -232,7 +235,8 @@ def _blueprint(rrb: Any, replays: RecordedReplays) -> Any:
     for name in of_all("parameters"):
         having = [mode for mode, r in replays.modes.items() if name in r.series["parameters"]]
         contents = [_entity("parameters", mode, name) for mode in having]
-        chosen.append(rrb.TimeSeriesView(origin="/parameters", contents=contents, name=name))
+        view = {"origin": "/parameters", "contents": contents, "name": name, "background": white}
+        chosen.append(rrb.TimeSeriesView(**view))
     chosen.append(rrb.TextLogView(origin="/words", name="selections in words"))
     right = rrb.Vertical(
         over_time("errors in percent", "errors"),
@@ -245,7 +249,9 @@ def _blueprint(rrb: Any, replays: RecordedReplays) -> Any:
     )
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial3DView(origin="/world", name=replays.title), right, column_shares=[3, 2]
+            rrb.Spatial3DView(origin="/world", name=replays.title, background=[250, 250, 250]),
+            right,
+            column_shares=[3, 2],
         ),
         rrb.TimePanel(timeline="seconds", state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
