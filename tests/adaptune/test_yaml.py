@@ -12,7 +12,7 @@ from adaptune.yaml import Document, YamlError, dump, scalar
 modest = settings(max_examples=80, deadline=None)
 
 # PyYAML writes YAML 1.1's rarer line breaks so that they are read as plain ones.
-words = st.text(st.characters(exclude_characters="\0\x85\u2028\u2029"), max_size=30)
+words = st.text(st.characters(codec="utf-8", exclude_characters="\0\x85\u2028\u2029"), max_size=30)
 scalars = (
     st.none()
     | st.booleans()
