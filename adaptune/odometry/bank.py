@@ -85,7 +85,7 @@ class Bank(OdometryInstance):
         )
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
         # Members in processes of their own register while those of this process do.
-        self._apart_first = sorted(self._members, key=lambda member: not member.apart)
+        self._apart_first = sorted(range(len(sets)), key=lambda i: not self._members[i].apart)
         self._names = [
             f"trial {trial}" + (f" ({of[ODOMETRY]})" if ODOMETRY in of else "")
             for trial, of in sets.items()
@@ -133,8 +133,7 @@ class Bank(OdometryInstance):
     @property
     def _present(self) -> list[OdometryInstance]:
         """Members that take the next scan; those apart come first."""
-        absent = {self._members[i] for i in np.flatnonzero(self.late.absent)}
-        return [member for member in self._apart_first if member not in absent]
+        return [self._members[i] for i in self._apart_first if not self.late.absent[i]]
 
     def apply(self, selection: Selection) -> None:
         # Members without a weight get 0.
@@ -175,15 +174,7 @@ class Bank(OdometryInstance):
     def collect(self) -> Registration:
         scan, before = self._submitted, self._recent.last
         seconds = (scan.stamp - before.scan.stamp) * 1e-9
-        numbers = {member: i for i, member in enumerate(self._members)}
-        found = {
-            member: self.late.collect(numbers[member], seconds)
-            for member in reversed(self._apart_first)
-        }
-        nobody = not any(np.isfinite(one.T_odom_sensor).all() for one in found.values())
-        if nobody and (first := self.late.collect_first()) is not None:
-            found[self._members[first[0]]] = first[1]
-        registrations = [found[member] for member in self._members]
+        registrations = self.late.collect(self._apart_first[::-1], seconds)
         self._tell()
         T_previous_current = self._member_motions(before.T_odom_sensor)
         self._T_previous_current = T_previous_current
@@ -216,9 +207,8 @@ class Bank(OdometryInstance):
         """Restart members at the bank's pose, but for those that have given up or are late."""
         members = members & ~np.array([member.given_up for member in self._members])
         members &= ~self.late.working
-        due = [self._members[i] for i in np.flatnonzero(members)]
-        in_order = [member for member in self._apart_first if member in due]
-        successors = [self._recent.replay_to(member) for member in in_order]
+        due = [self._members[i] for i in self._apart_first if members[i]]
+        successors = [self._recent.replay_to(member) for member in due]
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             catch_up_together(successors)

@@ -92,35 +92,37 @@ class Lateness:
                     return int(i)
         return None
 
-    def collect_first(self) -> tuple[int, Registration] | None:
-        """Wait for the first of the members that have the newest scan, where all were late."""
-        first = self._first(self._owing & ~self.absent)
-        if first is None:
-            return None
-        self._owing[first], self._behind[first] = False, 0.0
-        return first, self._members[first].collect()
-
-    def collect(self, i: int, interval: float) -> Registration:
-        """A member's pose; NaN if it is absent, or late.
+    def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
+        """The poses of all members; NaN for those that are absent, or late.
 
         Parameters
         ----------
-        i
-            Number of the member.
+        order
+            Numbers of the members, in the order in which they are collected.
         interval
             Seconds from the scan before to this one.
         """
-        if not self.absent[i]:
-            if self._rate is None:
-                return self._members[i].collect()
-            self._intervals.append(interval)
-            left = self._begun + median(self._intervals) / self._rate - time.perf_counter()
-            if self._members[i].ready(left):
+        self._intervals.append(interval)
+        found = [Registration(np.full((4, 4), np.nan), registered=False)] * len(self._members)
+        for i in order:
+            if self._is_in_time(i):
                 self._behind[i] = 0.0
-                return self._members[i].collect()
-            self._owing[i] = True
-        self._note(i, interval)
-        return Registration(np.full((4, 4), np.nan), registered=False)
+                found[i] = self._members[i].collect()
+            else:
+                self._owing[i] |= not self.absent[i]
+                self._note(i, interval)
+        if not any(np.isfinite(one.T_odom_sensor).all() for one in found):
+            first = self._first(self._owing & ~self.absent)
+            if first is not None:
+                self._owing[first], self._behind[first] = False, 0.0
+                found[first] = self._members[first].collect()
+        return found
+
+    def _is_in_time(self, i: int) -> bool:
+        if self.absent[i] or self._rate is None:
+            return not self.absent[i]
+        left = self._begun + median(self._intervals) / self._rate - time.perf_counter()
+        return self._members[i].ready(left)
 
     def _note(self, i: int, interval: float) -> None:
         if self.removed[i] or self.away[i]:

@@ -34,10 +34,10 @@ see `adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
 import contextlib
 import json
 import resource
-import select
 import socket
 import struct
 from collections.abc import Callable, Iterable, Mapping
+from multiprocessing.connection import wait
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -107,7 +107,7 @@ class SocketStream:
 
     def ready(self, seconds: float) -> bool:
         """Whether a message, or the end, is there, or comes in so many seconds."""
-        return bool(select.select([self._socket], [], [], max(seconds, 0.0))[0])
+        return bool(wait([self._socket], max(seconds, 0.0)))
 
     def close(self) -> None:
         """Close the socket."""

@@ -16,6 +16,7 @@ from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import LastMotion, OdometryInstance, Registration, WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.isolation import SERVICE, Limits
+from adaptune.odometry.lateness import Lateness
 from adaptune.odometry.pool import OdometryPool
 from adaptune.odometry.registry import odometry_class
 from adaptune.selection import Selection
@@ -180,6 +181,23 @@ def test_a_bank_that_starts_again_waits_for_those_at_work(make, scans):
     for i, scan in enumerate(scans[13:20], 1):
         T = bank.register(bank.prepare(scan)).T_odom_sensor
         np.testing.assert_allclose(T[0, 3], STEP * i, atol=0.05)
+
+
+def test_a_gap_does_not_make_it_wait_as_long(scans):
+    """Six members see the same gap of an hour, which counts once."""
+    slow = {n: Slow(0.0 if n else 3600.0) for n in range(6)}
+    late = Lateness(list(slow.values()), list("abcdef"), 1.0)
+    for i, interval in enumerate([0.01] * 6 + [3600.0] * 2):
+        late.begin()
+        for n, member in slow.items():
+            if not late.absent[n]:
+                if i == 0:
+                    member.start(scans[0], np.eye(4))
+                member.submit(scans[i + 1])
+        begin = time.perf_counter()
+        found = late.collect(range(6), interval)
+        assert time.perf_counter() - begin < 5.0
+        assert [np.isfinite(one.T_odom_sensor).all() for one in found] == [False] + [True] * 5
 
 
 def test_in_lockstep_nobody_is_late(make, scans):
