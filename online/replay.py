@@ -53,6 +53,9 @@ class Progressed(NamedTuple):
 
 
 Watch = Callable[[Progressed], None]
+"""Called after every scan."""
+Look = Callable[[str, int, Progressed], None]
+"""Called after every scan with what is driven, and how many scans there are (0: nobody knows)."""
 
 
 @dataclass(frozen=True, eq=False)

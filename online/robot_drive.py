@@ -4,7 +4,6 @@ import itertools
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -33,7 +32,7 @@ from online.drive_log import DriveLog
 from online.live_scans import CLOUD, IMU, LiveScans
 from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, needed
 from online.real_time import RealTimeDrive, outlook
-from online.replay import Progressed, RealTimeRecord
+from online.replay import Look, Progressed, RealTimeRecord
 from online.ros_link import RosLink
 from online.ros_messages import RosMessages, Status, Uncertainty
 from online.safety import Choice
@@ -53,8 +52,6 @@ _FIRST = 10
 """Scans from which the sensor's rate is known."""
 
 _log = logging.getLogger(__name__)
-
-Look = Callable[[str, int, Progressed], None]
 
 
 class DriveRecord(NamedTuple):

@@ -120,13 +120,13 @@ class Ros1:
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`.
 
-        They are set by dynamic_reconfigure where the node has it, and otherwise at the parameter
-        server: then only what the server holds is known.
+        They are set by dynamic_reconfigure where the node has it. The others are set at the
+        parameter server: nobody tells what the node makes of them, so they are not returned.
         """
         answer = self._ask({"type": "set_parameters", "node": node, "values": dict(values)})
         if "refused" in answer:
             raise LinkError(f"{node}: {answer['refused']}")
-        held: dict[str, Any] = answer["found"]["held"]
+        held: dict[str, Any] = answer["found"]
         return held
 
     def topics(self) -> Mapping[str, str]:

@@ -105,7 +105,10 @@ class _Node:
             self._answer(header, {"refused": str(error) or type(error).__name__})
 
     def _set(self, node: str, values: dict[str, Any]) -> dict[str, Any]:
-        """Set them at the parameter server, and where the node has that, while it runs."""
+        """Set them while the node runs, where it can, and else at the parameter server.
+
+        Returns what the node then holds, of those that it can set.
+        """
         import rosgraph
         import rosservice
 
@@ -121,7 +124,7 @@ class _Node:
         for name, value in values.items():
             if name not in held:
                 self._rospy.set_param(node + "/" + name, value)
-        return {"held": held, "live": sorted(held)}
+        return held
 
     def _reconfigured(self, node: str, values: dict[str, Any]) -> dict[str, Any]:
         from dynamic_reconfigure.client import Client
@@ -155,7 +158,7 @@ def main(number: int) -> None:
         return
     rospy.init_node("adaptune", anonymous=True, disable_signals=True)
     node = _Node(rospy, stream)
-    stream.send({"type": "ready", "name": rospy.get_name()})
+    stream.send({"type": "ready"})
     while True:
         received = stream.receive()
         if received is None:

@@ -18,15 +18,13 @@ from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
 from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.real_time import replay_in_real_time
-from online.replay import Progressed, Replay, Watch, replay
+from online.replay import Look, Progressed, Replay, Watch, replay
 from online.selector_process import SelectorProcess
 from online.stored_reference import is_reference_of, write_reference
 from online.stored_replays import ReplayIdentity, StoredReplay, other_keys, write_replay
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
-Look = Callable[[str, int, Progressed], None]
-"""Called with what is replayed, how many scans there are, and how far it is."""
 
 SCANT = 1.5
 """Training sequences below which a selection rests on hardly more than one."""
@@ -58,7 +56,7 @@ def run_replays(
     progress
         Called about every scan.
     look
-        Called with what is replayed, the number of its scans, and how far it is.
+        Sees every scan, see `online.dashboard.Dashboard.look`.
 
     Returns
     -------

@@ -13,6 +13,7 @@ from adaptune.sequence.scan import Scan
 
 AVOIDED = 60 * 10**9
 """Nanoseconds for which a set is not applied after the odometry failed with it."""
+
 _log = logging.getLogger(__name__)
 
 

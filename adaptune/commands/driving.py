@@ -2,6 +2,8 @@
 
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -102,28 +104,35 @@ def online(
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
 
 
+@contextmanager
+def _on_one_core(study: "OfflineStudy") -> Iterator[None]:
+    """Bind this process to one core, and leave the others to what it starts."""
+    from adaptune.cores import pin as bind
+
+    # Ask for the number of cores before.
+    _ = study.mechanism
+    unbind = bind(os.getpid(), alone=True)
+    try:
+        yield
+    finally:
+        unbind()
+
+
 def _replay(
     loaded: "OfflineStudy", model: Path | None, again: bool, untrained: bool
 ) -> tuple[int, int]:
     """Make the replays that are missing; how many were made, and how many there are."""
-    from adaptune.cores import pin as bind
     from adaptune.model import ErrorModel
     from online.dashboard import Dashboard
     from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
     from online.run_replays import run_replays, run_untrained
 
-    # Ask for the number of cores before the replays are bound to one.
-    _ = loaded.mechanism
-    unbind = bind(os.getpid(), alone=True)
     dashboard, path = Dashboard(), model or loaded.model_path
-    try:
-        with progress(dashboard) as show:
-            if untrained:
-                made = run_untrained(loaded, again, show, dashboard.look)
-            else:
-                made = run_replays(loaded, path, again, show, dashboard.look)
-    finally:
-        unbind()
+    with _on_one_core(loaded), progress(dashboard) as show:
+        if untrained:
+            made = run_untrained(loaded, again, show, dashboard.look)
+        else:
+            made = run_replays(loaded, path, again, show, dashboard.look)
     if untrained:
         return made, len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
     modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
@@ -134,7 +143,6 @@ def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
-    from adaptune.cores import pin as bind
     from online.dashboard import Dashboard
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot_drive import RobotDrive
@@ -144,17 +152,10 @@ def _drive(
     mode = UNTRAINED if untrained else mode or loaded.rules[0]
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
-    link = Ros2(loaded.config.online.ros.router) if ros2 else Ros1()
-    _ = loaded.mechanism
-    unbind = bind(os.getpid(), alone=True)
-    dashboard = Dashboard()
-    try:
-        with progress(dashboard):
-            log.info("drive, %s: Ctrl-C ends it", mode)
-            driven = drive.run(link, dashboard.look)
-    finally:
-        link.close()
-        unbind()
+    link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else Ros1(), Dashboard()
+    with closing(link), _on_one_core(loaded), progress(dashboard):
+        log.info("drive, %s: Ctrl-C ends it", mode)
+        driven = drive.run(link, dashboard.look)
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
     say(f"{driven.scans} scans{dropped}: {driven.folder}/")
 

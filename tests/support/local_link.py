@@ -3,6 +3,7 @@
 import threading
 from collections import defaultdict
 
+import drives
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -78,13 +79,11 @@ def header(stamp, frame="lidar"):
 
 def cloud(stamp, points, names="xyz"):
     """sensor_msgs/PointCloud2 of points of shape (n, 3)."""
-    data = np.ascontiguousarray(points, np.float32)
-    fields = [
-        TYPES["sensor_msgs/msg/PointField"](name, 4 * i, 7, 1) for i, name in enumerate(names)
-    ]
-    raw = data.view(np.uint8).reshape(-1)
-    n = len(data)
-    return TYPES[CLOUD](header(stamp), 1, n, fields, False, 12, 12 * n, raw, True)
+    made = drives.cloud(stamp, points)
+    made.header = header(stamp)
+    for field, name in zip(made.fields, names, strict=True):
+        field.name = name
+    return made
 
 
 def imu(stamp, rate=0.0):
