@@ -405,9 +405,11 @@ def _session(zenoh: ModuleType, router: str) -> Any:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
+        # Where in Zenoh's own code that was, helps nobody.
+        why = str(error).split(" at /")[0].rstrip("!. ")
         raise LinkError(
             f"no Zenoh router answers at {router}: run `ros2 run rmw_zenoh_cpp rmw_zenohd` on the "
-            f"robot, which listens on port {PORT}, and check the address ({error})"
+            f"robot, which listens on port {PORT}, and check the address ({why})"
         ) from error
 
 

@@ -135,7 +135,13 @@ class RealTimeConfig(StrictModel):
     queue: int = Field(1, ge=0, le=10_000)
 
 
-RosName = Annotated[str, Field(pattern=r"^[~/]?[A-Za-z]\w*(/[A-Za-z]\w*)*$", max_length=255)]
+def _ros_name(name: str) -> str:
+    if not re.fullmatch(r"[~/]?[A-Za-z]\w*(/[A-Za-z]\w*)*", name, re.ASCII) or len(name) > 255:
+        raise ValueError("is no name in ROS: give letters, digits and _, with / between the parts")
+    return name
+
+
+RosName = Annotated[str, AfterValidator(_ros_name)]
 """A topic or a node of ROS."""
 
 

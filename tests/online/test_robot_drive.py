@@ -193,6 +193,7 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
         (["--ros", "--rate", "1"], "give only one of --ros, --ros2 and --rate"),
         (["--mode", "fixed"], "--mode fixed is for a robot"),
         (["--ros", "--untrained", "--mode", "fixed"], "--untrained is a mode of its own"),
+        (["--ros", "-o", "online.ros.points=a b"], "online.ros.points: is no name in ROS: give"),
         (["--pin", "voxel"], "--pin voxel: give a parameter and its value, KEY=VALUE"),
     ],
 )
