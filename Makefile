@@ -12,7 +12,7 @@ help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests"
 	@echo "make quick   run linters and the fast tests, in about a minute"
-	@echo "make services  install what pip cannot bring: ROS 1 (Debian and Ubuntu)"
+	@echo "make services  install what pip cannot bring: ROS 1 (Debian 12)"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 
