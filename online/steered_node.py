@@ -18,6 +18,7 @@ from adaptune.odometry.base import (
     Registration,
     Usage,
 )
+from adaptune.ros.ros_link import RosLink
 from adaptune.selection import Selection
 from adaptune.sequence.config import to_pose
 from adaptune.sequence.pose_messages import POSES
@@ -25,7 +26,6 @@ from adaptune.sequence.scan import Scan
 from adaptune.study.config import SteerConfig
 from adaptune.timed_selector import BACK
 from adaptune.trajectory import Trajectory
-from online.ros_link import RosLink
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 PATIENCE = 0.3

@@ -143,11 +143,11 @@ def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
+    from adaptune.ros.ros1 import Ros1
+    from adaptune.ros.ros2 import Ros2
     from online.dashboard import Dashboard
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot_drive import RobotDrive
-    from online.ros1 import Ros1
-    from online.ros2 import Ros2
 
     mode = UNTRAINED if untrained else mode or loaded.rules[0]
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path

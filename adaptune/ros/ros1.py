@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.errors import in_a_line
 from adaptune.odometry import wire
-from online import ros1_node
-from online.ros_link import LinkError
+from adaptune.ros import ros1_node
+from adaptune.ros.ros_link import LinkError
 
 _START = 20.0
 """Seconds in which the node must be ready."""
@@ -50,7 +50,7 @@ def ros_python() -> str:
 
 
 class Ros1:
-    """A node in a running ROS 1, see `online.ros_link.RosLink`.
+    """A node in a running ROS 1, see `adaptune.ros.ros_link.RosLink`.
 
     A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
     through it as bytes.

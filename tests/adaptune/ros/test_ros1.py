@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from needs import needs_ros1
 
+from adaptune.ros.ros1 import Ros1, ros_python
+from adaptune.ros.ros_link import LinkError
 from adaptune.trajectory import read_tum
-from online.ros1 import Ros1, ros_python
-from online.ros_link import LinkError
 
 ROBOT = Path(drives.__file__).with_name("ros1_robot.py")
 """Only the Python of ROS can import it."""
