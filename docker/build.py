@@ -30,8 +30,8 @@ GLIBC = 36
 FOLDERS = {"reference": ROOT / "docker/reference", "adaptune": ROOT / "docker"}
 """An image's Dockerfile and the files beside it are in its folder."""
 TAGS = {"reference": "adaptune-reference", "adaptune": "adaptune"}
-REFERENCE_NEEDS = ("numpy", "pydantic", "small_gicp", "typing-extensions")
-"""What `adaptune.odometry.gicp` and `adaptune.odometry.serving` import."""
+REFERENCE_NEEDS = ("numpy", "pydantic", "scipy", "small_gicp", "typing-extensions")
+"""What `adaptune.odometry.gicp` and `adaptune.odometry.serving` import, sooner or later."""
 SOURCES = ("adaptune", "offline", "online", "pyproject.toml", "README.md", "LICENSE")
 SOURCE_DATE = "1700000000"
 """The same sources make the same wheel, to the byte."""
@@ -128,13 +128,12 @@ def _context(name: str) -> Path:
 def _download(folder: Path, requirements: Iterable[str]) -> None:
     """Fill a folder with wheels for the base, unless it holds them."""
     constraints = ROOT / "constraints.txt"
-    # Not by a tag of what is there: pip says which versions a requirement needs, too.
-    digest = _digest([constraints, Path(__file__)], *requirements)
+    machine = platform.machine()
+    digest = _digest([constraints], BASE, machine, *requirements)
     stamp = folder.with_suffix(".made")
     if stamp.exists() and stamp.read_text() == digest:
         return
     shutil.rmtree(folder)
-    machine = platform.machine()
     platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
     platforms.append(f"manylinux2014_{machine}")
     _run(

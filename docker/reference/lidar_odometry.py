@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from adaptune.geometry import to_quaternions
 from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.sequence.scan import Scan
 from adaptune.space import Categorical, Integer
@@ -91,17 +92,6 @@ class LidarOdometry:
         return T
 
 
-def quaternion(R: Any) -> list[float]:
-    """A rotation matrix as x, y, z, w."""
-    if not np.isfinite(R).all():
-        return [np.nan] * 4
-    # The quaternion is an eigenvector of this matrix (Bar-Itzhack, 2000).
-    (a, b, c), (d, e, f), (g, h, i) = R
-    K = [
-        [a - e - i, b + d, c + g, h - f],
-        [b + d, e - a - i, f + h, c - g],
-        [c + g, f + h, i - a - e, d - b],
-        [h - f, c - g, d - b, a + e + i],
-    ]
-    found = np.linalg.eigh(np.array(K))[1][:, -1]
-    return (found if found[3] >= 0 else -found).tolist()
+def quaternion(T: Any) -> list[float]:
+    """The rotation of a pose as x, y, z, w."""
+    return to_quaternions(T[None])[0].tolist() if np.isfinite(T).all() else [np.nan] * 4

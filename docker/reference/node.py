@@ -112,7 +112,7 @@ class GicpNode:
         said.header.frame_id, said.child_frame_id = "odom", "base_link"
         position, orientation = said.pose.pose.position, said.pose.pose.orientation
         position.x, position.y, position.z = T[:3, 3]
-        orientation.x, orientation.y, orientation.z, orientation.w = quaternion(T[:3, :3])
+        orientation.x, orientation.y, orientation.z, orientation.w = quaternion(T)
         self._publisher.publish(said)
 
 

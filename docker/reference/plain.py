@@ -33,7 +33,7 @@ def main() -> None:
             stamp = message.header.stamp
             T = odometry.register(to_scan(message, stamp.to_nsec()))
             time.sleep(imitate.get("seconds_per_scan", 0.0))
-            numbers = [*T[:3, 3], *quaternion(T[:3, :3])]
+            numbers = [*T[:3, 3], *quaternion(T)]
             pose = " ".join(f"{number:.9f}" for number in numbers)
             lines.append(f"{stamp.secs}.{stamp.nsecs:09d} {pose}\n")
             if len(lines) == imitate.get("die_at"):
