@@ -17,9 +17,10 @@ import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
-import docker
 import requests
 from docker.errors import DockerException
+
+import docker
 
 ROOT = Path(__file__).resolve().parents[1]
 BASE = "debian:bookworm-slim"

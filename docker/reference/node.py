@@ -71,7 +71,7 @@ class GicpNode:
         rospy.Subscriber(topic, PointCloud2, self._receive, buff_size=1 << 26)
         rospy.loginfo("ready for %s", topic)
 
-    def _reconfigure(self, config, _level):  # noqa: ANN001, ANN202
+    def _reconfigure(self, config, _level):
         self._changed = tuned(dict(config))
         return config
 
@@ -106,7 +106,7 @@ class GicpNode:
             sys.stderr.flush()
             os._exit(1)
 
-    def _publish(self, stamp, T) -> None:  # noqa: ANN001
+    def _publish(self, stamp, T) -> None:
         said = Odometry()
         said.header.stamp = rospy.Time.now() if self._imitate.get("stamp_now") else stamp
         said.header.frame_id, said.child_frame_id = "odom", "base_link"

@@ -68,13 +68,14 @@ def engine() -> Any:
     EngineError
         If no engine answers, or this user may not use it.
     """
-    import docker
     from docker.errors import DockerException
+
+    from docker import DockerClient
 
     for name in ("docker", "urllib3"):
         logging.getLogger(name).setLevel(logging.WARNING)  # they log every request
     try:
-        client = docker.from_env()
+        client = DockerClient.from_env()
         client.ping()
     except (DockerException, OSError) as error:
         where = os.environ.get("DOCKER_HOST", "unix:///var/run/docker.sock")

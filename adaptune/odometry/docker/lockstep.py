@@ -1,6 +1,8 @@
 """A ROS 1 system in a container that receives scan after scan, and can change its parameters."""
 
+import contextlib
 import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +25,8 @@ from adaptune.space import ParameterSet
 _CLOUD, _IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 _MOST_SILENT = 30
 """Scans in a row without a pose that are a fault."""
+_BETWEEN_LOOKS = 1.0
+"""Seconds between looks at what the system has used."""
 _EARLY = 1_000_000
 """Nanoseconds by which a pose's stamp may be before the scan's."""
 
@@ -51,7 +55,8 @@ class Lockstep(Faulting):
         self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
         self._news = threading.Condition()
         self._poses: list[tuple[int, Poses]] = []
-        self._waiting = False
+        self._waiting = self._has_run = False
+        self._looked = -np.inf
 
     @property
     def ended(self) -> bool:
@@ -59,6 +64,8 @@ class Lockstep(Faulting):
 
     @property
     def usage(self) -> Usage:
+        if self._system is not None and time.monotonic() - self._looked > _BETWEEN_LOOKS:
+            self._look(self._system)
         cpu = self._used_before.cpu + self._used.cpu
         memory = max(self._used_before.memory or 0.0, self._used.memory or 0.0)
         return Usage(cpu, memory, elsewhere=cpu)
@@ -82,9 +89,12 @@ class Lockstep(Faulting):
             self._show(prepared)
             self._correct()
         except (OdometryError, LinkError) as error:
-            if not self.faults and self._system is None:
-                raise
-            self._note(error)
+            told = self._told(error)
+            # One that has run can be gone for good.
+            if not self._has_run:
+                self.close()
+                raise OdometryError(f"{self.name}: {told}") from error
+            self.note_fault(told)
 
     def submit(self, prepared: Scan) -> None:
         self._stamp, self._waiting = prepared.stamp, True
@@ -92,7 +102,7 @@ class Lockstep(Faulting):
             try:
                 self._show(prepared)
             except (OdometryError, LinkError) as error:
-                self._note(error)
+                self.note_fault(self._told(error))
 
     def collect(self) -> Registration:
         self._waiting = False
@@ -104,7 +114,7 @@ class Lockstep(Faulting):
         try:
             registered = self._correct()
         except (OdometryError, LinkError) as error:
-            return self._note(error)
+            return self.note_fault(self._told(error))
         if registered:
             self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
         self._last_motion.move(self._T_odom_sensor)
@@ -128,6 +138,7 @@ class Lockstep(Faulting):
 
     def close(self) -> None:
         if self._system is not None:
+            self._look(self._system)
             self._system.close()
             self._system = None
             self._used_before = Usage(self.usage.cpu, self.usage.memory)
@@ -135,6 +146,12 @@ class Lockstep(Faulting):
 
     def __del__(self) -> None:
         self.close()
+
+    def _look(self, system: RosSystem) -> None:
+        """See what the system has used."""
+        self._looked = time.monotonic()
+        with contextlib.suppress(OdometryError, LinkError):
+            self._used = system.used()
 
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
@@ -185,7 +202,7 @@ class Lockstep(Faulting):
                     f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row"
                 )
             return False
-        self._silent = 0
+        self._silent, self._has_run = 0, True
         if wrong := pose_fault(T_own):
             raise OdometryError(f"it gave a pose {wrong}")
         T_own = T_own @ self._T_base_sensor
@@ -216,7 +233,7 @@ class Lockstep(Faulting):
                 self._poses = [(stamp, T)]
                 self._news.notify_all()
 
-    def _note(self, error: Exception) -> Registration:
-        """Note a fault with the last lines that the system wrote."""
+    def _told(self, error: Exception) -> str:
+        """An error, and the last lines that the system wrote."""
         words = "" if self._system is None else self._system.words()
-        return self.note_fault(f"{error}: {words}" if words else str(error))
+        return f"{error}: {words}" if words else str(error)

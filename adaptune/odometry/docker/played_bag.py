@@ -171,12 +171,12 @@ class PlayedBag(WholeRun):
 
     def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
         """Whether the pose of the last scan is there, or nothing came for a while."""
-        newest: int = max((stamp for stamp, *_ in _last_pose(recorder)), default=0)
+        newest = max((stamp for stamp, *_ in _last_pose(recorder)), default=0)
         # Stamps of a clock of its own say nothing.
-        if bool(last <= newest < last + 10**9):
+        if last <= newest < last + 10**9:
             return True
         pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
-        return time.monotonic() - max(recorder.last, over) > pause
+        return bool(time.monotonic() - max(recorder.last, over) > pause)
 
     def _check_time(self, end: float) -> None:
         if time.monotonic() > end:

@@ -8,6 +8,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,8 @@ _PROBE = (
     "command -v roslaunch >/dev/null || exit 1; " + _FIND.replace("{then}", "exit 0") + "exit 1"
 )
 _BETWEEN_LOOKS = 0.1
+_OTHERS_ONLY = 10.0
+"""Seconds in which nodes have subscribed to other topics only."""
 _TICK = 0.01
 """Seconds."""
 _START = 30.0
@@ -85,7 +88,7 @@ class RosSystem:
         self._folder = tempfile.TemporaryDirectory(prefix="adaptune-", ignore_cleanup_errors=True)
         self.folder = Path(self._folder.name)
         self.folder.chmod(0o777)  # for any user of the image
-        self._clock: Clock | None = None
+        self._clock: SimClock | None = None
         self._play: str | None = None
         for name in ("ros1_node.py", "ros1_container.py"):
             shutil.copy(Path(ros.__path__[0]) / name, self.folder)
@@ -163,23 +166,25 @@ class RosSystem:
         OdometryError
             If none does in time; it names the topics to which nodes subscribe.
         """
-        begin, before = time.monotonic(), None
-        while time.monotonic() - begin < self._settings.ready:
+        begin = changed = time.monotonic()
+        before: AbstractSet[str] = set()
+        while (now := time.monotonic()) - begin < self._settings.ready:
             state = self.state()
-            subscribed = state["subscribed"]
-            # A node subscribes to one after the other.
-            if (
-                topic in subscribed
-                and subscribed == before
-                and (not connected or state["sending"].get(topic, 0))
-            ):
-                return
-            before = subscribed
+            heard = state["subscribed"].keys() - {"/clock"}
+            if heard != before:
+                before, changed = heard, now
+            elif topic in heard:
+                # A node subscribes to one after the other.
+                if not connected or state["sending"].get(topic, 0):
+                    return
+            elif heard and now - changed > _OTHERS_ONLY:
+                break
             time.sleep(_BETWEEN_LOOKS)
-        heard = ", ".join(sorted(before or ())) or "no topic"
+        others = ", ".join(sorted(before)) or "none"
         raise OdometryError(
-            f"no node subscribed to {topic} in {self._settings.ready:g} s, but to {heard}; name "
-            f"the topic of the clouds in the template, or as odometry.settings.points"
+            f"no node subscribed to the clouds' topic {topic} in {now - begin:.0f} s (topics with "
+            f"subscribers: {others}); name the topic that the system hears as "
+            f"odometry.settings.points, or change it in the template"
         )
 
     def play(self, bag: str, rate: float, renamed: Mapping[str, str]) -> None:
@@ -199,10 +204,10 @@ class RosSystem:
             raise OdometryError(f"rosbag play ended with code {code}: {words}")
         return code is not None
 
-    def run_clock(self, stamp: int, rate: float = 1.0) -> "Clock":
+    def run_clock(self, stamp: int, rate: float = 1.0) -> "SimClock":
         """Publish a clock from now on, until this is closed."""
         if self._clock is None:
-            self._clock = Clock(self.link, stamp, rate)
+            self._clock = SimClock(self.link, stamp, rate)
         return self._clock
 
     def run(self, command: list[str]) -> tuple[int, str]:
@@ -240,7 +245,7 @@ class RosSystem:
         self._folder.cleanup()
 
 
-class Clock:
+class SimClock:
     """Publishes ``/clock``, and goes on by itself, so that nodes that sleep by it wake up.
 
     Parameters

@@ -10,10 +10,11 @@ _LOOKS, _BETWEEN = 3, 1.0
 def main(label: str) -> None:
     """Wait until the other side of the standard input has ended, then remove what has the label."""
     sys.stdin.buffer.read()
-    import docker
     from docker.errors import APIError
 
-    engine = docker.from_env()
+    from docker import DockerClient
+
+    engine = DockerClient.from_env()
     for look in range(_LOOKS):
         for container in engine.api.containers(quiet=True, all=True, filters={"label": label}):
             try:
