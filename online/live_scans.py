@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from adaptune.errors import AdaptuneError
+from adaptune.ros.ros_link import LinkError, RosLink
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.pointcloud2 import PointCloud2, from_fields, read_points
 from adaptune.sequence.pose_messages import message_stamp
@@ -19,7 +20,6 @@ from adaptune.sequence.scan import Scan
 from adaptune.sequence.timing import Timing
 from adaptune.timed_selector import BACK
 from online.real_time import Arrival
-from online.ros_link import LinkError, RosLink
 
 SILENCE = 2.0
 """Seconds without a scan after which the log says so."""

@@ -19,6 +19,7 @@ from adaptune.live.untrained import UntrainedSelector
 from adaptune.model import ErrorModel
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.tracker import RegisteredScan
+from adaptune.ros.ros_link import RosLink
 from adaptune.selection import Selection
 from adaptune.selector import Selector
 from adaptune.sequence.config import ImuConfig, SequenceConfig
@@ -33,7 +34,6 @@ from online.live_scans import CLOUD, IMU, LiveScans
 from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, needed
 from online.real_time import RealTimeDrive, outlook
 from online.replay import Look, Progressed, RealTimeRecord
-from online.ros_link import RosLink
 from online.ros_messages import RosMessages, Status, Uncertainty
 from online.safety import Choice
 from online.selector_process import SelectorProcess

@@ -4,7 +4,6 @@ import logging
 import subprocess
 import threading
 from collections import deque
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,8 @@ from adaptune.odometry.base import (
     Registration,
     Usage,
 )
+from adaptune.ros.ros_link import RosLink
+from adaptune.ros.steering import Steering
 from adaptune.selection import Selection
 from adaptune.sequence.config import to_pose
 from adaptune.sequence.pose_messages import POSES
@@ -25,7 +26,6 @@ from adaptune.sequence.scan import Scan
 from adaptune.study.config import SteerConfig
 from adaptune.timed_selector import BACK
 from adaptune.trajectory import Trajectory
-from online.ros_link import RosLink
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 PATIENCE = 0.3
@@ -57,7 +57,7 @@ class SteeredNode(OdometryInstance):
     rewinds = False
 
     def __init__(self, link: RosLink, settings: SteerConfig):
-        self._link, self._settings = link, settings
+        self._settings = settings
         extrinsic = settings.extrinsic
         self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
         self._news = threading.Condition()
@@ -65,7 +65,12 @@ class SteeredNode(OdometryInstance):
         self._last_motion = LastMotion()
         self._begun: tuple[int, Poses] | None = None
         self._T_odom_node: Poses | None = None
-        self._told: set[str] = set()
+        self._steering = Steering(
+            settings.node,
+            lambda parameters: link.set_parameters(settings.node, parameters),
+            settings.command,
+            _run,
+        )
         self._silent = 0
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
@@ -114,55 +119,11 @@ class SteeredNode(OdometryInstance):
             _log.warning(what, self._settings.odometry, self._settings.node, SILENT)
 
     def apply(self, selection: Selection) -> None:
-        """Set the parameters, and make sure that the node holds them where it tells.
-
-        Raises
-        ------
-        OdometryError
-            If it cannot be reached, or holds other values.
-        LinkError
-            If it refuses them.
-        """
-        if self._settings.command is not None:
-            for name, value in selection.parameters.items():
-                self._run(name, value)
-            return
-        held = self._link.set_parameters(self._settings.node, selection.parameters)
-        self._compare(selection.parameters, held)
+        """Set the parameters, see `adaptune.ros.steering.Steering.apply`."""
+        self._steering.apply(selection.parameters)
 
     def close(self) -> None:
         return  # it runs on without adaptune
-
-    def _compare(self, wanted: Mapping[str, Any], held: Mapping[str, Any]) -> None:
-        for name, value in wanted.items():
-            if name not in held:
-                if name not in self._told:
-                    self._told.add(name)
-                    _log.warning(
-                        "%s: nobody says whether %s takes effect before the node starts again",
-                        self._settings.node,
-                        name,
-                    )
-            elif not _equal(value, held[name]):
-                raise OdometryError(f"{self._settings.node} holds {name} = {held[name]}")
-
-    def _run(self, name: str, value: Any) -> None:
-        assert self._settings.command is not None
-        values = {"{node}": self._settings.node, "{name}": name, "{value}": _text(value)}
-        command = []
-        for argument in self._settings.command:
-            for key, text in values.items():
-                argument = argument.replace(key, text)  # noqa: PLW2901
-            command.append(argument)
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, timeout=_COMMAND, check=False
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise OdometryError(f"{command[0]}: {error}") from error
-        if done.returncode:
-            words = " | ".join((done.stderr or done.stdout).split("\n")[-4:]).strip(" |")
-            raise OdometryError(f"{' '.join(command)}: exit code {done.returncode}: {words}")
 
     def _take(self, message: Any) -> None:
         for stamp, _, position, orientation in POSES[ODOMETRY](message):
@@ -195,16 +156,11 @@ class SteeredNode(OdometryInstance):
         return found
 
 
-def _equal(wanted: Any, held: Any) -> bool:
-    if isinstance(wanted, float) and isinstance(held, int | float):
-        return bool(np.isclose(wanted, held, rtol=1e-5, atol=1e-9))
-    return bool(wanted == held)
-
-
-def _text(value: Any) -> str:
-    # `1e-05` is a text to some readers of YAML, and `True` to others.
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return np.format_float_positional(value, trim="0")
-    return str(value)
+def _run(command: list[str]) -> tuple[int, str]:
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_COMMAND, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise OdometryError(f"{command[0]}: {error}") from error
+    return done.returncode, done.stderr or done.stdout

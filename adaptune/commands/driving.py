@@ -143,16 +143,16 @@ def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
+    from adaptune.ros.ros1 import local_ros1
+    from adaptune.ros.ros2 import Ros2
     from online.dashboard import Dashboard
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot_drive import RobotDrive
-    from online.ros1 import Ros1
-    from online.ros2 import Ros2
 
     mode = UNTRAINED if untrained else mode or loaded.rules[0]
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
-    link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else Ros1(), Dashboard()
+    link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1(), Dashboard()
     with closing(link), _on_one_core(loaded), progress(dashboard):
         log.info("drive, %s: Ctrl-C ends it", mode)
         driven = drive.run(link, dashboard.look)

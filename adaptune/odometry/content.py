@@ -85,9 +85,15 @@ def module_file(name: str) -> Path | None:
 
 
 def _program(settings: Any) -> Content:
-    found: Content = {}
-    program, *arguments = settings.command or ("",)
-    for name in (shutil.which(program), *arguments, getattr(settings, "template", None)):
+    if (image := getattr(settings, "image", None)) is not None:
+        from adaptune.odometry.docker.engine import image_digest
+
+        found = {f"image {image}": image_digest(image)}
+        files: tuple[str | None, ...] = ()
+    else:
+        program, *arguments = settings.command or ("",)
+        found, files = {}, (shutil.which(program), *arguments)
+    for name in (*files, getattr(settings, "template", None)):
         # Arguments may be anything, also too long for a path.
         for file in (name or "", *(name or "").split("=", 1)[1:]):
             if os.path.isfile(file):  # noqa: PTH113

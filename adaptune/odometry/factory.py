@@ -6,13 +6,11 @@ from functools import partial
 from typing import Any
 
 from adaptune.odometry.base import Description, OdometryInstance
-from adaptune.odometry.command import Command
 from adaptune.odometry.content import Content, odometry_content
 from adaptune.odometry.declaration import declare
 from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.odometry.process import Process
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, versions
 from adaptune.space import ParameterSet, ParameterSpace
@@ -120,13 +118,13 @@ class OdometryFactory:
             Run in a process of its own even if the odometry is clean, to measure its memory.
         """
         given = self.space.complete(parameters or {})
-        if self.name == "command":
+        if self.name in PROGRAMS:
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            return Command(given, self.settings, self.limits, read)
-        if self.name == "process":
-            return Process(given, self.settings, self.limits)
+            program: Any = odometry_class(self.name)
+            made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
+            return made
         if isolated or not self._clean or (is_user_class(self.name) and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
         if is_user_class(self.name):

@@ -14,7 +14,7 @@ from adaptune.odometry.base import BaseSettings, Description, OdometryError
 from adaptune.odometry.isolation import Arguments, Isolated, Limits
 from adaptune.space import ParameterSet
 
-_FIRST_ANSWER = 60.0
+FIRST_ANSWER = 60.0
 """Seconds that a program may need to begin."""
 
 
@@ -88,6 +88,17 @@ class Process(Isolated):
         """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json())
 
+    @classmethod
+    def instance(
+        cls,
+        parameters: ParameterSet,
+        settings: Any,
+        limits: Limits,
+        read: object = None,  # noqa: ARG003
+    ) -> Self:
+        """Make an instance, as all programs of the user are made; it reads no recording."""
+        return cls(parameters, settings, limits)
+
     def close(self) -> None:
         super().close()
         if self._socket is not None:
@@ -110,7 +121,7 @@ class Process(Isolated):
                 self._socket.close()
                 what = f"nothing listens at {address} ({error.strerror})"
                 raise OdometryError(f"{what}: start the program there first") from error
-        self._socket.settimeout(max(self._limits.seconds, _FIRST_ANSWER))
+        self._socket.settimeout(max(self._limits.seconds, FIRST_ANSWER))
         return wire.SocketStream(self._socket)
 
     def _begin(self, command: tuple[str, ...]) -> socket.socket:

@@ -25,6 +25,7 @@ class ProgramInput(NamedTuple):
     imu: str  # empty if there is none
     stamps: NDArray[np.int64]  # nanoseconds, of shape (n,)
     T_ref_sensor: Poses | None  # of shape (n, 4, 4), NaN where there is no reference
+    logs: Path | None = None  # folder for what a program leaves behind, one folder a parameter set
 
 
 def program_input(

@@ -8,8 +8,9 @@ from adaptune import plugins
 from adaptune.odometry.base import Odometry, OdometryError
 
 if TYPE_CHECKING:
-    from adaptune.odometry.command import Command
-    from adaptune.odometry.process import Process
+    from adaptune.odometry.docker.rustle import Rustle
+    from adaptune.odometry.isolation import Isolated
+    from adaptune.odometry.whole_run import WholeRun
 
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
@@ -32,14 +33,17 @@ ODOMETRIES = {
 
 PROGRAMS = {
     "command": "adaptune.odometry.command:Command",
+    "docker_command": "adaptune.odometry.docker.docker_command:DockerCommand",
+    "docker_process": "adaptune.odometry.docker.docker_process:DockerProcess",
     "process": "adaptune.odometry.process:Process",
+    "rustle": "adaptune.odometry.docker.rustle:Rustle",
 }
 """Programs of the user."""
 
 PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
 """Packages that our adapters run on, if the adapter's module has another name."""
 
-AnyOdometry = type[Odometry] | type["Command"] | type["Process"]
+AnyOdometry = type[Odometry] | type["Isolated"] | type["WholeRun"] | type["Rustle"]
 
 
 def is_user_class(name: str) -> bool:

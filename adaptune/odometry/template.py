@@ -3,7 +3,7 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,11 @@ class Template:
     def holds(self, name: str) -> bool:
         """Whether there is such a value; an error if there are several."""
         return self._find(name) is not None
+
+    def path_of(self, name: str) -> tuple[str, ...]:
+        """Keys of a value, from the outermost on; none if there is no such value."""
+        place = self._find(name)
+        return () if place is None else place[0]
 
     @property
     def names(self) -> list[str]:
@@ -122,7 +127,9 @@ def replace(argument: str, values: Mapping[str, Any]) -> str:
     return _PLACEHOLDER.sub(text, argument)
 
 
-def check_names(parameters: ParameterSet, template: Template | None, command: list[str]) -> None:
+def check_names(
+    parameters: ParameterSet, template: Template | None, command: Iterable[str]
+) -> None:
     """Raise an `OdometryError` if a parameter is neither in the template nor in the arguments."""
     inside = {name for argument in command for name in placeholders(argument)}
     for name in parameters:

@@ -116,6 +116,10 @@ class SocketStream:
         finally:
             self._socket.close()
 
+    def limit(self, seconds: float) -> None:
+        """Raise a `TimeoutError` where a message takes longer."""
+        self._socket.settimeout(seconds)
+
     def end(self) -> None:
         """End the conversation, for all processes that share the socket and threads that read."""
         with contextlib.suppress(OSError):

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.base import Description, NotInstalledError, OdometryError
-from adaptune.odometry.command import Command
 from adaptune.odometry.declaration import declare
 from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, where
 from adaptune.plain_words import Key
@@ -68,7 +67,7 @@ def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace |
     if len(entries) > 1:
         for key, about in described.items():
             if about.whole:
-                message = "a command runs whole recordings, and must be the only odometry"
+                message = f"{entries[key].name} runs whole recordings, and must be the only one"
                 mistakes.append(Mistake((*key, "name"), message))
     for key, about in described.items():
         if about.needs_imu:
@@ -144,8 +143,9 @@ def _check_odometry(data: dict[str, Any], at: Key, mistakes: list[Mistake], fold
         found: list[Mistake] = []
         _check_parameters(name, described.space, data.get("parameters"), found)
         mistakes += (mistake.below(at) for mistake in found)
-        if name == "command" and isinstance(tuned := data.get("parameters"), dict):
-            Command.check(declared.settings, dict.fromkeys(tuned, 0))
+        check = getattr(odometry_class(name), "check", None) if name in PROGRAMS else None
+        if check is not None and isinstance(tuned := data.get("parameters"), dict):
+            check(declared.settings, dict.fromkeys(tuned, 0))
     except NotInstalledError as error:
         mistakes.append(Mistake((*at, "name"), str(error)))
     except OdometryError as error:
@@ -228,17 +228,14 @@ def _check_switching(
     for i, given in enumerate(online.switching.sets or ()):
         if isinstance(given, dict):
             yield from _check_set((*key, "sets", i), given, space)
-    whole = any(one.whole for one in described)
+    whole, names = any(one.whole for one in described), ", ".join(config.odometries)
     if whole and "rules" in online.model_fields_set and online.rules:
-        message = "a command runs whole recordings and cannot adapt; leave this out"
+        message = f"{names} runs whole recordings and cannot adapt; leave this out"
         yield Mistake(("online", "rules"), message)
     live = len(described) == 1 and described[0].live
     if whole and online.switching.mechanism != "auto":
-        message = "a command runs whole recordings and cannot change parameters; leave this out"
+        message = f"{names} runs whole recordings and cannot change parameters; leave this out"
         yield Mistake((*key, "mechanism"), message)
     elif online.switching.mechanism == "live" and not live:
-        message = (
-            f"{', '.join(config.odometries)} cannot change parameters between scans; choose auto, "
-            f"hand_over or bank"
-        )
+        message = f"{names} cannot change parameters between scans; choose auto, hand_over or bank"
         yield Mistake((*key, "mechanism"), message)

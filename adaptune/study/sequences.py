@@ -186,5 +186,6 @@ class StudySequences:
         key = str(folder), json.dumps(about)
         if key not in _inputs:
             config = self.config(name)
-            _inputs[key] = program_input(self.open(name), config, about, folder, self.layout)
+            given = program_input(self.open(name), config, about, folder, self.layout)
+            _inputs[key] = given._replace(logs=self.folder / "logs" / name)
         return _inputs[key]

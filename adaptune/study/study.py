@@ -53,7 +53,8 @@ class Study(Generic[C_co]):
         config = self.config
         described = [(one, describe_odometry(one)) for one in config.odometries.values()]
         # A program that runs whole recordings is the only odometry.
-        layouts = [odometry_settings(one).input for one, about in described if about.whole]
+        whole = [odometry_settings(one) for one, about in described if about.whole]
+        layouts = [getattr(settings, "input", "bag") for settings in whole]
         layout: Any = layouts[0] if layouts else "bag"
         of_study = (config.sequences, config.courses, config.views, self.folder)
         needs_imu = any(about.needs_imu for _, about in described)

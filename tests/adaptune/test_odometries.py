@@ -88,7 +88,7 @@ def test_the_same_odometry_with_other_settings_or_ranges(study_of):
         (
             "\n  - gicp\n  - {name: command, parameters: {x: {type: float, low: 0, high: 1, "
             "baseline: 0}}, settings: {command: [cat, '{input}', '{output}', '{x}']}}",
-            "odometry.1.name: a command runs whole recordings, and must be the only odometry",
+            "odometry.1.name: command runs whole recordings, and must be the only one",
         ),
         (" []", "odometry: give at least one, not none"),
     ],

@@ -12,6 +12,7 @@ from commands import call
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
+from adaptune.ros.ros_link import LinkError
 from adaptune.sequence.scan import Scan
 from adaptune.study.driven import ModeError
 from adaptune.trajectory import read_tum
@@ -20,7 +21,6 @@ from online import robot_drive
 from online.modes import ReplaySetup
 from online.replay import replay
 from online.robot_drive import RobotDrive
-from online.ros_link import LinkError
 
 PATIENT = (
     "online.real_time={deadline: 5, queue: 0}",

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from adaptune.odometry.base import OdometryError
+from adaptune.ros.ros_link import LinkError
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 from adaptune.study.config import SteerConfig
 from online import steered_node
-from online.ros_link import LinkError
 from online.steered_node import SteeredNode
 
 TENTH = 10**8

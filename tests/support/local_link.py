@@ -7,8 +7,8 @@ import drives
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from adaptune.ros.ros_link import LinkError
 from online.live_scans import CLOUD, IMU
-from online.ros_link import LinkError
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 STORE.register(
@@ -18,7 +18,7 @@ TYPES = STORE.types
 
 
 class LocalLink:
-    """Stands for `online.ros1.Ros1`; `holds` are the parameters of its only node, ``/node``.
+    """Stands for `adaptune.ros.ros1.Ros1`; `holds` are the parameters of its only node, ``/node``.
 
     What is `played`, topics and messages, begins when somebody subscribes to ``/points``.
     """

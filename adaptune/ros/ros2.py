@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from adaptune.odometry.base import NotInstalledError, import_extra
+from adaptune.ros.ros_link import LinkError
 from adaptune.sequence import livox
-from online.ros_link import LinkError
 
 PORT = 7447
 """On which a Zenoh router listens."""

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from needs import needs_ros1
 
+from adaptune.keeper import descendants
+from adaptune.ros.ros1 import local_ros1, ros_python
+from adaptune.ros.ros_link import LinkError
 from adaptune.trajectory import read_tum
-from online.ros1 import Ros1, ros_python
-from online.ros_link import LinkError
 
 ROBOT = Path(drives.__file__).with_name("ros1_robot.py")
 """Only the Python of ROS can import it."""
@@ -50,7 +51,7 @@ def link(master):
     while True:
         assert master.poll() is None
         try:
-            made = Ros1()
+            made = local_ros1()
             break
         except LinkError:
             assert time.monotonic() < end
@@ -104,7 +105,7 @@ def test_messages_arrive_whole(link):
 def test_messages_of_another_type_are_ignored_and_named(link, caplog):
     imu = local_link.imu(0)
     connected(link, "/imu", "sensor_msgs/msg/Imu", imu)
-    other = Ros1()
+    other = local_ros1()
     messages, publish = taken(other, "/imu", "sensor_msgs/msg/PointCloud2"), link.advertise
     publish = publish("/imu", "sensor_msgs/msg/Imu")
     until(lambda: publish(imu) or "/imu is sensor_msgs/Imu, not" in caplog.text)
@@ -130,14 +131,16 @@ def test_a_node_that_is_not_there_is_named(link):
 def test_without_a_roscore_it_says_so(monkeypatch):
     monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9")
     with pytest.raises(LinkError, match=r"no roscore answers at .*127\.0\.0\.1:9; start `roscore`"):
-        Ros1()
+        local_ros1()
 
 
 def test_a_node_that_is_killed_is_noticed(link):
-    other = Ros1()
+    before = descendants(os.getpid())
+    other = local_ros1()
     assert other.alive
     publish = other.advertise("/lost", "std_msgs/msg/String")
-    other._process.kill()
+    (process,) = set(descendants(os.getpid())) - set(before)
+    os.kill(process, signal.SIGKILL)
     until(lambda: not other.alive)
     with pytest.raises(LinkError, match="adaptune's node has ended"):
         publish(local_link.TYPES["std_msgs/msg/String"]("lost"))
@@ -149,7 +152,7 @@ def test_a_node_that_is_killed_is_noticed(link):
 
 def test_a_python_without_rospy_is_named():
     with pytest.raises(LinkError, match="cannot import ROS"):
-        Ros1(sys.executable)
+        local_ros1(sys.executable)
 
 
 @pytest.mark.parametrize("steers", [False, True])

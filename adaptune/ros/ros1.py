@@ -8,7 +8,7 @@ import shutil
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.errors import in_a_line
 from adaptune.odometry import wire
-from online import ros1_node
-from online.ros_link import LinkError
+from adaptune.ros import ros1_node
+from adaptune.ros.ros_link import LinkError
 
 _START = 20.0
 """Seconds in which the node must be ready."""
@@ -49,11 +49,8 @@ def ros_python() -> str:
     )
 
 
-class Ros1:
-    """A node in a running ROS 1, see `online.ros_link.RosLink`.
-
-    A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
-    through it as bytes.
+def local_ros1(python: str | None = None) -> "Ros1":
+    """A node in the ROS 1 that runs on this machine, or that ROS_MASTER_URI names.
 
     Parameters
     ----------
@@ -65,29 +62,68 @@ class Ros1:
     LinkError
         If ROS cannot be imported, or no roscore answers.
     """
+    here, there = socket.socketpair()
+    command = [python or ros_python(), ros1_node.__file__, str(there.fileno())]
+    # A session of its own: Ctrl-C ends adaptune, and that ends the node.
+    process = subprocess.Popen(
+        command, pass_fds=[there.fileno()], stdout=subprocess.DEVNULL, start_new_session=True
+    )
+    there.close()
 
-    def __init__(self, python: str | None = None):
+    def end() -> None:
+        try:
+            # It takes leave of the roscore.
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    try:
+        return Ros1(here, lambda: process.poll() is None, end)
+    except LinkError as error:
+        raise LinkError(f"{error}; start `roscore`, and source your ROS's setup") from error
+
+
+class Ros1:
+    """A node in a running ROS 1, see `adaptune.ros.ros_link.RosLink`.
+
+    A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
+    through it as bytes.
+
+    Parameters
+    ----------
+    connection
+        Socket to the node.
+    running
+        Whether the node's process runs.
+    end
+        Waits for the process, or ends it.
+
+    Raises
+    ------
+    LinkError
+        If the node does not start, with its reason.
+    """
+
+    def __init__(
+        self, connection: socket.socket, running: Callable[[], bool], end: Callable[[], None]
+    ):
         self.store = get_typestore(Stores.ROS1_NOETIC)
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        here, there = socket.socketpair()
-        command = [python or ros_python(), ros1_node.__file__, str(there.fileno())]
-        # A session of its own: Ctrl-C ends adaptune, and that ends the node.
-        self._process = subprocess.Popen(
-            command, pass_fds=[there.fileno()], stdout=subprocess.DEVNULL, start_new_session=True
-        )
-        there.close()
-        self._stream = wire.SocketStream(here)
+        self._running, self._end = running, end
+        self._stream = wire.SocketStream(connection)
         self._sending = threading.Lock()
         self._numbers = itertools.count()
         self._answers: dict[int, SimpleQueue[dict[str, Any]]] = {}
         self._takes: dict[str, tuple[str, SimpleQueue[bytes | None]]] = {}
+        self._recorded: dict[str, Callable[[str, bytes], None]] = {}
         self._mistaken: set[str] = set()
         ready = wire.receive(self._stream) if self._stream.ready(_START) else None
         if ready is None or ready.header["type"] == "failed":
             self.close()
             what = "its node did not start" if ready is None else ready.header["message"]
-            raise LinkError(f"ROS 1: {what}; start `roscore`, and source your ROS's setup")
+            raise LinkError(f"ROS 1: {what}")
         threading.Thread(target=self._receive, daemon=True).start()
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
@@ -105,6 +141,11 @@ class Ros1:
         threading.Thread(target=work, daemon=True).start()
         self._send({"type": "subscribe", "topic": topic})
 
+    def record(self, topic: str, take: Callable[[str, bytes], None]) -> None:
+        """Have every message of a topic taken as it comes, as its type and its bytes."""
+        self._recorded[topic] = take
+        self._send({"type": "subscribe", "topic": topic})
+
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
         """See `RosLink.advertise`."""
         text, md5 = self.store.generate_msgdef(kind, ros_version=1)
@@ -117,30 +158,51 @@ class Ros1:
 
         return publish
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """See `RosLink.set_parameters`.
+    def set_parameters(
+        self,
+        node: str,
+        values: Mapping[str, Any],
+        keys: Mapping[str, Sequence[str]] | None = None,
+    ) -> Mapping[str, Any]:
+        """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
 
         They are set by dynamic_reconfigure where the node has it. The others are set at the
         parameter server: nobody tells what the node makes of them, so they are not returned.
         """
-        answer = self._ask({"type": "set_parameters", "node": node, "values": dict(values)})
-        if "refused" in answer:
-            raise LinkError(f"{node}: {answer['refused']}")
-        held: dict[str, Any] = answer["found"]
+        asked = {"node": node, "values": dict(values), "keys": dict(keys or {})}
+        try:
+            held: dict[str, Any] = self.ask("set_parameters", **asked)
+        except LinkError as error:
+            raise LinkError(f"{node}: {error}") from error
         return held
 
     def topics(self) -> Mapping[str, str]:
         """See `RosLink.topics`."""
-        answer = self._ask({"type": "topics"})
-        if "refused" in answer:
-            raise LinkError(f"ROS 1: the roscore does not answer ({answer['refused']})")
-        found: dict[str, str] = answer["found"]
+        try:
+            found: dict[str, str] = self.ask("topics")
+        except LinkError as error:
+            raise LinkError(f"ROS 1: the roscore does not answer ({error})") from error
         return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
+
+    def ask(self, kind: str, **given: Any) -> Any:
+        """What the node answers, see `adaptune.ros.ros1_node`; a `LinkError` if it refuses."""
+        number = next(self._numbers)
+        waiting = self._answers[number] = SimpleQueue()
+        try:
+            self._send({**given, "type": kind, "number": number})
+            answer = waiting.get(timeout=_ANSWER)
+        except Empty as error:
+            raise LinkError(f"no answer in {_ANSWER:g} s") from error
+        finally:
+            del self._answers[number]
+        if "refused" in answer:
+            raise LinkError(str(answer["refused"]))
+        return answer["found"]
 
     @property
     def alive(self) -> bool:
         """See `RosLink.alive`."""
-        return self._process.poll() is None
+        return self._running()
 
     def close(self) -> None:
         """See `RosLink.close`."""
@@ -150,12 +212,7 @@ class Ros1:
         self._stream.end()
         with contextlib.suppress(OSError):
             self._stream.close()
-        try:
-            # It takes leave of the roscore.
-            self._process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._end()
 
     def _send(self, header: dict[str, Any], data: Any = None) -> None:
         try:
@@ -163,17 +220,6 @@ class Ros1:
                 wire.send(self._stream, header, data=data)
         except (OSError, ValueError) as error:
             raise LinkError("ROS 1: adaptune's node has ended") from error
-
-    def _ask(self, header: dict[str, Any]) -> dict[str, Any]:
-        number = next(self._numbers)
-        answer = self._answers[number] = SimpleQueue()
-        try:
-            self._send({**header, "number": number})
-            return answer.get(timeout=_ANSWER)
-        except Empty as error:
-            raise LinkError(f"ROS 1: no answer in {_ANSWER:g} s") from error
-        finally:
-            del self._answers[number]
 
     def _receive(self) -> None:
         """Pass on what the node sends, until it ends."""
@@ -183,6 +229,10 @@ class Ros1:
                 if header["type"] == "answer":
                     if (waiting := self._answers.get(header["number"])) is not None:
                         waiting.put(header)
+                    continue
+                if (take := self._recorded.get(header["topic"])) is not None:
+                    data = message.arrays["data"].tobytes()
+                    take(header["kind"].replace("/", "/msg/"), data)
                     continue
                 kind, received = self._takes[header["topic"]]
                 if header["kind"].replace("/", "/msg/") == kind:

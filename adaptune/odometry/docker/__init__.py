@@ -1,0 +1,1 @@
+"""Odometries in Docker images."""

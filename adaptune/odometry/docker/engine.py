@@ -1,0 +1,340 @@
+"""The Docker engine: images, and containers that can reach nothing and leave nothing behind."""
+
+import contextlib
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import Field
+
+from adaptune.keeper import Ended
+from adaptune.odometry.base import BaseSettings, OdometryError
+from adaptune.odometry.docker import undertaker
+
+_OWNER = "adaptune.owner"
+"""Label of every container: the process that has started it."""
+_NOBODY = 65534
+_TAIL, _LINES = 50, 5
+
+_log = logging.getLogger(__name__)
+
+
+class ContainerSettings(BaseSettings):
+    """An image, and what its containers may use besides `isolation.memory`.
+
+    Attributes
+    ----------
+    image : str
+        Name of the image.
+    cpus : float
+        Cores.
+    pids : int
+        Processes and threads.
+    user : str, optional
+        User in the container, a name or a number, as in ``docker run --user``. By default not root
+        where the image allows it.
+    """
+
+    image: str = Field(min_length=1)
+    cpus: float = Field(1.0, ge=0.01, le=4096)
+    pids: int = Field(1024, ge=16, le=10**6)
+    user: str | None = None
+
+
+class EngineError(OdometryError):
+    """A Docker engine that does not do what it is asked."""
+
+
+class Mount(NamedTuple):
+    """A file or folder of the host in a container."""
+
+    source: Path
+    target: str
+    writable: bool = False
+
+
+@cache
+def engine() -> Any:
+    """A client of the Docker engine; containers that ended processes have left are removed.
+
+    Raises
+    ------
+    EngineError
+        If no engine answers, or this user may not use it.
+    """
+    import docker
+    from docker.errors import DockerException
+
+    try:
+        client = docker.from_env()
+        client.ping()
+    except (DockerException, OSError) as error:
+        where = os.environ.get("DOCKER_HOST", "unix:///var/run/docker.sock")
+        if "Permission" in str(error):
+            help_ = "add yourself to its group, `sudo usermod -aG docker $USER`, and log in again"
+            raise EngineError(
+                f"this user may not use the Docker engine at {where}: {help_}"
+            ) from error
+        help_ = "install Docker Engine, or start it: `sudo service docker start`"
+        raise EngineError(f"no Docker engine answers at {where}: {help_}") from error
+    _remove_leftovers(client)
+    return client
+
+
+def _identity(pid: int) -> str | None:
+    """What names a process for good; None if there is none."""
+    try:
+        started = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except OSError:
+        return None
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    # Processes of another container have other numbers.
+    space = os.stat("/proc/self/ns/pid").st_ino  # noqa: PTH116
+    return f"{boot}.{space}.{pid}.{started}"
+
+
+def _remove_leftovers(client: Any) -> None:
+    """Remove containers whose process has ended."""
+    here = str(_identity(os.getpid())).rsplit(".", 2)[0]
+    for container in client.api.containers(all=True, filters={"label": _OWNER}):
+        owner = container["Labels"][_OWNER]
+        boot_and_space, pid, _ = owner.rsplit(".", 2)
+        another_boot = boot_and_space.split(".")[0] != here.split(".")[0]
+        ours = boot_and_space == here
+        if another_boot or (ours and _identity(int(pid)) != owner):
+            _log.info("removing container %s of an earlier run", container["Id"][:12])
+            _remove(client, container["Id"])
+
+
+def _remove(client: Any, container: str) -> None:
+    from docker.errors import APIError
+
+    # One that is gone, or on its way, is as good as removed.
+    with contextlib.suppress(APIError):
+        client.api.remove_container(container, v=True, force=True)
+
+
+@cache
+def _owner() -> tuple[str, Any]:
+    """Label of this process's containers, and who removes them if it is killed."""
+    owner = str(_identity(os.getpid()))
+    process = subprocess.Popen(
+        [sys.executable, undertaker.__file__, f"{_OWNER}={owner}"],
+        stdin=subprocess.PIPE,  # which closes with this process
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    return owner, process
+
+
+def image_digest(name: str) -> str:
+    """Digest of an image.
+
+    Raises
+    ------
+    EngineError
+        If it is not here, or no engine is.
+    """
+    return str(_image(name)["Id"])
+
+
+def _image(name: str) -> Any:
+    from docker.errors import APIError, ImageNotFound
+
+    try:
+        return engine().api.inspect_image(name)
+    except ImageNotFound as error:
+        help_ = f"`docker pull {name}`, or `docker build` it"
+        raise EngineError(f"there is no image {name!r} on this machine: {help_}") from error
+    except APIError as error:
+        raise EngineError(f"image {name!r}: {error.explanation or error}") from error
+
+
+def default_user(settings: ContainerSettings) -> str:
+    """User in a container: the study's, or the image's own if not root, or nobody special."""
+    if settings.user is not None:
+        return settings.user
+    own = str(_image(settings.image)["Config"].get("User") or "")
+    if own.partition(":")[0] not in ("", "0", "root"):
+        return own
+    me, group = os.getuid(), os.getgid()
+    return f"{me}:{group}" if me else f"{_NOBODY}:{_NOBODY}"
+
+
+class Container:
+    """A running container.
+
+    It has no network, no privileges and no new ones, and sees nothing of the host but its mounts.
+
+    Parameters
+    ----------
+    settings
+        The image, and what it may use.
+    memory
+        Gigabytes.
+    command
+        Program and arguments; those of the image if empty.
+    mounts
+        Files and folders of the host.
+    user
+        See `ContainerSettings`.
+    environment
+        Variables.
+    bare
+        Whether the command takes the place of the image's entry point, too.
+
+    Raises
+    ------
+    EngineError
+        If it cannot be started.
+    """
+
+    def __init__(
+        self,
+        settings: ContainerSettings,
+        memory: float,
+        command: Sequence[str] = (),
+        mounts: Sequence[Mount] = (),
+        *,
+        user: str,
+        environment: Mapping[str, str] | None = None,
+        bare: bool = False,
+    ):
+        from docker.errors import APIError
+        from docker.types import Mount as Bind
+        from docker.types import Ulimit
+
+        self.image = settings.image
+        digest, client = image_digest(settings.image), engine()
+        binds = [
+            Bind(m.target, str(m.source.resolve()), type="bind", read_only=not m.writable)
+            for m in mounts
+        ]
+        limit = int(memory * 1e9)
+        host = client.api.create_host_config(
+            mounts=binds,
+            network_mode="none",
+            mem_limit=limit,
+            memswap_limit=limit,
+            nano_cpus=int(settings.cpus * 1e9),
+            pids_limit=settings.pids,
+            cap_drop=["ALL"],
+            security_opt=["no-new-privileges"],
+            init=True,
+            ulimits=[Ulimit(name="core", soft=0, hard=0)],
+        )
+        try:
+            made = client.api.create_container(
+                digest,
+                list(command) or None,
+                user=user,
+                environment=dict(environment or {}),
+                labels={_OWNER: _owner()[0]},
+                host_config=host,
+                entrypoint=[] if bare else None,
+            )
+            self.id = made["Id"]
+            client.api.start(self.id)
+        except APIError as error:
+            self.close()
+            raise EngineError(f"image {settings.image!r}: {error.explanation or error}") from error
+
+    id: str | None = None
+    out_of_memory = False
+
+    def ended(self) -> int | None:
+        """Exit code, or minus the signal's number; None while it runs."""
+        from docker.errors import APIError
+
+        try:
+            state = engine().api.inspect_container(self.id)["State"]
+        except APIError:
+            return -9
+        if state["Running"]:
+            return None
+        self.out_of_memory = bool(state["OOMKilled"])
+        code = int(state["ExitCode"])
+        return 128 - code if code > 128 else code
+
+    def used(self) -> Ended:
+        """CPU seconds and megabytes now; zero where it has ended."""
+        from docker.errors import APIError
+
+        try:
+            stats = engine().api.stats(self.id, stream=False, one_shot=True)
+        except APIError:
+            return Ended(0, 0.0, 0.0)
+        memory = stats.get("memory_stats", {})
+        # Files that were read may be forgotten at any time.
+        cached = memory.get("stats", {})
+        files = cached.get("total_inactive_file", cached.get("inactive_file", 0))
+        held = memory.get("usage", 0) - files
+        cpu = stats.get("cpu_stats", {}).get("cpu_usage", {}).get("total_usage", 0)
+        return Ended(0, 1e-9 * cpu, 1e-6 * held)
+
+    def run(self, command: str, environment: Mapping[str, str] | None = None) -> str:
+        """Begin a command in a login shell; a name for `finished`."""
+        return self._exec(["/bin/bash", "-l", "-c", command], environment, detach=True)[0]
+
+    def call(self, command: Sequence[str]) -> tuple[int, str]:
+        """Run a command; its exit code and what it wrote."""
+        name, output = self._exec(command, None, detach=False)
+        return int(engine().api.exec_inspect(name)["ExitCode"] or 0), output.decode(
+            errors="replace"
+        )
+
+    def _exec(
+        self, command: Sequence[str], environment: Mapping[str, str] | None, detach: bool
+    ) -> tuple[str, bytes]:
+        from docker.errors import APIError
+
+        try:
+            made = engine().api.exec_create(
+                self.id, list(command), environment=dict(environment or {})
+            )
+            output = engine().api.exec_start(made["Id"], detach=detach)
+        except APIError as error:
+            raise EngineError(f"image {self.image!r}: {error.explanation or error}") from error
+        return made["Id"], b"" if detach else output
+
+    def finished(self, name: str) -> int | None:
+        """Exit code of a command that `run` began; None while it runs."""
+        from docker.errors import APIError
+
+        try:
+            state = engine().api.exec_inspect(name)
+        except APIError:
+            return -9  # with its container
+        return None if state["Running"] else int(state["ExitCode"] or 0)
+
+    def last_lines(self) -> str:
+        """The last lines that it wrote."""
+        from docker.errors import APIError
+
+        try:
+            text = engine().api.logs(self.id, tail=_TAIL).decode(errors="replace")
+        except APIError:
+            return ""
+        return " | ".join(text.strip().splitlines()[-_LINES:])
+
+    def log(self) -> bytes:
+        """All that it wrote."""
+        from docker.errors import APIError
+
+        try:
+            written: bytes = engine().api.logs(self.id)
+        except APIError:
+            return b""
+        return written
+
+    def close(self) -> None:
+        """End and remove it, with its volumes."""
+        if self.id is not None:
+            _remove(engine(), self.id)
+            self.id = None

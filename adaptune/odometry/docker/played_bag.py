@@ -1,0 +1,319 @@
+"""A ROS 1 system in a container, on a bag that is played."""
+
+import hashlib
+import json
+import logging
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer
+from rosbags.typesys.store import Typestore
+
+from adaptune import yaml
+from adaptune.files import replacing_folder
+from adaptune.odometry.base import OdometryError
+from adaptune.odometry.docker.engine import Mount, image_digest
+from adaptune.odometry.docker.ros_container import RosSystem
+from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread
+from adaptune.odometry.program_input import ProgramInput
+from adaptune.odometry.whole_run import WholeRun
+from adaptune.ros.ros1 import Ros1
+from adaptune.sequence.pose_messages import PATH, POSES, usable
+from adaptune.trajectory import Trajectory
+
+_BETWEEN_LOOKS = 0.1
+_BETWEEN_STATES = 1.0
+_LONGEST_PAUSE = 10.0
+"""Seconds."""
+_STEADY = 0.9
+"""Least share of poses whose stamps are as far from the scans' as those of the others."""
+
+_log = logging.getLogger(__name__)
+
+
+class _Times(NamedTuple):
+    """Seconds that parts of a trial took."""
+
+    container: float
+    ready: float
+    bag: float
+    drained: float
+    removed: float = 0.0
+
+
+class PoseRecorder:
+    """Records what a system publishes on the topic of its poses."""
+
+    def __init__(self, link: Ros1, topic: str):
+        self.topic, self.store = topic, link.store
+        self.received: list[tuple[str, bytes]] = []
+        self.last = self._begin = time.monotonic()
+        self.longest_pause = 0.0
+        link.record(topic, self._take)
+
+    def _take(self, kind: str, data: bytes) -> None:
+        now = time.monotonic()
+        if self.received:
+            self.longest_pause = max(self.longest_pause, now - self.last)
+        self.last = now
+        self.received.append((kind, data))
+
+    def poses(self) -> list[Any]:
+        """Poses in the order in which they came, see `adaptune.sequence.pose_messages`.
+
+        Raises
+        ------
+        OdometryError
+            If the messages hold no poses.
+        """
+        messages = self.received
+        if messages and (kind := messages[0][0]) not in POSES:
+            raise OdometryError(
+                f"{self.topic} is {kind}; odometry.settings.odometry must name poses"
+            )
+        if messages and messages[0][0] == PATH:
+            messages = messages[-1:]
+        return [
+            pose
+            for kind, data in messages
+            for pose in POSES[kind](self.store.deserialize_ros1(data, kind))
+        ]
+
+    def write(self, path: Path) -> None:
+        """Write a ROS 1 bag."""
+        write_poses(path, self.topic, self.received, self.store)
+
+
+def write_poses(
+    path: Path, topic: str, messages: list[tuple[str, bytes]], store: Typestore
+) -> None:
+    """Write messages of one type to a ROS 1 bag, at their poses' stamps."""
+    with Writer(path) as bag:
+        connection = None
+        for kind, data in messages:
+            if connection is None:
+                connection = bag.add_connection(topic, kind, typestore=store)
+            stamps = [stamp for stamp, *_ in POSES[kind](store.deserialize_ros1(data, kind))]
+            bag.write(connection, max(stamps, default=0), data)
+
+
+class PlayedBag(WholeRun):
+    """A ROS 1 system that hears a bag, from its beginning to its end."""
+
+    _words = ""
+
+    @property
+    def called(self) -> str:
+        return str(self.settings.image)
+
+    def words(self, folder: Path) -> str:  # noqa: ARG002
+        return self._words
+
+    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:  # noqa: ARG002
+        begin = time.monotonic()
+        template, text = filled(self.settings, self.parameters)
+        source = given.path.resolve()
+        # As RUSTLE mounts the folder of a data set.
+        inside = f"/rustle/dataset/{source.name}"
+        system = RosSystem(self.settings, self._limits.memory, text, [Mount(source, inside)])
+        recorder = None
+        with closing(system):
+            try:
+                times = time.monotonic() - begin
+                recorder = PoseRecorder(system.link, self.settings.odometry)
+                renamed = self._renamed(given)
+                system.wait(renamed.get(given.points, given.points))
+                keys = server_keys(template, self.parameters, system.link.ask("parameters"))
+                ready = time.monotonic() - begin - times
+                end = begin + self._limits.seconds * len(given.stamps)
+                played, drained = self._play(system, recorder, given, inside, end)
+                warn_of_unread(system.link, self.called, keys)
+                self._check_published(system, recorder)
+            finally:
+                self._finish(system, recorder, given)
+        took = _Times(times, ready, played, drained)
+        removed = time.monotonic() - begin - sum(took)
+        self._note(given, took._replace(removed=removed))
+        return self._checked(recorder, given)
+
+    def _renamed(self, given: ProgramInput) -> dict[str, str]:
+        """Topics of the recording that the system expects by another name."""
+        pairs = ((given.points, self.settings.points), (given.imu, self.settings.imu))
+        return {old: new for old, new in pairs if old and new and old != new}
+
+    def _play(
+        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str, end: float
+    ) -> tuple[float, float]:
+        """Play the bag and wait until nothing comes any more; seconds that each took."""
+        begin = looked = time.monotonic()
+        system.play(bag, self.settings.rate, self._renamed(given))
+        while not system.played():
+            time.sleep(_BETWEEN_LOOKS)
+            if time.monotonic() - looked > _BETWEEN_STATES:
+                looked = time.monotonic()
+                self._usage = system.used()
+                system.state()
+            self._check_time(end)
+        over = time.monotonic()
+        # Nodes that sleep by the clock must wake up to finish.
+        system.run_clock(_end_of(given.path), self.settings.rate)
+        while not self._drained(recorder, over, int(given.stamps[-1])):
+            time.sleep(_BETWEEN_LOOKS)
+            self._check_time(end)
+        system.state()
+        self._usage = system.used()
+        return over - begin, time.monotonic() - over
+
+    def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
+        """Whether the pose of the last scan is there, or nothing came for a while."""
+        newest: int = max((stamp for stamp, *_ in _last_pose(recorder)), default=0)
+        # Stamps of a clock of its own say nothing.
+        if last <= newest < last + 1_000_000_000:
+            return True
+        pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
+        return time.monotonic() - max(recorder.last, over) > pause
+
+    def _check_time(self, end: float) -> None:
+        if time.monotonic() > end:
+            limit = f"isolation.seconds = {self._limits.seconds:g}"
+            raise OdometryError(f"it took longer than {limit} for each scan")
+
+    def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
+        if not recorder.received:
+            topics = ", ".join(sorted(set(system.link.topics()) - {"/clock", "/rosout"}))
+            what = (
+                f"nothing was published on {self.settings.odometry}, but on {topics or 'nothing'}"
+            )
+            raise OdometryError(f"{what}; name its topic as odometry.settings.odometry")
+
+    def _finish(
+        self, system: RosSystem, recorder: PoseRecorder | None, given: ProgramInput
+    ) -> None:
+        """Keep what is left of the run."""
+        self._words = system.words()
+        self._kept = None
+        if given.logs is None:
+            return
+        whole = json.dumps([self.settings.model_dump(mode="json"), self.parameters], sort_keys=True)
+        name = hashlib.blake2b(whole.encode(), digest_size=4).hexdigest()
+        self._kept = given.logs / name
+        with replacing_folder(self._kept) as temporary:
+            temporary.mkdir()
+            system.keep(temporary)
+            if recorder is not None and recorder.received and recorder.received[0][0] in POSES:
+                recorder.write(temporary / "odometry.bag")
+
+    def _note(self, given: ProgramInput, took: _Times) -> None:
+        seconds = {name: round(value, 2) for name, value in took._asdict().items()}
+        fixed = sum(took) - took.bag
+        _log.info(
+            "%s: bag %.1f s, and %.1f s besides (container %.1f, ready %.1f, drained %.1f, "
+            "removed %.1f); %.0f %% of a core, %.0f MB",
+            *(self.called, took.bag, fixed),
+            *(took.container, took.ready, took.drained, took.removed),
+            *(100.0 * self._usage.cpu / max(took.bag, 1e-9), self._usage.memory or 0.0),
+        )
+        if self._kept is not None:
+            note = {
+                "image": self.called,
+                "digest": image_digest(self.called),
+                "parameters": self.parameters,
+                "rate": self.settings.rate,
+                "cpus": self.settings.cpus,
+                "memory": self._limits.memory,
+                "seconds": seconds,
+                "cpu": round(self._usage.cpu, 3),
+                "peak_memory": round(self._usage.memory or 0.0, 1),
+                "input": str(given.path),
+            }
+            (self._kept / "trial.yaml").write_text(yaml.dump(note), encoding="utf-8")
+
+    def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
+        """The trajectory, if its stamps are those of the data."""
+        poses = recorder.poses()
+        stamps = np.array([stamp for stamp, *_ in poses], np.int64)
+        if backwards := int((np.diff(stamps) < 0).sum()):
+            what = f"{backwards} of {len(stamps)} poses have stamps that go back"
+            raise OdometryError(f"{what}: {_OWN_CLOCK}")
+        check_stamps(stamps, given.stamps)
+        trajectory, unusable = usable(poses)
+        if trajectory is None or unusable:
+            raise OdometryError(
+                f"{unusable} of {len(poses)} poses are no poses (NaN, or no rotation)"
+            )
+        n, half = len(given.stamps), 0.5 * float(np.median(np.diff(given.stamps)))
+        near = np.searchsorted(stamps, given.stamps - half) < np.searchsorted(
+            stamps, given.stamps + 2.0 * half
+        )
+        # Systems need a few scans to begin.
+        missing = int((~near[np.argmax(near) :]).sum())
+        if missing > 0.01 * n:
+            _log.warning(
+                "%s: %d of %d scans have no pose at rate %g: it drops scans, so a lower "
+                "odometry.settings.rate gives other results",
+                *(self.called, missing, n, self.settings.rate),
+            )
+        return trajectory
+
+
+_OWN_CLOCK = (
+    "the system stamps poses by its own clock, not by the scans; set "
+    "odometry.settings.use_sim_time, or lower the rate, or mend the system"
+)
+
+
+def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
+    """Refuse stamps of poses that are not those of the scans.
+
+    Each pose of a system that publishes one for a scan has the stamp of the scan's start, or of its
+    end, or anything fixed between. Those that publish more often are judged by begin and end only.
+
+    Parameters
+    ----------
+    stamps, scans
+        Nanoseconds, of shapes (m,) and (n,), in order.
+
+    Raises
+    ------
+    OdometryError
+        It says how far the stamps are off.
+    """
+    if not len(stamps):
+        return
+    period = float(np.median(np.diff(scans)))
+    late = stamps[-1] - scans[-1]
+    if late > 1e9 + period or scans[0] - stamps[0] > 1e9 + period:
+        begin, end = (1e-9 * stamps[[0, -1]]).tolist()
+        raise OdometryError(
+            f"its poses are of {begin:.3f} s to {end:.3f} s, the scans of "
+            f"{1e-9 * scans[0]:.3f} s to {1e-9 * scans[-1]:.3f} s: {_OWN_CLOCK}"
+        )
+    if len(stamps) > 1.5 * len(scans):
+        return
+    i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
+    off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
+    steady = np.abs(off - np.median(off)) < max(5e6, 0.1 * period)
+    if steady.mean() < _STEADY:
+        far = 1e-9 * float(np.percentile(off, 95))
+        raise OdometryError(
+            f"its stamps are not those of the scans, but up to {far:.3f} s off: {_OWN_CLOCK}"
+        )
+
+
+def _last_pose(recorder: PoseRecorder) -> list[Any]:
+    if not recorder.received:
+        return []
+    kind, data = recorder.received[-1]
+    if kind not in POSES:
+        return []
+    return POSES[kind](recorder.store.deserialize_ros1(data, kind))[-1:]
+
+
+def _end_of(bag: Path) -> int:
+    with AnyReader([bag]) as reader:
+        return int(reader.end_time)

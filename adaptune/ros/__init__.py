@@ -1,0 +1,1 @@
+"""Connections to ROS 1 and ROS 2."""
