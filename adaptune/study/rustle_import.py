@@ -135,6 +135,7 @@ class _Library:
             raise file.error((*key, "parameters"), str(error)) from error
         settings = {"image": given.image_name, "template": str(template.path)}
         settings |= {"odometry": given.odom_topics[0]}
+        settings |= {kind: topic for kind in _TOPICS if (topic := _topic(template, kind))}
         notes = []
         if len(given.odom_topics) > 1:
             others = ", ".join(given.odom_topics[1:])
@@ -159,9 +160,9 @@ class _Library:
             notes.append(f"The bags of {folder} are taken for one recording, as RUSTLE plays them.")
         bag = bags[0] if len(bags) == 1 else folder
         data: dict[str, Any] = {"bag": str(bag.resolve())}
-        topics = {kind: _topic(system.template, kind) for kind in _TOPICS}
-        data |= {"points": topics["points"]} if topics["points"] else {}
-        data |= {"imu": {"topic": topics["imu"]}} if topics["imu"] else {}
+        topics = system.settings
+        data |= {"points": topics["points"]} if "points" in topics else {}
+        data |= {"imu": {"topic": topics["imu"]}} if "imu" in topics else {}
         if given.ground_truth_topic is not None:
             data["reference"] = given.ground_truth_topic
         else:
@@ -320,10 +321,10 @@ def _of_tuning(file: RustleFile, library: _Library) -> ImportedStudy:
         part["stop"] = float(of.start + of.duration)
     notes = [*_ignored(file, unknown_keys(tuning)), *library.unknown()]
     notes += [*system.notes, *sequence.notes]
-    if part:
+    if part and "points" not in system.settings:
         notes.append(
-            "Only a part of the recording is played. adaptune writes it to a bag of its own, with "
-            "the topics /points and /imu: the parameter file must read these."
+            "Only a part of the recording is played, from a bag that adaptune writes: "
+            "give odometry.settings points, and imu, the topics that the system reads."
         )
     parameters, offline = search_of(file, tuning, system.template, notes)
     weights = {k: float(w) for k, w in tuning.metric_weights if w and k in ("ape", "rpe")}
