@@ -7,6 +7,7 @@ Programs run under a keeper. Both end with this process, and so does all that th
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -29,6 +30,9 @@ IMPORT_SECONDS = 60.0
 
 _TAIL, _LINES = 1 << 14, 5
 """Messages quote the last lines, out of the last bytes, that a program wrote."""
+
+_CONTROL = re.compile(r"\x1b\[[0-9;]*[A-Za-z]|\x1b\][^\x07]*\x07?|[\x00-\x08\x0b-\x1f]")
+"""What colours a terminal, or sets its title."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment of programs that must not start threads of their own."""
@@ -53,8 +57,13 @@ def last_lines(output: BinaryIO) -> str:
     """The last lines that a process wrote to a file."""
     size = output.seek(0, os.SEEK_END)
     output.seek(max(size - _TAIL, 0))
-    lines = output.read().decode(errors="replace").strip().splitlines()
-    return " | ".join(lines[-_LINES:])
+    return plain_lines(output.read())
+
+
+def plain_lines(written: bytes) -> str:
+    """The last lines of what a process wrote, without colours and empty ones."""
+    lines = _CONTROL.sub("", written.decode(errors="replace")).splitlines()
+    return " | ".join([line.strip() for line in lines if line.strip()][-_LINES:])
 
 
 def quoting(what: str, output: BinaryIO) -> str:

@@ -5,6 +5,7 @@ Run by the Python of the image's ROS, as `ros1_node`, which is beside it. Ends w
 
 import socket
 import sys
+import uuid
 
 import ros1_node
 
@@ -44,14 +45,17 @@ def _start_master(asked):  # type: (dict[str, set[str]]) -> None
 
 def main(path, use_sim_time):  # type: (str, str) -> None
     """Start a roscore, connect to adaptune, and pass messages on."""
+    import rosgraph
+
     asked = {}  # type: dict[str, set[str]]
     _start_master(asked)
+    master = rosgraph.Master("/adaptune")
+    if use_sim_time:
+        master.setParam("/use_sim_time", use_sim_time == "true")
+    # roslaunch waits for it.
+    master.setParam("/run_id", str(uuid.uuid1()))
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.connect(path)
-    if use_sim_time:
-        import rosgraph
-
-        rosgraph.Master("/adaptune").setParam("/use_sim_time", use_sim_time == "true")
 
     def found(_):  # type: (dict[str, Any]) -> dict[str, list[str]]
         return {caller: sorted(keys) for caller, keys in dict(asked).items()}
@@ -60,4 +64,9 @@ def main(path, use_sim_time):  # type: (str, str) -> None
 
 
 if __name__ == "__main__":
+    try:
+        import rosmaster
+        import rospy
+    except ImportError:
+        sys.exit(9)  # another Python may
     main(*sys.argv[1:])

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from pydantic import Field
 
+from adaptune import hosting
 from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings, OdometryError
 from adaptune.odometry.docker import undertaker
@@ -19,7 +20,7 @@ from adaptune.odometry.docker import undertaker
 _OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
 _NOBODY = 65534
-_TAIL, _LINES = 50, 5
+_TAIL = 50
 
 _log = logging.getLogger(__name__)
 
@@ -70,6 +71,8 @@ def engine() -> Any:
     import docker
     from docker.errors import DockerException
 
+    for name in ("docker", "urllib3"):
+        logging.getLogger(name).setLevel(logging.WARNING)  # they log every request
     try:
         client = docker.from_env()
         client.ping()
@@ -318,10 +321,9 @@ class Container:
         from docker.errors import APIError
 
         try:
-            text = engine().api.logs(self.id, tail=_TAIL).decode(errors="replace")
+            return hosting.plain_lines(engine().api.logs(self.id, tail=_TAIL))
         except APIError:
             return ""
-        return " | ".join(text.strip().splitlines()[-_LINES:])
 
     def log(self) -> bytes:
         """All that it wrote."""

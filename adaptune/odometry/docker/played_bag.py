@@ -173,7 +173,7 @@ class PlayedBag(WholeRun):
         """Whether the pose of the last scan is there, or nothing came for a while."""
         newest: int = max((stamp for stamp, *_ in _last_pose(recorder)), default=0)
         # Stamps of a clock of its own say nothing.
-        if last <= newest < last + 1_000_000_000:
+        if bool(last <= newest < last + 10**9):
             return True
         pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
         return time.monotonic() - max(recorder.last, over) > pause

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from adaptune import hosting
+from adaptune import hosting, ros
 from adaptune.odometry.base import OdometryError, Usage
 from adaptune.odometry.docker.engine import (
     Container,
@@ -21,7 +21,6 @@ from adaptune.odometry.docker.engine import (
     default_user,
     image_digest,
 )
-from adaptune.ros import ros1_container, ros1_node
 from adaptune.ros.ros1 import Ros1
 
 CLOCK = "rosgraph_msgs/msg/Clock"
@@ -38,8 +37,8 @@ _FIND = 'for package in {packages}; do rospack find "$package" >/dev/null 2>&1 &
 _MASTER = (
     "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
     "for python in python3 python; do "
-    f'"$python" -c "import rospy, rosmaster" 2>/dev/null && exec "$python" '
-    f"{_FOLDER}/ros1_container.py {_FOLDER}/link {{use_sim_time}}; "
+    f'"$python" {_FOLDER}/ros1_container.py {_FOLDER}/link {{use_sim_time}}; '
+    "code=$?; [ $code = 9 ] || exit $code; "
     "done; echo 'no Python of the image imports rospy: is it a ROS 1 image?' >&2; exit 127"
 )
 _LAUNCH = (
@@ -88,8 +87,8 @@ class RosSystem:
         self.folder.chmod(0o777)  # for any user of the image
         self._clock: Clock | None = None
         self._play: str | None = None
-        for module in (ros1_node, ros1_container):
-            shutil.copy(str(module.__file__), self.folder)
+        for name in ("ros1_node.py", "ros1_container.py"):
+            shutil.copy(Path(ros.__path__[0]) / name, self.folder)
         file = self.folder / "params.yaml"
         file.write_text(parameters, encoding="utf-8")
         file.chmod(0o644)
