@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from adaptune import tools
-from adaptune.commands import driving, learning, looking, referencing, training
+from adaptune.commands import driving, importing, learning, looking, referencing, training
 from adaptune.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -44,6 +44,7 @@ for _command in (
     *(training.simulate, referencing.reference),
     *(training.offline, learning.learn, training.trials, training.validate),
     *(driving.online, driving.switching, driving.compare, looking.record),
+    importing.import_rustle,
 ):
     app.command()(_command)
 

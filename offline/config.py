@@ -76,6 +76,7 @@ class OfflineConfig(StrictModel):
     limits: dict[Metric, Limit] = Field(default_factory=dict)
     runs: Literal["restart", "whole", "episodes"] = "restart"
     repeats: int = Field(1, ge=1, le=100)
+    baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
     preset: Literal["paper"] | None = None
@@ -90,6 +91,12 @@ class OfflineConfig(StrictModel):
                 "pruning spares trials further sequences, and with sets: own each runs on one; "
                 "set pruning: none, or sets: shared or both"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _check_baseline_runs(self) -> Self:
+        if self.baseline_runs is not None and self.baseline_runs < self.repeats:
+            raise ValueError(f"baseline_runs must be {self.repeats} (repeats) or more")
         return self
 
     @model_validator(mode="before")
@@ -160,7 +167,7 @@ class OfflineConfig(StrictModel):
 
 _LASTING = (
     *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
-    *("objective", "limits", "runs", "repeats", "augment", "pruning", "search"),
+    *("objective", "limits", "runs", "repeats", "baseline_runs", "augment", "pruning", "search"),
 )
 """Settings that may not change when a study is resumed."""
 

@@ -176,7 +176,7 @@ def _labelled(
         blocks=frames.blocks,
         baseline=archive.read(name, 0).errors[known],
         values=np.array(values),
-        repeats=_repeats(summaries, objective),
+        repeats=_repeats(summaries, objective, config.offline.repeats),
         block=span(frames.T_ref_sensor, config.sub_trajectory),
         elevation=float(np.nanmedian(frames.elevations)),
         simulation=simulation,
@@ -186,12 +186,12 @@ def _labelled(
 
 
 def _repeats(
-    summaries: Sequence[Summary | None], objective: Mapping[Metric, float]
+    summaries: Sequence[Summary | None], objective: Mapping[Metric, float], n_repeats: int
 ) -> NDArray[np.float64] | None:
     """The objective in every run of repeated trials, of shape (n_sets, n_repeats), or None."""
-    n_repeats = max((len(s.repeats) for s in summaries if s is not None), default=0)
-    if not n_repeats:
+    if n_repeats == 1:
         return None
     missing = [np.nan] * n_repeats
+    # Of the baseline, there may be more runs.
     rows = [missing if s is None else repeated(objective, s.repeats) for s in summaries]
-    return np.array(rows)
+    return np.array([row[:n_repeats] for row in rows])

@@ -144,7 +144,8 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
         for name, limit in config.limits.items()
     )
     above = 0.0
-    if all(run.repeats for run in runs):
+    # Without repeats, nothing is known of the other sets' intervals.
+    if config.repeats > 1 and all(run.repeats for run in runs):
         above = float(margin(np.array([repeated(config.objective[0], r.repeats) for r in runs])))
     return Verdict(runs[0].parameters, values, constraints, above)
 
@@ -294,6 +295,27 @@ def label(weights: Mapping[Metric, float], units: bool = False) -> str:
         ("" if weight == 1.0 else f"{weight:g} ") + name + (f" [{UNITS[name]}]" if units else "")
         for name, weight in weights.items()
     )
+
+
+def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
+    """A sentence about the spread of the baseline over its runs, if it was run several times.
+
+    Parameters
+    ----------
+    config
+        Its first objective counts.
+    runs
+        The baseline's trial on every sequence.
+    """
+    objective = config.objective[0]
+    if not all(run.repeats for run in runs) or set(objective) <= set(TIMED):
+        return []
+    found = np.mean([repeated(objective, run.repeats) for run in runs], axis=0)
+    return [
+        f"The baseline ran {len(found)} times: {label(objective, units=True)} {found.mean():.4g} "
+        f"in the mean, {found.min():.4g} to {found.max():.4g}, "
+        f"standard deviation {found.std(ddof=1):.2g}."
+    ]
 
 
 def pareto_front(values: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -35,6 +35,7 @@ from offline.config import TIMED, Metric, OfflineConfig
 from offline.objective import (
     Verdict,
     affordable,
+    baseline_words,
     best_by_trials,
     candidates,
     choose_fixed,
@@ -71,6 +72,7 @@ class Training(NamedTuple):
     rows: list[dict[str, Any]]
     remark: str | None  # see `rivalry`
     references: Sequence[str] = ()  # see `estimates_beside_intervals`
+    repeated: Sequence[str] = ()  # see `baseline_words`
 
     @property
     def words(self) -> list[str]:
@@ -87,12 +89,14 @@ class Training(NamedTuple):
             return [
                 *self.references,
                 *self.doubts,
+                *self.repeated,
                 f"{beaten}; the fixed set is the baseline.",
                 baseline,
             ]
         return [
             *self.references,
             *self.doubts,
+            *self.repeated,
             f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[self.fixed])}{self._cost}",
             baseline,
@@ -181,7 +185,8 @@ def train(
     rows = _training_rows(study, verdicts, finished, fixed, whole)
     report.write_rows(study.folder, "training", rows)
     judged = estimates_beside_intervals(study, study.training)
-    return Training(model, means, fixed, rows, remark, judged)
+    spread = baseline_words(config, [trials[0] for trials in finished.values()])
+    return Training(model, means, fixed, rows, remark, judged, spread)
 
 
 def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:

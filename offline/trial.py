@@ -51,13 +51,15 @@ class TrialSettings:
     descriptors: tuple[str, ...] = ("ndt",)
     runs: Literal["restart", "whole", "episodes"] = "restart"
     repeats: int = 1
+    baseline_runs: int | None = None  # as many as `repeats`, if not given
     metrics: frozenset[str] = frozenset({"rte"})
 
     @classmethod
     def of(cls, config: OfflineStudyConfig) -> Self:
         """The settings of a study."""
         shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor.names)
-        own = (config.offline.runs, config.offline.repeats, frozenset(config.offline.metrics))
+        offline = config.offline
+        own = (offline.runs, offline.repeats, offline.baseline_runs, frozenset(offline.metrics))
         return cls(*shared, *own)
 
     @property
@@ -282,7 +284,7 @@ def run_trials(
         return [TrialRun(make, frames, lost_track, *piece) for piece in pieces]
 
     # For every set every repeat, and for every repeat every piece.
-    runs = [[repeat(s) for _ in range(settings.repeats)] for s in sets]
+    runs = [[repeat(s) for _ in range(_n_runs(settings, odometry, s))] for s in sets]
     each = [run for of_set in runs for of_repeat in of_set for run in of_repeat]
     for i, scan in enumerate(_watched(scans, len(frames.stamps), advance)):
         for run in each:
@@ -292,6 +294,12 @@ def run_trials(
         _mean(s, [_trial(settings, s, scans, pieces) for pieces in of_set])
         for s, of_set in zip(sets, runs, strict=True)
     ]
+
+
+def _n_runs(settings: TrialSettings, odometry: Factory, parameters: ParameterSet) -> int:
+    if settings.baseline_runs is None or parameters not in odometry.space.baselines:
+        return settings.repeats
+    return settings.baseline_runs
 
 
 def _trial(

@@ -67,7 +67,7 @@ def test_index_lists_all_research_notes():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_exist(page):
     code = "\n".join(CODE.findall(page.read_text(encoding="utf-8")))
-    named = set(re.findall(r"(?:^|[\s`/])adaptune ([a-z]+)\b", code))
+    named = set(re.findall(r"(?:^|[\s`/])adaptune ([a-z]+(?:-[a-z]+)*)\b", code))
     assert named <= set(get_command(app).commands)
 
 

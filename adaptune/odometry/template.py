@@ -69,6 +69,13 @@ class Template:
         """Paths of all values."""
         return [".".join(path) for path, *_ in self._places]
 
+    def value(self, name: str) -> Any:
+        """A value; an `OdometryError` if there is none of this name, or several."""
+        if (place := self._find(name)) is None:
+            known = nearest(name, self.names)
+            raise OdometryError(f"{self.path.name} has no such value; {known}")
+        return place[1][place[2]]
+
     def fill(self, parameters: Mapping[str, Any]) -> str:
         """The file's text with new values; parameters that are not in it are ignored."""
         for name, value in parameters.items():

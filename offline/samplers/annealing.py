@@ -35,7 +35,7 @@ CHANGE = 0.3
 """Probability that a category changes."""
 
 
-_Trial = tuple[int, Mapping[str, Any], float]
+_Trial = tuple[int, dict[str, Any], float]
 """Number, parameters and value of a finished trial."""
 
 
@@ -262,10 +262,12 @@ class AnnealingSampler(BaseSampler):
         chains = [Chain(self.settings) for _ in range(self.settings.chains)]
         sign = _sign(study)
         best = sorted(startup, key=lambda t: sign * t[2])[: len(chains)]
+        given = self.settings.start
         for k, chain in enumerate(chains):
             if best:
                 _, params, value = best[k % len(best)]
-                chain.start(params, sign * value)
+                # The error at a given start is unknown: the first step from it is accepted.
+                chain.start(params | (given or {}), sign * value if given is None else math.inf)
         return chains
 
     def _rng(self, number: int) -> np.random.Generator:
@@ -295,9 +297,11 @@ def step_from(
             return value
         return others[rng.integers(len(others))]
     assert isinstance(distribution, FloatDistribution | IntDistribution)
-    low, high = distribution.low, distribution.high
+    low = distribution.low if step.low is None else max(step.low, distribution.low)
+    high = distribution.high if step.high is None else min(step.high, distribution.high)
     if low == high:
-        return value
+        return low
+    value = min(max(value, low), high)
     if distribution.step is not None and not distribution.log:
         # Counted in steps of the distribution.
         n = round((high - low) / distribution.step)
@@ -306,6 +310,7 @@ def step_from(
         i = round((value - low) / distribution.step) + int(rng.integers(-longest, longest + 1))
         made = low + reflected(i, n) * distribution.step
         return int(made) if isinstance(distribution, IntDistribution) else min(made, high)
+    first, last = low, high
     if distribution.log:
         low, high, x = math.log(low), math.log(high), math.log(value)
     else:
@@ -317,10 +322,10 @@ def step_from(
     if isinstance(distribution, IntDistribution):
         made = round(made)
         if made == value:  # a step of less than one whole number is one
-            up = value == distribution.low or (x > math.log(value) and value < distribution.high)
+            up = value == first or (x > math.log(value) and value < last)
             made += 1 if up else -1
         return int(made)
-    return min(max(made, distribution.low), distribution.high)
+    return min(max(made, first), last)
 
 
 def reflected(x: Any, length: Any) -> Any:

@@ -4,7 +4,14 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from adaptune import hosting
-from adaptune.space import Categorical, Float, Integer, ParameterSpace, nearest
+from adaptune.space import (
+    Categorical,
+    Float,
+    Integer,
+    ParameterSpace,
+    describe,
+    nearest,
+)
 from adaptune.study.mistakes import Mistake
 from offline.samplers.grid import check_grid
 from offline.samplers.settings import (
@@ -21,6 +28,7 @@ from offline.samplers.settings import (
 
 _ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
+_BOX = ("low", "high")
 _MOST = 100_000
 """Candidates, or members of a population: more of them take hours, or all memory."""
 
@@ -58,7 +66,10 @@ def check_sampler(
     elif space is None:
         return
     elif name == "annealing":
-        for parameter, step in AnnealingSettings.model_validate(settings).steps.items():
+        given = AnnealingSettings.model_validate(settings)
+        for parameter, value in (given.start or {}).items():
+            yield from _check_start(parameter, value, given.steps.get(parameter, Step()), space)
+        for parameter, step in given.steps.items():
             yield from _check_step(parameter, step, space)
     elif name in ("grid", "random"):
         axes = RandomSettings.model_validate(settings).grid
@@ -98,19 +109,44 @@ def _check_step(name: str, step: Step, space: ParameterSpace) -> Iterable[Mistak
     for setting in given:
         if setting not in allowed:
             kind = "log " * getattr(parameter, "log", False) + parameter.type
-            message = f"steps of a {kind} are set by {' and '.join(allowed)}"
+            message = f"steps of a {kind} are set by {_listed(allowed)}"
             yield Mistake((*key, setting), message)
-    still = {k: v for k, v in given.items() if k in allowed}
+    if not isinstance(parameter, Categorical):
+        low, high = box = _box(parameter, step)
+        if not (low < high and all(map(parameter.contains, box))):
+            message = f"the walk's low and high must lie in {describe(parameter)}, low below high"
+            yield Mistake(key, message)
+    still = {k: v for k, v in given.items() if k in allowed and k not in _BOX}
     if still and not any(still.values()) and (allowed[0] != "mu" or "sigma" in still):
         named = " and ".join(f"{k} {v:g}" for k, v in still.items())
         yield Mistake(key, f"never moves with {named}")
+
+
+def _check_start(name: str, value: float, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
+    key = ("start", name)
+    parameter = space.parameters.get(name)
+    if parameter is None:
+        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
+    elif isinstance(parameter, Categorical):
+        yield Mistake(key, "is a category, which starts at the baseline; leave it out")
+    else:
+        low, high = _box(parameter, step)
+        if not (parameter.contains(value) and low <= value <= high):
+            what = "a whole number" if isinstance(parameter, Integer) else "a number"
+            yield Mistake(key, f"give {what} from {low:g} to {high:g}, not {value!r}")
+
+
+def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
+    """Bounds of the walk."""
+    low, high = step.low, step.high
+    return parameter.low if low is None else low, parameter.high if high is None else high
 
 
 def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
     if isinstance(parameter, Categorical):
         return ("change",)
     linear = isinstance(parameter, Integer) and not parameter.log
-    return ("delta_max",) if linear else ("mu", "sigma")
+    return (*(("delta_max",) if linear else ("mu", "sigma")), *_BOX)
 
 
 def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
@@ -129,3 +165,8 @@ def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
         raise SamplerError(str(error)) from error
     finally:
         process.close()
+
+
+def _listed(words: tuple[str, ...]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last

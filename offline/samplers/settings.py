@@ -51,6 +51,9 @@ class Step(StrictModel):
     sigma: float | None = Field(None, ge=0)
     delta_max: int | None = Field(None, ge=0, le=2**53)
     change: float | None = Field(None, ge=0, le=1)
+    # Bounds of the walk, within the parameter's range.
+    low: int | float | None = None
+    high: int | float | None = None
 
 
 class AnnealingSettings(StrictModel):
@@ -68,6 +71,8 @@ class AnnealingSettings(StrictModel):
     stall_accepted: int | None = Field(None, ge=1, le=10**9)
     stall_best: int | None = Field(None, ge=1, le=10**9)
     chains: int = Field(2, ge=1, le=1000)
+    # Where the chains begin, instead of at the best of the initial points.
+    start: dict[str, int | float] | None = None
     steps: dict[str, Step] = Field(default_factory=dict)
 
 

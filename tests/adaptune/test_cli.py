@@ -293,3 +293,13 @@ def test_a_deep_inspection_measures_the_reference(adaptune, study_file, tmp_path
     begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
     (tmp_path / "wrong.yaml").write_text(done.stdout[begin:end])
     assert load_study(tmp_path / "wrong.yaml").training == ["wrong_0-60"]
+
+
+def test_a_study_of_one_trial_tells_how_much_the_baseline_varies(adaptune, study_file):
+    keys = ("offline.trials=1", "offline.baseline_runs=3", "offline.runs=whole")
+    options = [word for key in keys for word in ("-o", key)]
+    done = adaptune("offline", study_file, *options, "--folder", "once")
+    assert done.exit_code == 0, done.stderr
+    assert re.search(r"The baseline ran 3 times: rte \[%\] \d\.\d+ in the mean, ", done.stdout)
+    assert "standard deviation 0." in done.stdout  # GICP always does the same
+    assert "the fixed set is the baseline." in done.stdout

@@ -201,7 +201,32 @@ GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
         (
             ANNEALING + "steps: {keyframe_interval: {\n delta_max: 3}}}}",
             15,
-            "delta_max: steps of a log float are set by mu and sigma",
+            "delta_max: steps of a log float are set by mu, sigma, low and high",
+        ),
+        (
+            ANNEALING + "steps: {\n keyframe_interval: {low: 0.1}}}}",
+            15,
+            "the walk's low and high must lie in [0.5, 15], low below high",
+        ),
+        (
+            ANNEALING + "steps: {\n keyframe_interval: {low: 9, high: 8}}}}",
+            15,
+            "the walk's low and high must lie in [0.5, 15], low below high",
+        ),
+        (
+            ANNEALING + "start: {\n keyframe_interval: 20}}}",
+            15,
+            "give a number from 0.5 to 15, not 20",
+        ),
+        (
+            ANNEALING + "steps: {keyframe_interval: {high: 8}}, start: {\n keyframe_interval: 9}}}",
+            15,
+            "give a number from 0.5 to 8, not 9",
+        ),
+        (
+            ANNEALING + "start: {\n keyframe: 9}}}",
+            15,
+            "no parameter 'keyframe' is tuned: did you mean 'keyframe_interval'?",
         ),
         (ANNEALING + "\n alfa: 0.9}}", 15, "alfa: unknown key; did you mean 'alpha'?"),
         (ANNEALING + "\n alpha: 1.1}}", 15, "not 1.1"),

@@ -22,6 +22,7 @@ from offline.objective import (
     SEVERITY,
     SamplerResult,
     Verdict,
+    baseline_words,
     best_by_trials,
     candidates,
     choose_fixed,
@@ -119,6 +120,20 @@ def test_of_repeated_trials_the_surely_best_is_taken():
     assert verdicts[1].values < verdicts[0].values
     assert best_by_trials(config(), dict(enumerate(verdicts))) == 0
     assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
+
+
+def test_runs_of_the_baseline_alone_give_it_no_margin_but_a_sentence():
+    repeats = [{"rte": e, "rpe": 0.1 * e} for e in (1.0, 2.0, 3.0)]
+    runs = [Summary({}, 2.0, 0, 0, 1.0, {"rpe": 0.2}, repeats)] * 2
+    once = config(baseline_runs=3, objective="rpe")
+    assert judge(once, runs).bound == judge(once, runs).values[0] == pytest.approx(0.2)
+    assert baseline_words(once, runs) == [
+        "The baseline ran 3 times: rpe [m] 0.2 in the mean, 0.1 to 0.3, standard deviation 0.1."
+    ]
+    assert baseline_words(once, [Summary({}, 2.0, 0, 0, 1.0)]) == []
+    assert baseline_words(config(objective="cpu"), runs) == []
+    with pytest.raises(ValueError, match=r"baseline_runs must be 3 \(repeats\) or more"):
+        config(repeats=3, baseline_runs=2)
 
 
 def test_samplers_receive_limits():

@@ -220,6 +220,16 @@ def test_repeats_are_averaged_and_kept(study):
     np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
 
 
+def test_the_baseline_may_have_more_runs(study):
+    sequence = setup_of(study).prepare("one", 1e9)
+    baseline = study.odometry.space.baseline
+    setup = setup_of(study, baseline_runs=2)
+    trials = setup.run(
+        sequence, [baseline, GOOD | {"keyframe_interval": 2.0}, baseline], whole=True
+    )
+    assert [len(trial.repeats) for trial in trials] == [2, 0, 2]
+
+
 @pytest.mark.parametrize("length", [1.0, 2.5, 3.0, 50.0])
 def test_every_sub_trajectory_lies_in_an_episode(study, length):
     T = setup_of(study).prepare("one", 1e9).frames.T_ref_sensor

@@ -303,3 +303,38 @@ def test_every_combination_of_a_small_space_is_reached():
         study.tell(study.ask(space), 1.0)
     seen = {(t.params["n"], t.params["c"]) for t in study.trials}
     assert seen == set(itertools.product(range(4), ("red", "green", "blue")))
+
+
+# Bounds and starts of the walk.
+
+
+def test_the_walk_begins_where_it_is_told_and_keeps_its_bounds():
+    given = settings(
+        chains=1,
+        start={"x": 3.0, "n": 18},
+        steps={"x": {"sigma": 2.0, "low": 2.0, "high": 4.0}, "n": {"low": 15}},
+    )
+    sampler = AnnealingSampler(given, seed=1)
+    study = optuna.create_study(sampler=sampler)
+    study.enqueue_trial({"x": -5.0, "n": 0, "c": "blue"})  # outside of the bounds, and the best
+    study.optimize(lambda t: objective(t) + 1e6 * t.number, n_trials=1)
+    (chain,) = sampler.chains(study)
+    assert chain.params == {"x": 3.0, "n": 18, "c": "blue"}
+    study.optimize(lambda t: objective(t) + 1e6, n_trials=1)
+    (chain,) = sampler.chains(study)
+    assert chain.params == study.trials[1].params  # however bad it is
+    study.optimize(objective, n_trials=60)
+    walked = [trial.params for trial in study.trials[1:]]
+    assert all(2.0 <= params["x"] <= 4.0 and 15 <= params["n"] <= 20 for params in walked)
+    assert len({params["x"] for params in walked}) > 50
+
+
+@pytest.mark.parametrize("name", ["x", "y", "n", "m", "q"])
+def test_a_step_from_outside_the_bounds_leads_inside(name):
+    distribution = SPACE[name]
+    low, high = {"q": (0.25, 0.75)}.get(name, (2, 5))
+    rng = np.random.default_rng(1)
+    for value in (distribution.low, distribution.high, low):
+        made = step_from(value, distribution, Step(low=low, high=high), 1.0, rng)
+        assert low <= made <= high
+        assert type(made) is type(distribution.low)
