@@ -23,14 +23,14 @@ use_sim_time: true
 common: {points_topic: /points}
 gicp: {max_correspondence_distance: 2.0, keyframe_interval: 1.5, downsampling: 2e-1, other: 3}
 """
-LAUNCH = "exec roslaunch rustle-ros rustle.launch"
+LAUNCH = "exec roslaunch rustle-ros rustle.launch required:=false"
 DRIVE = """\
 until rostopic info /points | grep -q '/gicp'; do sleep 0.1; done
 [ -z "$SET" ] || rosservice call /gicp/set_parameters "$SET"
 rostopic echo -p /Odometry > /output/poses.csv &
 until rostopic info /Odometry | grep -q '/rostopic'; do sleep 0.1; done
-rosbag play --quiet --clock -r 4 /rustle/dataset/drive.bag > /dev/null
-sleep 0.5
+rosbag play --quiet --clock -r 4 --delay 1 --wait-for-subscribers /rustle/dataset/drive.bag > /dev/null
+sleep 1
 kill %1
 """
 
@@ -132,6 +132,7 @@ def test_it_can_end_like_a_node_that_crashes(mounts):
     assert len(stamps) == 3
     assert positions[-1].argmax() == 2
     assert "gicp: terminating after 3 scans: the map is corrupt" in said
+    assert "exit code 1" in said
 
 
 def test_the_plain_program_writes_a_trajectory(scans, mounts):

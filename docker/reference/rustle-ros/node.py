@@ -105,6 +105,7 @@ class GicpNode:
         if self._n == self._imitate.get("die_at"):
             sys.stderr.write(f"gicp: terminating after {self._n} scans: the map is corrupt\n")
             sys.stderr.flush()
+            time.sleep(0.2)  # its last pose is on its way, in another thread
             os._exit(1)
 
     def _publish(self, stamp, T) -> None:
