@@ -6,13 +6,14 @@ BIN := $(VENV)/bin
 STUDY := configs/demo.yaml
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
-.PHONY: help demo test quick lint types pytest services format clean
+.PHONY: help demo test quick lint types pytest services reference-image format clean
 
 help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests"
 	@echo "make quick   run linters and the fast tests, in about a minute"
-	@echo "make services  install what pip cannot bring: ROS 1 (Debian 12)"
+	@echo "make services  install what pip cannot bring: ROS 1 and Docker (Debian 12)"
+	@echo "make reference-image  build the image of a ROS 1 odometry that tests run"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 
@@ -41,7 +42,14 @@ pytest: $(VENV)/.installed
 services:
 	$(SUDO) apt-get update
 	DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install --yes --no-install-recommends \
-		ros-core python3-rospy python3-dynamic-reconfigure
+		ros-core python3-rospy python3-dynamic-reconfigure debootstrap \
+		$(if $(shell command -v dockerd),,docker.io)
+	$(SUDO) docker info >/dev/null 2>&1 || $(SUDO) service docker start
+	$(SUDO) sh -c 'for i in $$(seq 30); do docker info >/dev/null 2>&1 && exit; sleep 1; done; \
+		echo "the Docker engine does not answer: see /var/log/docker.log" >&2; exit 1'
+
+reference-image: $(VENV)/.installed
+	$(BIN)/python docker/build.py reference
 
 format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .

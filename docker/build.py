@@ -17,10 +17,9 @@ import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
+import docker
 import requests
 from docker.errors import DockerException
-
-import docker
 
 ROOT = Path(__file__).resolve().parents[1]
 BASE = "debian:bookworm-slim"
@@ -29,7 +28,9 @@ PYTHON = "3.11"
 GLIBC = 36
 """Of the base: 2.36."""
 FOLDERS = {"reference": ROOT / "docker/reference", "adaptune": ROOT / "docker"}
-"""An image's Dockerfile and the files beside it are in its folder."""
+"""Where an image's Dockerfile is."""
+FILES = {"reference": ["rustle-ros"], "adaptune": []}
+"""Folders beside it that go into the image."""
 TAGS = {"reference": "adaptune-reference", "adaptune": "adaptune"}
 REFERENCE_NEEDS = ("numpy", "pydantic", "scipy", "small_gicp", "typing-extensions")
 """What `adaptune.odometry.gicp` and `adaptune.odometry.serving` import, sooner or later."""
@@ -44,14 +45,18 @@ class BuildError(Exception):
     """An image that cannot be built."""
 
 
+class LackingError(BuildError):
+    """What `make services` installs is not there."""
+
+
 def engine() -> docker.DockerClient:
-    """The Docker engine; a `BuildError` that says what to do if none answers."""
+    """The Docker engine; a `LackingError` that says what to do if none answers."""
     try:
         client = docker.from_env()
         client.ping()
     except (DockerException, requests.RequestException) as error:
         what = "no Docker engine answers: run `make services`, or set DOCKER_HOST"
-        raise BuildError(f"{what} ({error})") from error
+        raise LackingError(f"{what} ({error})") from error
     return client
 
 
@@ -94,7 +99,7 @@ def make_base(client: docker.DockerClient) -> None:
 
 def _bootstrap(client: docker.DockerClient) -> None:
     if shutil.which("debootstrap") is None:
-        raise BuildError(f"{BASE} is missing, and so is debootstrap: run `make services`")
+        raise LackingError(f"{BASE} is missing, and so is debootstrap: run `make services`")
     sudo = [] if os.geteuid() == 0 else ["sudo"]
     folder = tempfile.mkdtemp(prefix="adaptune-base-")
     try:
@@ -113,12 +118,13 @@ def _bootstrap(client: docker.DockerClient) -> None:
 
 
 def _context(name: str) -> Path:
-    """Gather what a build sees: the files beside the Dockerfile, wheels, and adaptune's wheel."""
+    """Gather what a build sees: the Dockerfile and its folders, wheels, and adaptune's wheel."""
     context = ROOT / "build/docker" / name
     (context / "wheels").mkdir(parents=True, exist_ok=True)
-    for file in FOLDERS[name].iterdir():
-        if file.is_file():
-            shutil.copy(file, context)
+    shutil.copy(FOLDERS[name] / "Dockerfile", context)
+    for folder in FILES[name]:
+        shutil.rmtree(context / folder, ignore_errors=True)
+        _copy(FOLDERS[name] / folder, context / folder)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     needed = REFERENCE_NEEDS if name == "reference" else project["dependencies"]
     _download(context / "wheels", needed)

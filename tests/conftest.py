@@ -32,6 +32,7 @@ SLOW = [
     "offline/test_resume.py",
     "adaptune/odometry/test_command.py",
     "offline/test_objective.py",
+    "test_reference_image.py",
     "adaptune/simulation/test_recording.py",
     "offline/test_search.py",
     "online/test_stale_replays.py",

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("adaptune", "offline", "online")
-SOURCES = (*PACKAGES, "benchmarks")
+SOURCES = (*PACKAGES, "benchmarks", "docker")
 SHARED_NAMES = {"__init__", "base", "config"}
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_NESTING = 450, 60, 8, 4
 MAX_OPTIONS = 12

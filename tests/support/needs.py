@@ -1,10 +1,16 @@
 """What tests need that is not in the repository."""
 
+import fcntl
 import importlib.util
 import os
 import shutil
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
+
+ROOT = Path(__file__).parents[2]
 
 
 def lacking(name: str, reason: str) -> None:
@@ -30,3 +36,39 @@ def needs_ros1() -> None:
     """Skip where there is no ROS 1."""
     if shutil.which("roscore") is None:
         lacking("ros1", "there is no roscore: make services")
+
+
+@cache
+def image_builder() -> Any:
+    """The module docker/build.py."""
+    spec = importlib.util.spec_from_file_location("docker_build", ROOT / "docker/build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def needs_docker() -> None:
+    """Skip where no Docker engine answers."""
+    builder = image_builder()
+    try:
+        builder.engine().close()
+    except builder.LackingError as error:
+        lacking("docker", str(error))
+
+
+@cache
+def reference_image() -> str:
+    """Build the reference image, one process at a time, and return its tag."""
+    needs_docker()
+    builder = image_builder()
+    lock = ROOT / "build/docker.lock"
+    lock.parent.mkdir(exist_ok=True)
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        try:
+            return builder.build("reference")
+        except builder.LackingError as error:
+            lacking("docker", str(error))
+            raise

@@ -68,9 +68,8 @@ def engine() -> Any:
     EngineError
         If no engine answers, or this user may not use it.
     """
-    from docker.errors import DockerException
-
     from docker import DockerClient
+    from docker.errors import DockerException
 
     for name in ("docker", "urllib3"):
         logging.getLogger(name).setLevel(logging.WARNING)  # they log every request

@@ -10,9 +10,8 @@ _LOOKS, _BETWEEN = 3, 1.0
 def main(label: str) -> None:
     """Wait until the other side of the standard input has ended, then remove what has the label."""
     sys.stdin.buffer.read()
-    from docker.errors import APIError
-
     from docker import DockerClient
+    from docker.errors import APIError
 
     engine = DockerClient.from_env()
     for look in range(_LOOKS):

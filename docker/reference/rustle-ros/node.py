@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections import deque
+from types import SimpleNamespace
 
 import rospy
 from dynamic_reconfigure.server import Server
@@ -16,14 +17,12 @@ from sensor_msgs.msg import PointCloud2
 QUEUE_SIZE = 200_000
 
 
-class Reconfigured:
-    """The parameters as dynamic_reconfigure wants them, else generated from a .cfg file."""
-
-    min = {name: low for name, (low, _, _) in limits().items()}
-    max = {name: high for name, (_, high, _) in limits().items()}
-    defaults = {name: default for name, (_, _, default) in limits().items()}
-    level = dict.fromkeys(defaults, 0)
-    config_description = {
+RECONFIGURED = SimpleNamespace(
+    min={name: low for name, (low, _, _) in limits().items()},
+    max={name: high for name, (_, high, _) in limits().items()},
+    defaults={name: default for name, (_, _, default) in limits().items()},
+    level=dict.fromkeys(limits(), 0),
+    config_description={
         "name": "Default",
         "type": "",
         "id": 0,
@@ -33,7 +32,7 @@ class Reconfigured:
         "parameters": [
             {
                 "name": name,
-                "type": "int" if name == "iterations" else "double",
+                "type": "int" if isinstance(default, int) else "double",
                 "level": 0,
                 "description": "",
                 "edit_method": "",
@@ -43,7 +42,9 @@ class Reconfigured:
             }
             for name, (low, high, default) in limits().items()
         ],
-    }
+    },
+)
+"""The parameters as dynamic_reconfigure wants them, which packages generate from a .cfg file."""
 
 
 class GicpNode:
@@ -65,7 +66,7 @@ class GicpNode:
             # The server reads its first values there, and knows numbers only.
             for name, value in parameters.items():
                 rospy.set_param(f"~{name}", value)
-            self._server = Server(Reconfigured, self._reconfigure)
+            self._server = Server(RECONFIGURED, self._reconfigure)
         time.sleep(self._imitate.get("ready_delay", 0.0))
         topic = rospy.get_param("/common/points_topic", POINTS_TOPIC)
         rospy.Subscriber(topic, PointCloud2, self._receive, buff_size=1 << 26)
@@ -104,6 +105,7 @@ class GicpNode:
         if self._n == self._imitate.get("die_at"):
             sys.stderr.write(f"gicp: terminating after {self._n} scans: the map is corrupt\n")
             sys.stderr.flush()
+            time.sleep(0.2)  # its last pose is on its way, in another thread
             os._exit(1)
 
     def _publish(self, stamp, T) -> None:

@@ -13,7 +13,7 @@ def main() -> None:
         sys.exit("usage: odometry-serve PATH")
     # The first process of a container has no default for it.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    listen(f"unix:{sys.argv[1]}", "gicp", lambda address: print(address, flush=True))
+    listen(f"unix:{sys.argv[1]}", "gicp", lambda address: sys.stderr.write(f"{address}\n"))
 
 
 if __name__ == "__main__":
