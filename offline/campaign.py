@@ -115,7 +115,8 @@ class _Campaign:
 
     def _tasks(self, missing: Sequence["Missing"]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []
-        return _tasks(missing, without_frames, len(self._workers.workers()))
+        n_workers = len(self._workers.workers())
+        return _tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
 
     def _verdict(self, n: int) -> Verdict:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
@@ -133,11 +134,17 @@ class Missing(NamedTuple):
     parameters: Callable[[int], ParameterSet]  # the set of a trial
 
 
-def _tasks(missing: Sequence[Missing], without_frames: Sequence[str], n_workers: int) -> list[Task]:
+def _tasks(
+    missing: Sequence[Missing],
+    without_frames: Sequence[str],
+    n_workers: int,
+    one_by_one: bool = False,
+) -> list[Task]:
     """Split the trials of every sequence between the workers.
 
     Those of the last sequence are split into ever smaller pieces, so that all workers end together.
-    A sequence whose frames are missing, but no trial, is a task of its own.
+    A sequence whose frames are missing, but no trial, is a task of its own. If trials run
+    `one_by_one`, so is every trial.
     """
     lacking = [
         (name, numbers, some.parameters)
@@ -153,7 +160,7 @@ def _tasks(missing: Sequence[Missing], without_frames: Sequence[str], n_workers:
         first = numbers[0] if name in without_frames else None
         left = numbers
         while left:
-            size = math.ceil(len(left) / n_workers / (1 if last else 2))
+            size = 1 if one_by_one else math.ceil(len(left) / n_workers / (1 if last else 2))
             tasks += [
                 Task(name, tuple(n), tuple(map(parameters, n)), frames=n[0] == first)
                 for share in range(n_workers)

@@ -12,7 +12,7 @@ from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.program_input import ProgramInput
-from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, versions
+from adaptune.odometry.registry import CONTAINERS, PROGRAMS, is_user_class, odometry_class, versions
 from adaptune.space import ParameterSet, ParameterSpace
 
 
@@ -89,6 +89,11 @@ class OdometryFactory:
     def apart(self) -> bool:
         """Whether it runs in processes of their own, which have limits."""
         return self.name in PROGRAMS or not self._clean or is_user_class(self.name)
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether trials gain nothing from sharing a pass: what runs them shares nothing."""
+        return self.description.whole or self.name in CONTAINERS
 
     @property
     def versions(self) -> dict[str, str]:

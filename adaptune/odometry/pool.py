@@ -78,6 +78,11 @@ class OdometryPool:
         return any(factory.apart for factory in self.factories.values())
 
     @property
+    def one_by_one(self) -> bool:
+        """See `OdometryFactory`."""
+        return any(factory.one_by_one for factory in self.factories.values())
+
+    @property
     def versions(self) -> dict[str, str]:
         """Versions of the packages that the poses depend on."""
         every = (factory.versions for factory in self.factories.values())

@@ -40,6 +40,9 @@ PROGRAMS = {
 }
 """Programs of the user."""
 
+CONTAINERS = ("docker_command", "docker_process", "rustle")
+"""Those of them that run in containers."""
+
 PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
 """Packages that our adapters run on, if the adapter's module has another name."""
 
