@@ -250,6 +250,7 @@ class Container:
 
     id: str | None = None
     out_of_memory = False
+    _removed = False
 
     def ended(self) -> int | None:
         """Exit code, or minus the signal's number; None while it runs."""
@@ -336,7 +337,7 @@ class Container:
         return written
 
     def close(self) -> None:
-        """End and remove it, with its volumes."""
-        if self.id is not None:
+        """End and remove it, with its volumes; what is asked of it later finds none."""
+        if self.id is not None and not self._removed:
+            self._removed = True
             _remove(engine(), self.id)
-            self.id = None
