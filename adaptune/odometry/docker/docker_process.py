@@ -119,8 +119,8 @@ class DockerProcess(Isolated):
                 connection.connect(str(path))
                 return connection
             connection.close()
-            if (code := self._container.ended()) is not None:
-                what = hosting.verdict(code)
+            if (ended := self._ended()) is not None:
+                what = ended
                 break
             time.sleep(_BETWEEN_LOOKS)
         words = self._container.last_lines()
@@ -139,14 +139,21 @@ class DockerProcess(Isolated):
         if self._container is None:
             return what
         for _ in range(10):
-            if (code := self._container.ended()) is not None:
-                what = hosting.verdict(code)
-                if self._container.out_of_memory:
-                    what = f"out of isolation.memory = {self._limits.memory:g} GB"
+            if (ended := self._ended()) is not None:
+                what = ended
                 break
             time.sleep(0.05)
         words = self._container.last_lines()
         return f"{what}: {words}" if words else what
+
+    def _ended(self) -> str | None:
+        """How the program ended; None while it runs."""
+        assert self._container is not None
+        if (code := self._container.ended()) is None:
+            return None
+        if self._container.out_of_memory:
+            return f"out of isolation.memory = {self._limits.memory:g} GB"
+        return hosting.verdict(code)
 
 
 @cache
