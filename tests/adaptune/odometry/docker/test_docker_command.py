@@ -1,0 +1,216 @@
+import os
+import re
+import tempfile
+
+import numpy as np
+import pytest
+from contained import (
+    LIMITS,
+    N_SCANS,
+    VALUES,
+    containers,
+    drive,
+    host_poses,
+    recording,
+    template,
+    truth,
+)
+from needs import reference_image
+from setups import setup_of
+
+from adaptune.odometry.docker.docker_command import DockerCommand, DockerCommandSettings
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.template import Template
+from adaptune.study.mistakes import ConfigurationError
+from offline.offline_study import load_study
+
+PLAIN = ("odometry-plain", "{points}")
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    reference_image()
+    return recording(tmp_path_factory.mktemp("recording"))
+
+
+@pytest.fixture
+def nothing_left(tmp_path, monkeypatch):
+    """The folder of temporary files is empty, and no container runs, when a test ends."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    before = set(containers())
+    yield
+    assert not list(folder.iterdir())
+    assert set(containers()) <= before
+
+
+def settings(tmp_path, *command, name="params.yaml", **more):
+    file = template(tmp_path / name)
+    return DockerCommandSettings(
+        image=reference_image(), command=command or PLAIN, template=str(file), **more
+    )
+
+
+def made(settings, given, limits=LIMITS, parameters=VALUES):
+    DockerCommand.check(settings, parameters)
+    return DockerCommand.instance(parameters, settings, limits, lambda: given)
+
+
+def shell(tmp_path, script, **more):
+    return settings(tmp_path, "sh", "-c", script, **more)
+
+
+@pytest.mark.usefixtures("nothing_left")
+def test_the_poses_are_those_of_the_program_on_this_machine(tmp_path, given):
+    odometry = made(settings(tmp_path), given)
+    poses = drive(odometry)
+    assert not odometry.faults
+    np.testing.assert_allclose(poses, host_poses(), atol=1e-6)
+    assert 0.0 < odometry.usage.cpu < 60.0
+    assert 0.0 < odometry.usage.memory < 2000.0
+    assert 0.0 < odometry.usage.seconds < 60.0 / N_SCANS
+    # Later starts run nothing.
+    begun = odometry.usage.cpu
+    T = np.eye(4)
+    T[:3, 3] = 5.0, 6.0, 7.0
+    np.testing.assert_allclose(drive(odometry, T=T)[-1], T @ poses[-1], atol=1e-9)
+    assert odometry.usage.cpu == begun
+
+
+def test_a_trial_of_a_study(tmp_path, study_file):
+    template(tmp_path / "params.yaml")
+    overrides = [
+        "odometry.name=docker_command",
+        f"odometry.settings={{image: {reference_image()}, command: [odometry-plain, '{{points}}'], "
+        f"template: {tmp_path}/params.yaml}}",
+        "odometry.parameters={max_correspondence_distance: {type: float, low: 1, high: 5, "
+        "baseline: 2}, gicp.keyframe_interval: {type: float, low: 1, high: 5, baseline: 1.5}}",
+    ]
+    study = load_study(study_file, overrides, tmp_path / "run")
+    assert study.odometry.one_by_one
+    setup = setup_of(study)
+    sequence = setup.prepare("one", 1e9)
+    parameters = {"max_correspondence_distance": 2.0, "gicp.keyframe_interval": 1.5}
+    (trial,) = setup.run(sequence, [parameters])
+    assert not trial.faults
+    np.testing.assert_allclose(trial.T_odom_sensor, host_poses(), atol=1e-6)
+    content = study.odometry.content
+    assert any(
+        name.startswith("image ") and of.startswith("sha256:") for name, of in content.items()
+    )
+    assert f"{tmp_path}/params.yaml" in content
+    for override, words in (
+        ("odometry.settings.image=no-such", "there is no image 'no-such' on this machine"),
+        ("odometry.settings.image=", "odometry.settings.image: give text, not nothing"),
+        ("odometry.settings.cpus=0", "odometry.settings.cpus"),
+        ("odometry.settings.command=[x, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
+        ("odometry.parameters.voxl={type: float, low: 1, high: 2, baseline: 1}", "voxl: no argum"),
+    ):
+        with pytest.raises(ConfigurationError) as caught:
+            load_study(study_file, [*overrides, override])
+        assert words in str(caught.value)
+
+
+def test_every_placeholder_and_the_file_get_there(tmp_path, given):
+    script = """
+        env | grep ADAPTUNE_ | sort
+        echo {input} {points} {parameters} {output} {voxel}
+        cat {parameters}; ls /data; exit 1
+    """
+    odometry = made(
+        shell(tmp_path, script, name="params.yml", output="poses/run.tum"),
+        given,
+        parameters=VALUES | {"voxel": 3},
+    )
+    kept = []
+    odometry.words, words = lambda _: kept.append(words(None)) or kept[-1], odometry.words
+    # Messages hold the last lines only.
+    odometry.settings = odometry.settings.model_copy(
+        update={"command": ("sh", "-c", script.replace("cat {parameters}", "true"))}
+    )
+    drive(odometry)
+    (fault,) = odometry.faults
+    assert fault.endswith(
+        "ADAPTUNE_IMU= | ADAPTUNE_POINTS=/points | "
+        "/data/drive.bag /points /parameters.yml /output/poses/run.tum 3 | drive.bag"
+    )
+    filled = Template(tmp_path / "params.yml").fill(odometry.parameters)
+    assert "max_correspondence_distance: 2.0" in filled
+    assert "voxel: 3" in filled
+
+
+WRITTEN = """awk 'BEGIN {
+    for (i = 0; i < 40; i++) {
+        at = 123456789 + i * 1e8
+        printf "%d.%09d %f 0 0 0 0 0 1\\n", 1700000000 + int(at / 1e9), at % 1e9, 0.3 * i
+    }
+}' > /output/trajectory.tum; """
+
+FAULTS = {
+    "exit": ("echo no planes here >&2; exit 3", r"its process ended with code 3: no planes here"),
+    "signal": ("echo oh; kill -ABRT $$", r"its process was ended by SIGABRT: oh"),
+    "nothing": ("echo done", r"it left no trajectory\.tum: done"),
+    "cut": (
+        "echo 1 2 3 > /output/trajectory.tum",
+        r"trajectory\.tum, line 1: .*",
+    ),
+    "NaN": (
+        WRITTEN + "sed -i '5s/ [^ ]*/ nan/' /output/trajectory.tum",
+        r"trajectory\.tum, line 5: .*",
+    ),
+    "half": (
+        WRITTEN + "sed -i 21,99d /output/trajectory.tum",
+        r"it gave poses for 20 of 40 scans, the last at 1\.9 s of 3\.9 s",
+    ),
+    "backwards": (
+        WRITTEN + "tac /output/trajectory.tum > /output/t; mv /output/t {output}",
+        r"trajectory\.tum, line 2: .*",
+    ),
+    "clock": (
+        WRITTEN + "sed -i 's/^17000/00000/' /output/trajectory.tum",
+        r"its poses are of .* s to .* s, the scans of 1700000000\.123 s to .* s",
+    ),
+    "no such program": ("no-such-program", r"its process ended with code 127: .*not found"),
+    "memory": (
+        "python3 -c 'bytearray(10**9)'",
+        r"out of isolation\.memory = 0\.3 GB: Killed",
+    ),
+}
+
+
+@pytest.mark.usefixtures("nothing_left")
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_told_with_the_last_lines(fault, tmp_path, given, caplog):
+    script, words = FAULTS[fault]
+    limits = Limits(memory=0.3 if fault == "memory" else 2.0)
+    odometry = made(shell(tmp_path, script), given, limits)
+    poses = drive(odometry)
+    (told,) = odometry.faults
+    assert re.fullmatch(words, told), told
+    assert f"{reference_image()} with {VALUES}: {told}" in caplog.messages
+    assert np.isnan(poses[-1]).all()
+
+
+@pytest.mark.usefixtures("nothing_left")
+def test_one_that_hangs_is_ended(tmp_path, given):
+    script = "echo waiting; exec sleep 300"
+    odometry = made(shell(tmp_path, script), given, Limits(seconds=2.0 / N_SCANS))
+    drive(odometry)
+    assert odometry.faults == [
+        "it took longer than isolation.seconds = 0.05 for each scan: waiting"
+    ]
+    assert odometry.usage.seconds >= 2.0 / N_SCANS
+
+
+@pytest.mark.usefixtures("nothing_left")
+def test_a_file_of_another_user_is_read(tmp_path, given):
+    script = "umask 077; odometry-plain && stat -c %u:%a /output/trajectory.tum"
+    odometry = made(shell(tmp_path, script, user="1234:1234"), given)
+    poses = drive(odometry)
+    if os.getuid():
+        # Nobody else may read it then.
+        assert "trajectory.tum" in odometry.faults[0]
+        return
+    assert not odometry.faults
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.1)

@@ -1,0 +1,305 @@
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import closing
+from functools import cache
+
+import pytest
+from contained import LABEL
+from needs import reference_image
+
+from adaptune.odometry.docker import engine as engine_module
+from adaptune.odometry.docker.engine import (
+    Container,
+    ContainerSettings,
+    EngineError,
+    Mount,
+    default_user,
+    image_digest,
+)
+
+NOBODY = "65534:65534"
+LOOK = """
+import json, os, resource, socket
+def refused(do):
+    try:
+        do()
+    except OSError as error:
+        return error.strerror
+def connect(host):
+    socket.create_connection((host, 80), 5)
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(json.dumps({
+    "links": os.listdir("/sys/class/net"),
+    "connect": [refused(lambda: connect(host)) for host in ("192.0.2.1", "172.17.0.1")],
+    "write": refused(lambda: open("/given/new", "w")),
+    "kept": refused(lambda: open("/kept/new", "w").write("written")),
+    "user": [os.getuid(), os.getgid()],
+    "capabilities": [status[name].strip() for name in ("CapEff", "CapPrm", "CapBnd")],
+    "privileges": status["NoNewPrivs"].strip(),
+    "core": resource.getrlimit(resource.RLIMIT_CORE),
+    "variable": os.environ["VARIABLE"],
+}))
+"""
+FORKS = """
+import os, sys, time
+n = 0
+try:
+    while n < 200:
+        if os.fork() == 0:
+            time.sleep(30)
+            os._exit(0)
+        n += 1
+except OSError as error:
+    print(n, error.strerror)
+"""
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return ContainerSettings(image=reference_image(), cpus=0.5, pids=40)
+
+
+@pytest.fixture
+def fresh(monkeypatch):
+    """The engine, as at its first use."""
+    renewed = cache(engine_module.engine.__wrapped__)
+    monkeypatch.setattr(engine_module, "engine", renewed)
+    return renewed
+
+
+def started(settings, *command, memory=0.3, mounts=(), user=NOBODY, **more):
+    return Container(settings, memory, command, mounts, user=user, **more)
+
+
+def wait(container):
+    end = time.monotonic() + 60.0
+    while (code := container.ended()) is None:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return code
+
+
+def run(settings, *command, **more):
+    """Exit code of a command, and what it wrote."""
+    with closing(started(settings, *command, **more)) as container:
+        return wait(container), container.log().decode()
+
+
+def gone(client, container):
+    found = client.api.containers(quiet=True, all=True, filters={"id": container})
+    return not found
+
+
+def test_it_reaches_nothing_and_may_do_nothing(settings, tmp_path):
+    given, kept = tmp_path / "given", tmp_path / "kept"
+    for folder in (given, kept):
+        folder.mkdir()
+        folder.chmod(0o777)
+    mounts = [Mount(given, "/given"), Mount(kept, "/kept", writable=True)]
+    code, said = run(
+        settings, "python3", "-c", LOOK, mounts=mounts, environment={"VARIABLE": "a b"}
+    )
+    assert code == 0, said
+    seen = json.loads(said)
+    assert seen["links"] == ["lo"]
+    assert seen["connect"] == ["Network is unreachable"] * 2
+    assert seen["write"] == "Read-only file system"
+    assert seen["kept"] is None
+    assert (kept / "new").read_text() == "written"
+    assert seen["user"] == [65534, 65534]
+    assert {int(mask, 16) for mask in seen["capabilities"]} == {0}
+    assert seen["privileges"] == "1"
+    assert seen["core"] == [0, 0]
+    assert seen["variable"] == "a b"
+
+
+def test_its_limits_are_those_that_were_given(settings):
+    with closing(started(settings, "sleep", "60", memory=0.25)) as container:
+        api = engine_module.engine().api
+        found = api.inspect_container(container.id)
+        limits = found["HostConfig"]
+        assert limits["Memory"] == limits["MemorySwap"] == 250_000_000
+        assert limits["NanoCpus"] == 500_000_000
+        assert limits["PidsLimit"] == 40
+        assert limits["NetworkMode"] == "none"
+        assert not limits["Privileged"]
+        assert found["Image"] == image_digest(settings.image)
+        assert f".{os.getpid()}." in found["Config"]["Labels"][LABEL]
+        assert container.ended() is None
+        used = container.used()
+        assert 0.0 <= used.cpu < 60.0
+        assert 0.0 < used.memory < 250.0
+
+
+def test_the_cores_are_shared_out(settings):
+    busy = "import time\nend = time.monotonic() + 2\nwhile time.monotonic() < end: pass\n"
+    with closing(started(settings, "python3", "-c", busy + "time.sleep(60)")) as container:
+        # Half a core for two seconds, and what was used before the first of them.
+        time.sleep(3.0)
+        assert 0.0 < container.used().cpu < 1.7
+
+
+def test_processes_are_limited(settings):
+    code, said = run(settings, "python3", "-c", FORKS)
+    assert code == 0
+    n, _, why = said.strip().partition(" ")
+    assert 20 < int(n) < 40
+    assert why == "Resource temporarily unavailable"
+
+
+def test_memory_is_limited(settings):
+    with closing(started(settings, "python3", "-c", "bytearray(10**9)", memory=0.1)) as container:
+        assert wait(container) == -9
+        assert container.out_of_memory
+
+
+@pytest.mark.parametrize(
+    ("script", "code"), [("exit 7", 7), ("kill -ABRT $$", -6), ("nonsense", 127)]
+)
+def test_how_it_ended(settings, script, code):
+    with closing(started(settings, "sh", "-c", f"echo here; {script}")) as container:
+        assert wait(container) == code
+        assert not container.out_of_memory
+        assert container.last_lines().startswith("here")
+    assert container.ended() == -9
+    assert container.last_lines() == ""
+    assert container.log() == b""
+    assert container.used() == (0, 0.0, 0.0)
+
+
+def test_commands_run_beside_it(settings):
+    with closing(started(settings, "sleep", "60")) as container:
+        code, said = container.call(["sh", "-c", "echo so; echo there >&2; exit 3"])
+        assert code == 3
+        assert set(said.split()) == {"so", "there"}
+        code, said = container.call(["no-such-program"])
+        assert code in (126, 127)
+        assert "no-such-program" in said
+        name = container.run("sleep 0.3; exit $NUMBER", {"NUMBER": "4"})
+        end = time.monotonic() + 20.0
+        while (code := container.finished(name)) is None:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert code == 4
+    assert container.finished(name) is not None
+    with pytest.raises(EngineError, match=settings.image):
+        container.run("true")
+
+
+def test_the_user(settings, monkeypatch):
+    monkeypatch.setattr(os, "getuid", lambda: 1234)
+    monkeypatch.setattr(os, "getgid", lambda: 123)
+    assert default_user(settings) == "1234:123"
+    monkeypatch.setattr(os, "getuid", lambda: 0)
+    assert default_user(settings) == NOBODY
+    assert default_user(settings.model_copy(update={"user": "0"})) == "0"
+
+
+def test_what_an_image_says_of_user_command_and_volumes(settings):
+    client, name = engine_module.engine(), "adaptune-test-volume"
+    with closing(started(settings, "true")) as container:
+        changes = ["VOLUME /scratch", "USER daemon", 'CMD ["sleep", "60"]']
+        client.api.commit(container.id, repository=name, tag="latest", changes=changes)
+    try:
+        other = ContainerSettings(image=name)
+        assert default_user(other) == "daemon"
+        with closing(started(other, user=default_user(other))) as container:
+            (mount,) = client.api.inspect_container(container.id)["Mounts"]
+            assert mount["Type"] == "volume"
+            assert container.call(["id", "-un"]) == (0, "daemon\n")
+        assert mount["Name"] not in str(client.api.volumes(filters={"name": mount["Name"]}))
+    finally:
+        client.api.remove_image(name, force=True)
+
+
+def test_without_an_engine_it_says_what_to_do(fresh, monkeypatch):
+    monkeypatch.setenv("DOCKER_HOST", "unix:///nowhere")
+    with pytest.raises(EngineError) as caught:
+        fresh()
+    assert str(caught.value) == (
+        "no Docker engine answers at unix:///nowhere: install Docker Engine, or start it: "
+        "`sudo service docker start`"
+    )
+
+
+def test_without_permission_it_says_what_to_do(fresh, monkeypatch):
+    import docker
+
+    def from_env():
+        said = "Error while fetching server API version: ('Connection aborted.', "
+        raise docker.errors.DockerException(f"{said}PermissionError(13, 'Permission denied'))")
+
+    monkeypatch.setattr(docker.DockerClient, "from_env", from_env)
+    with pytest.raises(EngineError, match=r"this user may not use the Docker engine at unix:.*-aG"):
+        fresh()
+
+
+def test_images_that_are_not_there(settings):
+    with pytest.raises(EngineError, match="there is no image 'no-such' on this machine: `docker p"):
+        image_digest("no-such")
+    with pytest.raises(EngineError, match="image 'No Such'"):
+        image_digest("No Such")
+    assert image_digest(settings.image).startswith("sha256:")
+
+
+def test_what_cannot_be_started(settings, tmp_path):
+    with pytest.raises(EngineError, match="nobody-here"):
+        started(settings, "true", user="nobody-here")
+    with pytest.raises(EngineError, match="no-folder"):
+        started(settings, "true", mounts=[Mount(tmp_path / "no-folder", "/there")])
+
+
+def test_what_ended_processes_have_left_is_removed_at_the_first_use(settings, fresh):
+    client = engine_module.engine()
+    with closing(started(settings, "sleep", "60")) as container:
+        own = client.api.inspect_container(container.id)["Config"]["Labels"][LABEL]
+    boot, space, pid, begin = own.split(".")
+    owners = {
+        "ended": f"{boot}.{space}.{pid}.1",
+        "another boot": f"{boot[::-1]}.{space}.{pid}.{begin}",
+        "another container": f"{boot}.1.{pid}.1",
+        "living": own,
+    }
+    made = {
+        name: client.api.create_container(settings.image, ["true"], labels={LABEL: owner})["Id"]
+        for name, owner in owners.items()
+    }
+    try:
+        fresh.cache_clear()
+        fresh()
+        kept = {name for name, container in made.items() if not gone(client, container)}
+        assert kept == {"another container", "living"}
+    finally:
+        for container in made.values():
+            if not gone(client, container):
+                client.api.remove_container(container, force=True)
+
+
+KILLED = """
+import sys, time
+from adaptune.odometry.docker.engine import Container, ContainerSettings
+settings = ContainerSettings(image=sys.argv[1])
+made = [Container(settings, 0.2, ["sleep", "600"], user="65534") for _ in range(2)]
+print(*[container.id for container in made], flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_process_that_is_killed_leaves_no_container(settings):
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, settings.image],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        text=True,
+    )
+    with process:
+        made = process.stdout.readline().split()
+        process.kill()
+    assert len(made) == 2
+    client, end = engine_module.engine(), time.monotonic() + 60.0
+    while not all(gone(client, container) for container in made):
+        assert time.monotonic() < end
+        time.sleep(0.1)

@@ -1,0 +1,114 @@
+"""What tests of odometries in containers share: a short drive, settings, and a look at the engine.
+
+Nothing here starts a container when it is imported.
+"""
+
+import json
+import logging
+import os
+import threading
+from functools import cache
+
+import drives
+import numpy as np
+from needs import reference_image
+
+from adaptune.odometry.docker.engine import engine
+from adaptune.odometry.docker.rustle import RustleSettings
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.in_process import InProcess
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.program_input import ProgramInput
+from adaptune.sequence import Scan
+
+LABEL = "adaptune.owner"
+N_SCANS = 40
+LIMITS = Limits(seconds=10.0, memory=2.0)
+VALUES = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.5}
+"""Of the parameters in the template that are tuned here."""
+TEMPLATE = """\
+use_sim_time: {sim}
+common: {{points_topic: {points}}}
+gicp: {{max_correspondence_distance: 9.0, keyframe_interval: 9, downsampling: 0.5, iterations: 20}}
+other: {{voxel: 1}}
+imitate: {imitate}
+"""
+
+
+@cache
+def scans():
+    """Scans of a drive of four seconds, 0.3 m apart."""
+    return [Scan(stamp, points) for stamp, points, _ in drives.scans(n_scans=N_SCANS)]
+
+
+def truth():
+    """Poses of the scans, of shape (n, 4, 4)."""
+    T = np.tile(np.eye(4), (N_SCANS, 1, 1))
+    T[:, 0, 3] = 0.3 * np.arange(N_SCANS)
+    return T
+
+
+def recording(folder, logs=None):
+    """The drive as a bag, for odometries that run whole recordings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    bag = drives.write_bag(folder / "drive.bag", drives.scans(n_scans=N_SCANS))
+    stamps = np.array([scan.stamp for scan in scans()], np.int64)
+    return ProgramInput(bag, "/points", "", stamps, truth(), logs)
+
+
+def template(path, sim="true", points="/points", **imitate):
+    """Write the reference image's parameter file."""
+    path.write_text(TEMPLATE.format(sim=sim, points=points, imitate=json.dumps(imitate)))
+    return path
+
+
+def rustle(file, **settings):
+    """Settings of the reference image's system, with a parameter file."""
+    given = {"image": reference_image(), "odometry": "/Odometry", "rate": 4.0, "drain": 1.0}
+    return RustleSettings(template=str(file), **(given | settings))
+
+
+def drive(odometry, first=0, T=None):
+    """Start with a scan and register those after it; poses of shape (n, 4, 4)."""
+    T = np.eye(4) if T is None else T
+    prepared = [odometry.prepare(scan) for scan in scans()[first:]]
+    odometry.start(prepared[0], T)
+    return np.array([T, *(odometry.register(p).T_odom_sensor for p in prepared[1:])])
+
+
+@cache
+def host_poses(**parameters):
+    """What keyframe GICP finds in this process; parameters left out are those of `VALUES`."""
+    return drive(InProcess(KeyframeGicp(VALUES | parameters)))
+
+
+def containers():
+    """Containers that this process has started and not removed."""
+    ids = engine().api.containers(quiet=True, all=True, filters={"label": LABEL})
+    own = (engine().api.inspect_container(found["Id"]) for found in ids)
+    pid = f".{os.getpid()}."
+    return [found["Id"] for found in own if pid in found["Config"]["Labels"][LABEL]]
+
+
+class Said(logging.Handler):
+    """What this thread logs meanwhile, one message a line."""
+
+    def __init__(self):
+        super().__init__(logging.INFO)
+        self._thread, self._lines = threading.get_ident(), []
+
+    def emit(self, record):
+        if record.thread == self._thread:
+            self._lines.append(record.getMessage())
+
+    def __enter__(self):
+        log = logging.getLogger("adaptune")
+        log.addHandler(self)
+        log.setLevel(logging.INFO)
+        return self
+
+    def __exit__(self, *_):
+        logging.getLogger("adaptune").removeHandler(self)
+
+    def __str__(self):
+        return "\n".join(self._lines)
