@@ -23,6 +23,7 @@ from adaptune.odometry.docker.engine import (
     image_digest,
 )
 from adaptune.ros.ros1 import Ros1
+from adaptune.ros.ros_link import LinkError
 
 CLOCK = "rosgraph_msgs/msg/Clock"
 _FOLDER = "/adaptune"
@@ -284,7 +285,7 @@ class SimClock:
         self._thread.join()
 
     def _tick(self) -> None:
-        with contextlib.suppress(OdometryError, OSError):
+        with contextlib.suppress(LinkError):
             while not self._ended.wait(_TICK):
                 with self._lock:
                     self._send()
