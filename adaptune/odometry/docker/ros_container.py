@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import shlex
 import shutil
 import socket
 import tempfile
@@ -213,8 +214,7 @@ class RosSystem:
 
     def run(self, command: list[str]) -> tuple[int, str]:
         """Run a command of the image; its exit code and what it wrote."""
-        line = " ".join(f"'{word}'" for word in command)
-        return self._container.call(["/bin/bash", "-l", "-c", line])
+        return self._container.call(["/bin/bash", "-l", "-c", shlex.join(command)])
 
     def used(self) -> Usage:
         """What the system's nodes have used; the memory is the sum of their peaks."""
