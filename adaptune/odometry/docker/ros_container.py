@@ -41,7 +41,7 @@ _MASTER = (
     "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
     "for python in python3 python; do "
     f'"$python" {_FOLDER}/ros1_container.py {_FOLDER}/link {{use_sim_time}}; '
-    "code=$?; [ $code = 9 ] || exit $code; "
+    "code=$?; [ $code = 9 ] || [ $code = 127 ] || exit $code; "
     "done; echo 'no Python of the image imports rospy: is it a ROS 1 image?' >&2; exit 127"
 )
 _LAUNCH = (
