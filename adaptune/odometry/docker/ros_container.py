@@ -2,6 +2,8 @@
 
 import contextlib
 import logging
+import os
+import re
 import shlex
 import shutil
 import socket
@@ -44,6 +46,11 @@ _MASTER = (
     "code=$?; [ $code = 9 ] || [ $code = 127 ] || exit $code; "
     "done; echo 'no Python of the image imports rospy: is it a ROS 1 image?' >&2; exit 127"
 )
+_CLOSING = re.compile(
+    rb"(\x1b\[\d*m)*(=*|log file: .*|Initiating shutdown!|\[\S+\] killing on exit|"
+    rb"all processes on machine have died.*|(\.\.\. )?shutting down .*|done)(\x1b\[\d*m)*"
+)
+"""Lines that roslaunch writes at its end, after the last ones of the nodes."""
 _LAUNCH = (
     "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
     f"exec > {_FOLDER}/roslaunch.log 2>&1; "
@@ -57,6 +64,8 @@ _PROBE = (
 _BETWEEN_LOOKS = 0.1
 _OTHERS_ONLY = 10.0
 """Seconds in which nodes have subscribed to other topics only."""
+_TAIL = 1 << 14
+"""Bytes of a log in which its last lines are."""
 _TICK = 0.01
 """Seconds."""
 _START = 30.0
@@ -298,7 +307,9 @@ class SimClock:
 
 def _last_lines(path: Path) -> str:
     with contextlib.suppress(OSError), path.open("rb") as file:
-        return hosting.last_lines(file)
+        file.seek(max(file.seek(0, os.SEEK_END) - _TAIL, 0))
+        lines = [line for line in file.read().splitlines() if not _CLOSING.fullmatch(line)]
+        return hosting.plain_lines(re.sub(rb"={10,}", b"", b"\n".join(lines)))
     return ""
 
 
