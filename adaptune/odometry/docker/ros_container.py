@@ -21,6 +21,7 @@ from adaptune.odometry.base import OdometryError, Usage
 from adaptune.odometry.docker.engine import (
     Container,
     ContainerSettings,
+    EngineError,
     Mount,
     default_user,
     image_digest,
@@ -66,6 +67,8 @@ _OTHERS_ONLY = 10.0
 """Seconds in which nodes have subscribed to other topics only."""
 _TAIL = 1 << 14
 """Bytes of a log in which its last lines are."""
+_UNTIL_NOTED = 0.5
+"""Seconds in which the engine notes that a container has ended."""
 _TICK = 0.01
 """Seconds."""
 _START = 30.0
@@ -131,7 +134,11 @@ class RosSystem:
                     bare=True,
                 )
                 undo.callback(self._container.close)
-                self._launch = self._container.run(self._launched(), self._environment)
+                try:
+                    self._launch = self._container.run(self._launched(), self._environment)
+                except EngineError as error:
+                    time.sleep(_UNTIL_NOTED)
+                    raise self._no_roscore() or error from error
                 connection = self._accept(server)
             self.link = Ros1(connection, self._running, self._container.close)
             undo.pop_all()
@@ -149,10 +156,16 @@ class RosSystem:
         while time.monotonic() - begin < _START:
             with contextlib.suppress(TimeoutError):
                 return server.accept()[0]
-            if (code := self._container.ended()) is not None:
-                words = self._container.last_lines()
-                raise OdometryError(f"no roscore: {hosting.verdict(code)}: {words}")
+            if (failure := self._no_roscore()) is not None:
+                raise failure
         raise OdometryError(f"there was no roscore in {_START:g} s: {self._container.last_lines()}")
+
+    def _no_roscore(self) -> OdometryError | None:
+        """How the container ended; None while it runs."""
+        if (code := self._container.ended()) is None:
+            return None
+        words = self._container.last_lines()
+        return OdometryError(f"no roscore: {hosting.verdict(code)}: {words}")
 
     def state(self) -> dict[str, Any]:
         """What adaptune's node sees, see `ros1_node`; an error where the system has ended.
