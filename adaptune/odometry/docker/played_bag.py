@@ -184,12 +184,21 @@ class PlayedBag(WholeRun):
             raise OdometryError(f"it took longer than {limit} for each scan")
 
     def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
-        if not recorder.received:
-            topics = ", ".join(sorted(set(system.link.topics()) - {"/clock", "/rosout"}))
-            what = (
-                f"nothing was published on {self.settings.odometry}, but on {topics or 'nothing'}"
+        if recorder.received:
+            return
+        topic, drain = self.settings.odometry, self.settings.drain
+        topics = set(system.link.topics()) - {"/clock", "/rosout"}
+        others = ", ".join(sorted(topics - {topic})) or "nothing"
+        if topic in topics:
+            raise OdometryError(
+                f"nothing was published on {topic} until {drain:g} s after the bag, though a node "
+                f"announces it (others publish {others}); a system that is slow to begin needs a "
+                f"longer odometry.settings.drain"
             )
-            raise OdometryError(f"{what}; name its topic as odometry.settings.odometry")
+        raise OdometryError(
+            f"nothing was published on {topic}, but on {others}; name its topic as "
+            f"odometry.settings.odometry"
+        )
 
     def _finish(
         self, system: RosSystem, recorder: PoseRecorder | None, given: ProgramInput
