@@ -26,10 +26,12 @@ N_SCANS = 40
 LIMITS = Limits(seconds=10.0, memory=2.0)
 VALUES = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.5}
 """Of the parameters in the template that are tuned here."""
+FIXED = {"downsampling": 0.7, "iterations": 20}
+"""The others; ROS reads `7e-1` as a text, and the node would take its default for it."""
 TEMPLATE = """\
 use_sim_time: {sim}
 common: {{points_topic: {points}}}
-gicp: {{max_correspondence_distance: 9.0, keyframe_interval: 9, downsampling: 0.5, iterations: 20}}
+gicp: {{max_correspondence_distance: 9.0, keyframe_interval: 9, downsampling: 7e-1, iterations: 20}}
 other: {{voxel: 1}}
 imitate: {imitate}
 """
@@ -78,8 +80,8 @@ def drive(odometry, first=0, T=None):
 
 @cache
 def host_poses(**parameters):
-    """What keyframe GICP finds in this process; parameters left out are those of `VALUES`."""
-    return drive(InProcess(KeyframeGicp(VALUES | parameters)))
+    """What keyframe GICP finds in this process; parameters left out are the template's."""
+    return drive(InProcess(KeyframeGicp(VALUES | FIXED | parameters)))
 
 
 def containers():

@@ -2,7 +2,7 @@ import re
 
 import numpy as np
 import pytest
-from contained import LIMITS, VALUES, containers, drive, host_poses, scans
+from contained import FIXED, LIMITS, VALUES, containers, drive, host_poses, scans
 from needs import reference_image
 
 from adaptune.odometry import OdometryError
@@ -29,7 +29,7 @@ def shell(script):
 def make():
     odometries = []
 
-    def begin(given=None, parameters=VALUES, limits=LIMITS):
+    def begin(given=None, parameters=VALUES | FIXED, limits=LIMITS):
         odometries.append(DockerProcess.instance(parameters, given or settings(), limits))
         return odometries[-1]
 
@@ -60,7 +60,7 @@ def changing(odometry):
 
 def test_it_is_the_same_odometry_and_changes_its_parameters(make):
     odometry = make()
-    here = changing(InProcess(KeyframeGicp(VALUES)))
+    here = changing(InProcess(KeyframeGicp(VALUES | FIXED)))
     assert np.abs(here - host_poses()[1:20]).max() > 1e-5
     np.testing.assert_allclose(changing(odometry), here, atol=1e-6)
     # It keeps its container, and its parameters, from start to start.

@@ -1,0 +1,235 @@
+"""The reference image's system, scan by scan."""
+
+import re
+
+import numpy as np
+import pytest
+from contained import (
+    FIXED,
+    LIMITS,
+    N_SCANS,
+    VALUES,
+    Said,
+    containers,
+    drive,
+    host_poses,
+    rustle,
+    scans,
+    template,
+)
+from needs import reference_image
+
+from adaptune.odometry import OdometryError, WarmUp
+from adaptune.odometry.docker import lockstep
+from adaptune.odometry.docker.engine import engine
+from adaptune.odometry.docker.ros_container import RosSystem
+from adaptune.odometry.docker.rustle import Rustle
+from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.hand_over import HandOver
+from adaptune.odometry.in_process import InProcess
+from adaptune.selection import Selection
+
+pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+
+OTHER = {"max_correspondence_distance": 3.0}
+SET = "test {name} != keyframe_interval || { echo 'I do not know {name}'; exit 4; }; exec rosparam \
+set {node}/{name} {value}"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _image():
+    reference_image()
+
+
+@pytest.fixture
+def systems(monkeypatch):
+    """The systems that are started."""
+    started = []
+
+    class Noted(RosSystem):
+        def __init__(self, *given):
+            super().__init__(*given)
+            started.append(self)
+
+    monkeypatch.setattr(lockstep, "RosSystem", Noted)
+    return started
+
+
+@pytest.fixture
+def make(tmp_path):
+    odometries = []
+
+    def begin(parameters=VALUES, imitate=None, points="/points", settings=()):
+        file = template(tmp_path / "params.yaml", points=points, **(imitate or {}))
+        given = rustle(file, **({"play": "lockstep", "patience": 5.0} | dict(settings)))
+        odometries.append(Rustle.instance(parameters, given, LIMITS, None))
+        return odometries[-1]
+
+    yield begin
+    for odometry in odometries:
+        odometry.close()
+    assert not containers()
+
+
+def on(odometry, first, end):
+    """Register more scans."""
+    given = [odometry.prepare(scan) for scan in scans()[first:end]]
+    return [odometry.register(prepared) for prepared in given]
+
+
+def test_the_poses_are_those_of_a_played_bag_and_it_starts_again_on_the_way(make):
+    odometry = make()
+    assert odometry.ended
+    np.testing.assert_allclose(drive(odometry), host_poses(), atol=1e-6)
+    assert not odometry.faults
+    assert 0.0 < odometry.usage.cpu < 100.0
+    assert 0.0 < odometry.usage.memory < 1000.0
+    # A start has a container of its own, a frame of its own, and forgets what was before.
+    (before,) = containers()
+    T = np.eye(4)
+    T[:3, 3] = 5.0, 6.0, 7.0
+    again = drive(odometry, N_SCANS - 10, T)
+    (after,) = containers()
+    assert after != before
+    here = InProcess(KeyframeGicp(VALUES | FIXED))
+    np.testing.assert_allclose(again, T @ drive(here, N_SCANS - 10), atol=1e-6)
+    odometry.close()
+    assert odometry.ended
+    assert not containers()
+
+
+def test_parameters_get_there_as_numbers_and_change_while_it_runs(make, systems):
+    odometry = make(settings={"node": "/gicp"})
+    odometry.start(scans()[0], np.eye(4))
+    on(odometry, 1, 7)
+    link = systems[0].link
+    held = link.ask("parameters")
+    assert held["gicp"] == VALUES | FIXED
+    assert isinstance(held["gicp"]["iterations"], int)
+    assert isinstance(held["gicp"]["max_correspondence_distance"], float)
+    assert held["use_sim_time"] is True
+    with Said() as said:
+        odometry.apply(Selection(0, OTHER))
+    assert odometry.parameters == VALUES | OTHER
+    assert "takes effect" not in str(said)
+    assert link.ask("parameters")["gicp"]["max_correspondence_distance"] == 3.0
+    poses = [registration.T_odom_sensor for registration in on(odometry, 7, 20)]
+    here = InProcess(KeyframeGicp(VALUES | FIXED))
+    here.start(here.prepare(scans()[0]), np.eye(4))
+    on(here, 1, 7)
+    here.apply(Selection(0, OTHER))
+    expected = [registration.T_odom_sensor for registration in on(here, 7, 20)]
+    np.testing.assert_allclose(poses, expected, atol=1e-6)
+    assert np.abs(poses - host_poses()[7:20]).max() > 1e-5
+    # The node bounds it to 10, and says so.
+    with pytest.raises(OdometryError, match=r"/gicp holds max_correspondence_distance = 10\.0"):
+        odometry.apply(Selection(0, {"max_correspondence_distance": 30.0}))
+
+
+def test_nobody_says_whether_a_node_without_reconfigure_reads_its_parameters_again(make, systems):
+    odometry = make(imitate={"read_once": True}, settings={"node": "/gicp"})
+    odometry.start(scans()[0], np.eye(4))
+    with Said() as said:
+        odometry.apply(Selection(0, OTHER))
+    assert str(said) == (
+        "/gicp: nobody says whether max_correspondence_distance takes effect before the node "
+        "starts again"
+    )
+    held = systems[0].link.ask("parameters")
+    assert held["gicp"]["max_correspondence_distance"] == 3.0
+    poses = [registration.T_odom_sensor for registration in on(odometry, 1, 10)]
+    np.testing.assert_allclose(poses, host_poses()[1:10], atol=1e-6)
+
+
+def test_a_command_sets_parameters(make, systems):
+    odometry = make(settings={"node": "/gicp", "set_parameter": ("sh", "-c", SET)})
+    odometry.start(scans()[0], np.eye(4))
+    odometry.apply(Selection(0, {"max_correspondence_distance": 3.5}))
+    held = systems[0].link.ask("parameters")
+    assert held["gicp"]["max_correspondence_distance"] == 3.5
+    with pytest.raises(OdometryError, match="exit code 4: I do not know keyframe_interval"):
+        odometry.apply(Selection(0, {"keyframe_interval": 2.0}))
+
+
+def test_hand_over_between_containers(make):
+    def begin(parameters):
+        return make(parameters)
+
+    odometry = HandOver(begin, VALUES, WarmUp(0.5, 0.5, 1))
+    prepared = [odometry.prepare(scan) for scan in scans()[:16]]
+    odometry.start(prepared[0], np.eye(4))
+    poses = [np.eye(4), *(odometry.register(p).T_odom_sensor for p in prepared[1:8])]
+    odometry.apply(Selection(0, VALUES | OTHER))
+    assert len(containers()) == 1
+    poses += [odometry.register(p).T_odom_sensor for p in prepared[8:]]
+    np.testing.assert_allclose(poses[:8], host_poses()[:8], atol=1e-6)
+    np.testing.assert_allclose(np.diff(np.array(poses)[:, 0, 3]), 0.3, atol=0.05)
+    assert not odometry.faults
+    odometry.close()
+
+
+def test_one_that_dies_is_a_fault_with_its_last_lines_and_starts_again(make):
+    odometry = make(imitate={"die_at": 4}, settings={"patience": 2.0})
+    poses = drive(odometry)
+    np.testing.assert_allclose(poses[:4], host_poses()[:4], atol=1e-6)
+    assert np.isnan(poses[-1]).all()
+    (fault,) = odometry.faults
+    assert re.match(r"(node /gicp died|roslaunch ended with code \d+): ", fault), fault
+    assert "gicp: terminating after 4 scans: the map is corrupt" in fault
+    assert odometry.ended
+    assert not containers()
+    odometry.start(scans()[0], np.eye(4))
+    np.testing.assert_allclose(
+        [r.T_odom_sensor for r in on(odometry, 1, 4)], host_poses()[1:4], atol=1e-6
+    )
+
+
+def test_a_pose_that_is_none_is_a_fault(make):
+    odometry = make(imitate={"jump": 1})
+    odometry.start(scans()[0], np.eye(4))
+    (fault,) = odometry.faults
+    assert fault.startswith("it gave a pose that is not finite: ")
+    assert np.isnan(on(odometry, 1, 2)[0].T_odom_sensor).all()
+
+
+def test_a_container_that_is_killed_is_a_fault(make):
+    odometry = make()
+    odometry.start(scans()[0], np.eye(4))
+    (container,) = containers()
+    engine().api.kill(container)
+    assert all(np.isnan(r.T_odom_sensor).all() for r in on(odometry, 1, 4))
+    assert len(odometry.faults) == 1
+    assert odometry.ended
+
+
+def test_scans_without_a_pose_continue_the_motion(make, monkeypatch):
+    monkeypatch.setattr(lockstep, "_MOST_SILENT", 4)
+    odometry = make(imitate={"silent": True}, settings={"patience": 0.3})
+    T, step = np.eye(4), np.eye(4)
+    T[:3, 3], step[:3, 3] = (5.0, 6.0, 7.0), (0.3, 0.1, 0.0)
+    odometry.start(scans()[0], T, step)
+    for found in on(odometry, 1, 3):
+        T = T @ step
+        assert not found.registered
+        np.testing.assert_allclose(found.T_odom_sensor, T, atol=1e-9)
+    assert not odometry.faults
+    assert np.isnan(on(odometry, 3, 5)[-1].T_odom_sensor).all()
+    (fault,) = odometry.faults
+    assert fault.startswith("no pose on /Odometry for 4 scans in a row: ")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"imitate": {"quit_launch": True}}, "roslaunch ended with code 0: "),
+        ({"points": "/velodyne"}, "no node subscribed to the clouds' topic /points .*/velodyne"),
+        ({"settings": {"package": "other"}}, "roslaunch ended with code 1: there is no package"),
+    ],
+)
+def test_one_that_cannot_begin_says_why(make, given, words, monkeypatch):
+    monkeypatch.setattr("adaptune.odometry.docker.ros_container._OTHERS_ONLY", 1.0)
+    odometry = make(**given)
+    with pytest.raises(OdometryError, match=f"^{reference_image()}: {words}"):
+        odometry.start(scans()[0], np.eye(4))
+    assert odometry.ended
+    assert not containers()

@@ -1,0 +1,285 @@
+"""Trials of the reference image on a short bag; those that need no other run side by side."""
+
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+from contained import (
+    FIXED,
+    LIMITS,
+    N_SCANS,
+    VALUES,
+    Said,
+    containers,
+    drive,
+    host_poses,
+    recording,
+    rustle,
+    scans,
+    template,
+    truth,
+)
+from needs import reference_image
+from rosbags.highlevel import AnyReader
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.docker import ros_container
+from adaptune.odometry.docker.engine import image_digest
+from adaptune.odometry.docker.played_bag import PlayedBag
+from adaptune.odometry.docker.rustle import Rustle
+from adaptune.odometry.isolation import Limits
+
+pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+
+SIDE_BY_SIDE = 3
+
+TRIALS = {
+    "plain": {"parameters": VALUES | {"other.voxel": 2}},
+    "late": {
+        "imitate": {"ready_delay": 3.0},
+        "points": "/velodyne",
+        "settings": {"points": "/velodyne"},
+    },
+    "rate": {"imitate": {"rate": 5000}},
+    "by the clock": {"imitate": {"stamp_now": True, "seconds_per_scan": 0.02}},
+    "present time": {"imitate": {"stamp_now": True}, "sim": "false"},
+    "lag": {"imitate": {"seconds_per_scan": 0.1}, "settings": {"drain": 2.0}},
+    "no time": {"imitate": {"seconds_per_scan": 3.0}, "settings": {"rate": 20.0, "drain": 0.0}},
+    "too slow": {
+        "imitate": {"seconds_per_scan": 60.0},
+        "limits": Limits(seconds=15.0 / N_SCANS),
+        "settings": {"drain": 60.0},
+    },
+    "drops": {"imitate": {"seconds_per_scan": 0.1, "queue_size": 1}, "settings": {"rate": 2.0}},
+    "loses nearly all": {
+        "imitate": {"seconds_per_scan": 3.0, "queue_size": 1},
+        "settings": {"drain": 6.0},
+    },
+    "dies": {"imitate": {"die_at": 3}, "settings": {"rate": 0.1}},
+    "node dies": {
+        "imitate": {"die_at": 3},
+        "settings": {"rate": 0.1, "arguments": ("required:=false",)},
+    },
+    "quits": {"imitate": {"quit_launch": True}},
+    "silent": {"imitate": {"silent": True}},
+    "another topic": {"settings": {"odometry": "/odom"}},
+    "no poses": {"settings": {"odometry": "/points"}},
+    "camera": {"imitate": {"frame": "camera"}},
+    "jump": {"imitate": {"jump": 20}},
+    "another package": {"settings": {"package": "other"}},
+    "hears nothing": {"points": "/velodyne"},
+}
+"""What is imitated and set in each trial."""
+
+
+class Ran(NamedTuple):
+    poses: np.ndarray | None
+    odometry: PlayedBag
+    error: str
+    said: str
+    seconds: float
+
+
+def run(
+    folder,
+    imitate=None,
+    parameters=VALUES,
+    limits=LIMITS,
+    sim="true",
+    points="/points",
+    settings=(),
+):
+    """Run a trial."""
+    folder.mkdir(parents=True)
+    given = recording(folder, folder / "logs")
+    given.logs.mkdir()
+    file = template(folder / "template.yaml", sim, points, **(imitate or {}))
+    odometry = Rustle.instance(parameters, rustle(file, **dict(settings)), limits, lambda: given)
+    poses, error, begin = None, "", time.monotonic()
+    with Said() as said:
+        try:
+            poses = drive(odometry)
+        except OdometryError as caught:
+            error = str(caught)
+    return Ran(poses, odometry, error, str(said), time.monotonic() - begin)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("trials")
+
+
+@pytest.fixture(scope="module")
+def ran(folder):
+    """The outcome of a trial; all of them begin with the first that is asked for."""
+    reference_image()
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
+        patch.setattr(ros_container, "_OTHERS_ONLY", 2.0)
+        trials = {name: pool.submit(run, folder / name, **given) for name, given in TRIALS.items()}
+        yield lambda name: trials[name].result()
+        for trial in trials.values():
+            trial.cancel()
+    assert not containers()
+
+
+def kept(folder, name):
+    (logs,) = (folder / name / "logs").iterdir()
+    return logs
+
+
+def assert_good(trial):
+    assert not trial.error
+    assert not trial.odometry.faults
+    np.testing.assert_allclose(trial.poses, host_poses(), atol=1e-6)
+
+
+def test_the_poses_are_those_of_the_odometry(ran):
+    trial = ran("plain")
+    assert_good(trial)
+    np.testing.assert_allclose(trial.poses, truth(), atol=0.1)
+    assert re.search(r"adaptune-reference: bag \d.* s besides \(container", trial.said)
+    assert 0.0 < trial.odometry.usage.cpu < 100.0
+    assert 0.0 < trial.odometry.usage.memory < 1000.0
+
+
+def test_a_parameter_that_no_node_reads_is_named(ran):
+    warned = [line for line in ran("plain").said.splitlines() if "no node has read" in line]
+    assert warned == [
+        "adaptune-reference: no node has read the parameter other.voxel, so its value changes "
+        "nothing; is its name in the template right?"
+    ]
+
+
+def test_what_is_kept_of_a_trial(ran, folder):
+    ran("plain")
+    logs = kept(folder, "plain")
+    held = yaml.safe_load((logs / "params.yaml").read_text())
+    assert held["gicp"] == VALUES | FIXED
+    assert isinstance(held["gicp"]["iterations"], int)
+    assert held["other"] == {"voxel": 2}
+    assert "ready for /points" in (logs / "roslaunch.log").read_text()
+    with AnyReader([logs / "odometry.bag"]) as bag:
+        assert {c.topic: c.msgtype for c in bag.connections} == {
+            "/Odometry": "nav_msgs/msg/Odometry"
+        }
+        stamps = [stamp for _, stamp, _ in bag.messages()]
+    assert stamps == [scan.stamp for scan in scans()]
+    note = yaml.safe_load((logs / "trial.yaml").read_text())
+    assert note["image"] == "adaptune-reference"
+    assert note["digest"] == image_digest("adaptune-reference")
+    assert note["parameters"] == VALUES | {"other.voxel": 2}
+    assert note["rate"] == 4.0
+    assert note["seconds"].keys() == {"container", "ready", "bag", "drained", "removed"}
+    assert note["seconds"]["bag"] > 0.9
+    assert note["input"].endswith("/plain/drive.bag")
+
+
+def test_it_waits_for_one_that_is_late_and_renames_topics(ran):
+    assert_good(ran("late"))
+
+
+def test_one_that_sleeps_by_the_clock_finishes_when_the_bag_has_ended(ran):
+    assert_good(ran("rate"))
+
+
+def test_stamps_by_the_clock_are_refused(ran):
+    (fault,) = ran("by the clock").odometry.faults
+    assert re.search(r"stamps .*: the system stamps poses by its own clock, not by the sc", fault)
+
+
+def test_stamps_of_the_present_time_are_refused(ran):
+    (fault,) = ran("present time").odometry.faults
+    assert re.search(
+        r"its poses are of \d+\.\d{3} s to .*, the scans of 1700000000\.123 s to 1700000004.*: the "
+        r"system stamps poses by its own clock, .*use_sim_time, or lower the rate",
+        fault,
+    )
+
+
+def test_it_waits_for_one_that_lags_behind(ran, folder):
+    assert_good(ran("lag"))
+    seconds = yaml.safe_load((kept(folder, "lag") / "trial.yaml").read_text())["seconds"]
+    assert seconds["drained"] > 1.0
+
+
+def test_one_that_is_far_too_slow_is_ended(ran):
+    (fault,) = ran("too slow").odometry.faults
+    assert fault.startswith("it took longer than isolation.seconds = 0.375 for each scan")
+
+
+def test_scans_that_are_dropped_are_counted(ran):
+    trial = ran("drops")
+    assert not trial.odometry.faults
+    assert re.search(
+        r"adaptune-reference: \d\d of 40 scans have no pose at rate 2: it drops scans, so a lower "
+        r"odometry\.settings\.rate gives other results",
+        trial.said,
+    )
+
+
+def test_one_that_drops_nearly_all_scans_has_a_fault(ran):
+    (fault,) = ran("loses nearly all").odometry.faults
+    assert re.match(r"it gave poses for \d+ of 40 scans, the last at|its poses are of", fault)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("dies", r"(roslaunch ended with code \d+|node /gicp died): "),
+        ("node dies", r"node /gicp died: "),
+    ],
+)
+def test_one_that_dies_is_a_fault_at_once(ran, name, words):
+    trial = ran(name)
+    (fault,) = trial.odometry.faults
+    assert re.match(words, fault), fault
+    assert "terminating after 3 scans: the map is corrupt" in fault
+    # The bag alone takes forty.
+    assert trial.seconds < 35.0
+    assert np.isnan(trial.poses[-1]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("quits", r"roslaunch ended with code 0: .*gicp-1.*"),
+        (
+            "silent",
+            r"nothing was published on /Odometry until 1 s after the bag, though a node announces "
+            r"it \(others publish .*/gicp/parameter_.*\); .*longer odometry\.settings\.drain",
+        ),
+        ("no time", r"nothing was published on /Odometry until 0 s after the bag, .*drain"),
+        ("another topic", r"nothing was published on /odom, but on /Odometry, .*set.*odometry"),
+        ("no poses", r"/points is sensor_msgs/msg/PointCloud2; odometry\.settings\.odometry must"),
+        ("jump", r"1 of 40 poses are no poses \(NaN, or no rotation\)"),
+        ("another package", r"roslaunch ended with code 1: there is no package other"),
+        (
+            "hears nothing",
+            r"no node subscribed to the clouds' topic /points in \d+ s \(topics with subscribers: "
+            r".*/velodyne.*\); name the topic",
+        ),
+    ],
+)
+def test_what_went_wrong_is_told(ran, name, words):
+    trial = ran(name)
+    assert not trial.error
+    (fault,) = trial.odometry.faults
+    assert re.match(words, fault), fault
+    assert np.isnan(trial.poses[-1]).all()
+
+
+def test_poses_of_another_frame_are_refused(ran):
+    error = ran("camera").error
+    assert re.search(r"another frame: turned by 120 degrees.*odometry\.settings\.extrinsic", error)
+
+
+def test_an_image_without_ros(tmp_path):
+    settings = {"image": "debian:bookworm-slim"}
+    trial = run(tmp_path / "trial", settings=settings)
+    (fault,) = trial.odometry.faults
+    assert "no roscore: its process ended with code 127: " in fault
+    assert "no Python of the image imports rospy: is it a ROS 1 image?" in fault

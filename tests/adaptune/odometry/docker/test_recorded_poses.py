@@ -1,0 +1,168 @@
+"""Stamps and poses that a system publishes, without a container."""
+
+import local_link
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.docker.played_bag import PoseRecorder, check_stamps, write_poses
+from adaptune.sequence.pose_messages import POSES, usable
+
+PERIOD = 10**8
+SCANS = 1_700_000_000_123_456_789 + PERIOD * np.arange(40)
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+@given(
+    late=st.integers(0, PERIOD),
+    drop=st.sets(st.integers(0, 39), max_size=30),
+    jitter=st.integers(0, 4_000_000),
+    seed=st.integers(0, 100),
+)
+def test_stamps_of_the_scans_pass_wherever_in_the_scan_they_are(late, drop, jitter, seed):
+    wobble = np.random.default_rng(seed).integers(0, jitter + 1, 40)
+    kept = [i for i in range(40) if i not in drop]
+    check_stamps((SCANS + late + wobble)[kept], SCANS)
+
+
+@given(often=st.integers(2, 20), late=st.integers(0, PERIOD))
+def test_poses_that_come_more_often_are_judged_by_begin_and_end(often, late):
+    stamps = SCANS[0] + late + PERIOD // often * np.arange(40 * often)
+    check_stamps(stamps, SCANS)
+    with pytest.raises(OdometryError, match=r"its poses are of .* s, the scans of .*its own clock"):
+        check_stamps(stamps + 2 * 10**9, SCANS)
+    with pytest.raises(OdometryError, match="its poses are of"):
+        check_stamps(stamps - 2 * 10**9, SCANS)
+
+
+@given(seed=st.integers(0, 1000))
+def test_stamps_of_another_clock_are_refused(seed):
+    rng = np.random.default_rng(seed)
+    # As of a system that stamps when it has finished, and takes its time.
+    stamps = np.sort(SCANS + rng.integers(0, PERIOD // 2, 40))
+    with pytest.raises(OdometryError, match=r"stamps are not those of the scans, but up to 0\.0\d"):
+        check_stamps(stamps, SCANS)
+
+
+@given(rate=st.floats(1.03, 4.0))
+def test_a_clock_of_another_speed_is_refused(rate):
+    stamps = SCANS[0] + ((SCANS - SCANS[0]) / rate).astype(np.int64)
+    with pytest.raises(OdometryError, match="the system stamps poses by its own clock"):
+        check_stamps(stamps, SCANS)
+
+
+def test_nothing_is_said_of_no_poses_and_of_one():
+    check_stamps(SCANS[:0], SCANS)
+    check_stamps(SCANS[:1], SCANS)
+
+
+class Recorded:
+    """Stands for a link whose node publishes messages of one type."""
+
+    store = local_link.STORE
+
+    def record(self, topic, take):
+        self.topic, self.take = topic, take
+
+    def publish(self, message):
+        kind = message.__msgtype__
+        self.take(kind, bytes(self.store.serialize_ros1(message, kind)))
+
+
+def odometry(i, x=0.0):
+    T = np.eye(4)
+    T[0, 3] = x
+    return local_link.odometry(int(SCANS[i]), T)
+
+
+@pytest.fixture
+def link():
+    return Recorded()
+
+
+def test_poses_are_kept_as_they_come(link, tmp_path):
+    recorder = PoseRecorder(link, "/found")
+    assert link.topic == "/found"
+    assert recorder.poses() == []
+    for i in (0, 1, 3, 2):
+        link.publish(odometry(i, 0.3 * i))
+    assert [stamp for stamp, *_ in recorder.poses()] == SCANS[[0, 1, 3, 2]].tolist()
+    trajectory, unusable = usable(recorder.poses())
+    assert unusable == 0
+    np.testing.assert_allclose(trajectory.T_world_sensor[:, 0, 3], [0.0, 0.3, 0.6, 0.9])
+    recorder.write(tmp_path / "found.bag")
+    with AnyReader([tmp_path / "found.bag"]) as bag:
+        (connection,) = bag.connections
+        assert (connection.topic, connection.msgtype) == ("/found", ODOMETRY)
+        assert sorted(stamp for _, stamp, _ in bag.messages()) == SCANS[:4].tolist()
+
+
+def test_pauses_are_measured(link, monkeypatch):
+    now = [10.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    recorder = PoseRecorder(link, "/found")
+    for second in (15.0, 15.5, 17.0, 17.2):
+        now[0] = second
+        link.publish(odometry(0))
+    assert recorder.last == 17.2
+    # The time until the first is no pause.
+    assert recorder.longest_pause == 1.5
+
+
+def test_messages_that_hold_no_poses_are_refused(link):
+    recorder = PoseRecorder(link, "/found")
+    link.publish(local_link.imu(0))
+    with pytest.raises(OdometryError, match=r"/found is sensor_msgs/msg/Imu; odometry\.settings"):
+        recorder.poses()
+
+
+def test_of_paths_the_last_holds_all(link, tmp_path):
+    recorder, types = PoseRecorder(link, "/path"), local_link.TYPES
+    poses = []
+    for i in range(3):
+        said = odometry(i, 0.1 * i)
+        poses.append(types["geometry_msgs/msg/PoseStamped"](said.header, said.pose.pose))
+        link.publish(types["nav_msgs/msg/Path"](said.header, list(poses)))
+    assert [stamp for stamp, *_ in recorder.poses()] == SCANS[:3].tolist()
+    recorder.write(tmp_path / "path.bag")
+    with AnyReader([tmp_path / "path.bag"]) as bag:
+        assert [stamp for _, stamp, _ in bag.messages()] == SCANS[:3].tolist()
+    link.publish(types["nav_msgs/msg/Path"](said.header, []))
+    assert recorder.poses() == []
+
+
+def test_every_type_of_poses_can_be_recorded(link, tmp_path):
+    types, said = local_link.TYPES, odometry(5, 1.5)
+    stamped = types["geometry_msgs/msg/PoseStamped"](said.header, said.pose.pose)
+    p, q = said.pose.pose.position, said.pose.pose.orientation
+    transform = types["geometry_msgs/msg/TransformStamped"](
+        said.header,
+        "lidar",
+        types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](p.x, p.y, p.z), q),
+    )
+    messages = {
+        "geometry_msgs/msg/PoseStamped": stamped,
+        "geometry_msgs/msg/PoseWithCovarianceStamped": types[
+            "geometry_msgs/msg/PoseWithCovarianceStamped"
+        ](said.header, said.pose),
+        ODOMETRY: said,
+        "nav_msgs/msg/Path": types["nav_msgs/msg/Path"](said.header, [stamped]),
+        "geometry_msgs/msg/TransformStamped": transform,
+        "tf2_msgs/msg/TFMessage": types["tf2_msgs/msg/TFMessage"]([transform]),
+    }
+    assert messages.keys() == POSES.keys() - {"tf/msg/tfMessage"}
+    for message in messages.values():
+        recorder = PoseRecorder(link, "/found")
+        link.publish(message)
+        ((stamp, _, found, _),) = recorder.poses()
+        assert (stamp, found.x) == (SCANS[5], 1.5)
+        recorder.write(tmp_path / "found.bag")
+        (tmp_path / "found.bag").unlink()
+
+
+def test_an_empty_recording_makes_an_empty_bag(tmp_path):
+    write_poses(tmp_path / "empty.bag", "/found", [], local_link.STORE)
+    assert (tmp_path / "empty.bag").exists()

@@ -1,0 +1,116 @@
+import pytest
+from contained import template
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.docker.ros_parameters import server_keys, warn_of_unread
+from adaptune.odometry.template import Template
+
+HELD = {
+    "gicp": {"keyframe_interval": 1.5, "iterations": 20, "robust": True, "name": "x"},
+    "front": {"gicp": {"keyframe_interval": 1.5}},
+    "other": {"voxel": 2, "gicp_keyframe_interval": 1.0},
+    "gate": "",
+}
+FILE = """\
+gicp: {keyframe_interval: 0.0, iterations: 1, robust: false, name: y}
+other/voxel: 1.0
+use_sim_time: true
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text(FILE)
+    return Template(path)
+
+
+def test_the_path_of_a_value(tmp_path):
+    held = Template(template(tmp_path / "params.yaml"))
+    assert held.path_of("gicp.iterations") == ("gicp", "iterations")
+    assert held.path_of("gicp/iterations") == ("gicp", "iterations")
+    assert held.path_of("iterations") == ("gicp", "iterations")
+    assert held.path_of("use_sim_time") == ("use_sim_time",)
+    assert held.path_of("iteration") == ()
+
+
+def test_a_value_of_many_names(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text("a: {b/c: {d: 1}, e: [1, 2], list: [{d: 2}, {d: 3}]}\nb: {d: 1}\nd: 4\n")
+    held = Template(path)
+    assert held.path_of("c.d") == ("a", "b", "c", "d")
+    assert held.path_of("a.e.1") == ("a", "e", "1")
+    assert held.path_of("list.1.d") == ("a", "list", "1", "d")
+    assert held.path_of("d") == ("d",)
+    assert held.path_of("b.d") == ("b", "d")
+    path.write_text("a: {x: 1}\nb: {x: 1}\n")
+    with pytest.raises(OdometryError, match=r"'x' may be any of a\.x, b\.x; name one of them"):
+        Template(path).path_of("x")
+
+
+def test_where_the_parameter_server_holds_them(file):
+    given = {"keyframe_interval": 1.5, "iterations": 20, "gicp.robust": True, "voxel": 2.0}
+    assert server_keys(file, given, HELD) == {
+        # A launch file may load the file into groups, and more than once.
+        "keyframe_interval": ["/gicp/keyframe_interval", "/front/gicp/keyframe_interval"],
+        "iterations": ["/gicp/iterations"],
+        "gicp.robust": ["/gicp/robust"],
+        "voxel": ["/other/voxel"],
+    }
+    assert server_keys(file, {}, None) == {}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            {"use_sim_time": True},
+            "the parameter server holds no use_sim_time: the launch file does",
+        ),
+        ({"iterations": 21}, r"/gicp/iterations is 20 on the parameter server, not 21: the launch"),
+        ({"robust": 1}, "/gicp/robust is True on the parameter server, not 1"),
+        ({"name": "z"}, "/gicp/name is 'x' on the parameter server, not 'z'"),
+        ({"keyframe_interval": 1.6}, "/gicp/keyframe_interval is 1.5 on the parameter server"),
+    ],
+)
+def test_values_that_do_not_arrive(file, given, words):
+    with pytest.raises(OdometryError, match=words):
+        server_keys(file, given, HELD)
+
+
+class Asked:
+    """Stands for a link: which node has asked for which parameters."""
+
+    def __init__(self, **asked):
+        self._asked = {f"/{name}": keys for name, keys in asked.items()}
+
+    def ask(self, kind):
+        assert kind == "asked"
+        return self._asked
+
+
+@pytest.mark.parametrize(
+    ("asked", "warned"),
+    [
+        ({"gicp": ["/gicp/voxel"]}, False),
+        ({"gicp": ["/gicp/voxel/"]}, False),
+        ({"gicp": ["/gicp/"]}, False),
+        ({"gicp": ["/gicp"]}, False),
+        ({"gicp": ["/gicp/vox"]}, True),
+        ({"gicp": ["/voxel", "/other"]}, True),
+        ({"roslaunch_1": ["/gicp/voxel"], "adaptune_1": ["/gicp"], "rosparam-1": ["/gicp"]}, True),
+        ({}, True),
+    ],
+)
+def test_parameters_that_no_node_reads_are_named_once(asked, warned, caplog, request):
+    # An image is warned of once.
+    for _ in range(2):
+        warn_of_unread(Asked(**asked), request.node.name, {"voxel": ["/gicp/voxel"]})
+    assert len(caplog.messages) == warned
+    assert all("no node has read the parameter voxel" in message for message in caplog.messages)
+
+
+def test_one_place_that_is_read_is_enough(caplog):
+    keys = {"voxel": ["/front/voxel", "/gicp/voxel"]}
+    warn_of_unread(Asked(gicp=["/gicp/voxel"]), "one place", keys)
+    assert not caplog.messages

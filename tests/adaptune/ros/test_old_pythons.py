@@ -1,0 +1,119 @@
+"""What a robot's Python runs must be written for 2.7 and 3.6; the tests have neither.
+
+The parser knows the grammar of 3.6; of 2.7 there is a list of what came later.
+"""
+
+import ast
+import builtins
+import io
+import tokenize
+from pathlib import Path
+
+import pytest
+
+from adaptune import ros
+
+FILES = ("ros1_node.py", "ros1_container.py")
+
+LATER = (
+    *(ast.AnnAssign, ast.AsyncFor, ast.AsyncFunctionDef, ast.AsyncWith, ast.Await, ast.JoinedStr),
+    *(ast.MatMult, ast.NamedExpr, ast.Nonlocal, ast.YieldFrom),
+)
+STATEMENTS = {"exec", "print"}
+"""Of Python 2, where no attribute can be called so."""
+ERRORS = {
+    name
+    for name, of in vars(builtins).items()
+    if isinstance(of, type) and issubclass(of, OSError) and of is not OSError
+} | {"ModuleNotFoundError", "RecursionError"}
+"""Names that only Python 3 has."""
+
+
+def later(source):
+    """What Python 2.7 or 3.6 cannot read in a source, as lines and words."""
+    try:
+        tree = ast.parse(source, feature_version=(3, 6))
+    except SyntaxError as error:
+        return [(error.lineno, "not of Python 3.6")]
+    lines = enumerate(source.splitlines(), 1)
+    found = [(number, "not ASCII") for number, line in lines if not line.isascii()]
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    numbers = (token for token in tokens if token.type == tokenize.NUMBER)
+    found += [(token.start[0], "digits in groups") for token in numbers if "_" in token.string]
+    # A call may have one starred argument, after which no other comes.
+    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call))
+    allowed = {id(call.args[-1]) for call in calls if call.args}
+    for node in ast.walk(tree):
+        starred = isinstance(node, ast.Starred) and id(node) not in allowed
+        if isinstance(node, LATER) or starred:
+            found.append((getattr(node, "lineno", 0), type(node).__name__))
+        found += [(getattr(node, "lineno", 0), what) for what in of_node(node)]
+    return found
+
+
+OF_NODE = {
+    "an annotation": lambda n: getattr(n, "annotation", None) or getattr(n, "returns", None),
+    "an argument by keyword only": lambda n: getattr(n, "kwonlyargs", None),
+    "a keyword of a class": lambda n: isinstance(n, ast.ClassDef) and n.keywords,
+    "raise from": lambda n: isinstance(n, ast.Raise) and n.cause,
+    "** in a mapping": lambda n: isinstance(n, ast.Dict) and None in n.keys,
+    "** twice": lambda n: isinstance(n, ast.Call) and [k.arg for k in n.keywords].count(None) > 1,
+    "super without arguments": lambda n: (
+        isinstance(n, ast.Call) and getattr(n.func, "id", None) == "super" and not n.args
+    ),
+    "a statement's name": lambda n: isinstance(n, ast.Attribute) and n.attr in STATEMENTS,
+    "a name of Python 3": lambda n: isinstance(n, ast.Name) and n.id in STATEMENTS | ERRORS,
+}
+"""What a part of a source may have that came later, and that its type alone does not tell."""
+
+
+def of_node(node):
+    return [what for what, has in OF_NODE.items() if has(node)]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_old_pythons_can_read_it(name):
+    assert later((Path(ros.__path__[0]) / name).read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "x: int = 1",
+        "def f(x: int): pass",
+        "def f() -> int: pass",
+        "def f(*, x): pass",
+        "def f(x, /): pass",
+        "f'{x}'",
+        "if (n := 1): pass",
+        "n = 1_000",
+        "first, *rest = x",
+        "y = [*x]",
+        "f(*x, *y)",
+        "f(*x, y)",
+        "f(**x, **y)",
+        "y = {**x}",
+        "class C(metaclass=M): pass",
+        "class C(object):\n    def f(self): super().f()",
+        "def f():\n    x = 1\n    def g():\n        nonlocal x",
+        "def f(): yield from x",
+        "async def f(): pass",
+        "raise x from y",
+        "match x:\n    case 1: pass",
+        "try: pass\nexcept FileNotFoundError: pass",
+        "try: pass\nexcept* E: pass",
+        "with (a as b, c as d): pass",
+        "x.print()",
+        "x = 'ä'",
+        "a @ b",
+    ],
+)
+def test_what_came_later_is_found(source):
+    assert later(source + "\n")
+
+
+@pytest.mark.parametrize(
+    "source", ["f(x, *y)", "f(*x, **y)", "f(x, *y, z=1)", "x = {1}", "with a as b, c as d: pass"]
+)
+def test_what_was_always_there_is_not(source):
+    assert not later(source + "\n")
