@@ -129,6 +129,8 @@ class Lockstep(Faulting):
 
     def apply(self, selection: Selection) -> None:
         """Set the node's parameters, see `adaptune.ros.steering.Steering.apply`."""
+        if unknown := selection.parameters.keys() - self.parameters.keys():
+            raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
         self.parameters |= selection.parameters
         if self._system is not None and self._steering is not None:
             try:
