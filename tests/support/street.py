@@ -1,5 +1,9 @@
-"""Odometries by name on a drive straight ahead along a street."""
+"""Odometries by name on a drive straight ahead along a street.
 
+Those in containers run the reference image, which is there only when one of them is made.
+"""
+
+import copy
 import sys
 import tempfile
 import threading
@@ -9,8 +13,10 @@ from pathlib import Path
 import drives
 import numpy as np
 import program
+from needs import reference_image
 
 from adaptune.odometry.command import Command
+from adaptune.odometry.gicp import KeyframeGicp
 from adaptune.odometry.in_process import InProcess
 from adaptune.odometry.isolation import Limits
 from adaptune.odometry.process import Process
@@ -23,10 +29,26 @@ from adaptune.space import Float, ParameterSpace
 STEP = 0.4
 """Metres between scans."""
 N_SCANS = 16
+START = 10**10
+"""Nanoseconds; ROS has no stamp of zero."""
+LOCKSTEP = "rustle, lockstep"
+"""The other way to run `rustle`."""
+TEMPLATE = """\
+use_sim_time: true
+gicp: {max_correspondence_distance: 1.0, keyframe_interval: 1.0, downsampling: 0.5, iterations: 20}
+"""
 
 
 def make(name, parameters=None):
     """A new instance; of programs, keyframe GICP that is served and program.py."""
+    if name in ("docker_command", "rustle"):
+        given = space_of(name).baseline | (parameters or {})
+        return copy.deepcopy(_that_has_run(name, tuple(given.items())))
+    if name in ("docker_process", LOCKSTEP):
+        given = parameters or {}
+        return _contained(
+            name, given if name == "docker_process" else space_of(name).baseline | given
+        )
     if name == "process":
         return Process(parameters or {}, served(), Limits(seconds=60.0))
     if name == "command":
@@ -35,6 +57,35 @@ def make(name, parameters=None):
         Command.check(settings, given)
         return Command(given, settings, Limits(seconds=10.0), lambda: recording)
     return InProcess(odometry_class(name)(parameters))
+
+
+@cache
+def _that_has_run(name, parameters):
+    """One that has run on the drive, which takes seconds."""
+    odometry = _contained(name, dict(parameters))
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    return odometry
+
+
+def _contained(name, parameters):
+    """A new instance whose program is in a container."""
+    from adaptune.odometry.docker.docker_process import DockerProcess
+
+    kind = odometry_class("rustle" if name == LOCKSTEP else name)
+    image, file = reference_image(), Path(_folder.name) / "params.yaml"
+    file.write_text(TEMPLATE)
+    given = {
+        "docker_command": {"command": ("odometry-plain", "{points}"), "template": str(file)},
+        "docker_process": {"command": ("odometry-serve", "{socket}")},
+        "rustle": {"template": str(file), "odometry": "/Odometry", "rate": 4.0},
+        LOCKSTEP: {"play": "lockstep", "node": "/gicp", "patience": 5.0},
+    }
+    given[LOCKSTEP] |= {"template": str(file), "odometry": "/Odometry"}
+    settings = kind.settings_type(image=image, **given[name])
+    if kind is not DockerProcess:
+        kind.check(settings, parameters)
+    recording = command_on_the_street()[1]
+    return kind.instance(parameters, settings, Limits(seconds=60.0), lambda: recording)
 
 
 def parameters_of(odometry):
@@ -50,11 +101,18 @@ def space_of(name):
                 "registration.distance": Float(low=0.5, high=4.0, baseline=2.0, log=True),
             }
         )
+    if name in ("docker_command", "rustle", LOCKSTEP):
+        tuned = ("max_correspondence_distance", "keyframe_interval")
+        return ParameterSpace({key: KeyframeGicp.space.parameters[key] for key in tuned})
+    if name == "docker_process":
+        return KeyframeGicp.space
     return Process.describe(served()).space if name == "process" else odometry_class(name).space
 
 
 def is_live(name):
-    return name != "command" and odometry_class("gicp" if name == "process" else name).live
+    if name in ("command", "docker_command", "rustle"):
+        return False
+    return name in ("process", "docker_process", LOCKSTEP) or odometry_class(name).live
 
 
 @cache
@@ -110,15 +168,15 @@ def scan(i):
     rng = np.random.default_rng(i)
     points = street()[rng.random(len(street())) < 0.5] - [STEP * i, 0.0, 0.0]
     points += rng.normal(0, 0.01, points.shape)
-    return Scan(i * 10**8, points.astype(np.float32))
+    return Scan(START + i * 10**8, points.astype(np.float32))
 
 
 def poor_scan(n, i=0):
     """A scan of `n` points all over the place, or one that is all NaN, in the place of scan `i`."""
     if n == "NaN":
-        return Scan(i * 10**8, np.full((5000, 3), np.nan, np.float32))
+        return Scan(START + i * 10**8, np.full((5000, 3), np.nan, np.float32))
     points = np.random.default_rng(n).uniform(2.0, 9.0, (n, 3))
-    return Scan(i * 10**8, points.astype(np.float32))
+    return Scan(START + i * 10**8, points.astype(np.float32))
 
 
 @cache

@@ -14,6 +14,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from street import (
+    LOCKSTEP,
     N_SCANS,
     STEP,
     drive,
@@ -31,20 +32,29 @@ from adaptune import cores
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import prepared_bytes
-from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
+from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.selection import Selection
 from adaptune.sequence import Scan
 
 CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 """Those that live in this process; test_conformance_isolated.py holds what the others must do."""
 
-every_odometry = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS])
+HERE = [*CLEAN, *(name for name in PROGRAMS if name not in CONTAINERS)]
+"""Those without an image."""
+
+every_odometry = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS, LOCKSTEP])
+
+# A node's clock does not go back, and each start takes seconds; test_lockstep.py holds more of it.
+but_lockstep = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS])
 
 # The program registers each scan to the one before.
 DRIFT = {"command": 0.15}
 
 # A command reads a recording, in which these scans are not; what it makes of poor ones is its own.
 scan_by_scan = pytest.mark.parametrize("name", [*CLEAN, "process"])
+
+# What is behind the socket is the same, but a new container takes a second.
+also_contained = pytest.mark.parametrize("name", [*CLEAN, "process", "docker_process"])
 
 # A study gives programs a value for every parameter.
 in_python = pytest.mark.parametrize("name", CLEAN)
@@ -95,7 +105,7 @@ def digests():
     return {name: found for name, *found in map(str.split, done.stdout.splitlines())}
 
 
-@every_odometry
+@pytest.mark.parametrize("name", HERE)
 def test_the_same_scans_give_the_same_bytes_on_one_core(name):
     first, second = digests()[name]
     assert first == second
@@ -103,13 +113,13 @@ def test_the_same_scans_give_the_same_bytes_on_one_core(name):
 
 def print_digests():
     cores.pin(0)
-    for name in [*CLEAN, *PROGRAMS]:
+    for name in HERE:
         poses = [drive(make(name), prepared_drive(name)) for _ in range(2)]
         found = (hashlib.sha256(of_one.tobytes()).hexdigest() for of_one in poses)
         sys.stdout.write(f"{name} {' '.join(found)}\n")
 
 
-@every_odometry
+@but_lockstep
 def test_a_second_instance_is_fresh(name):
     prepared = prepared_drive(name)
     first, second = make(name), make(name)
@@ -117,7 +127,7 @@ def test_a_second_instance_is_fresh(name):
     np.testing.assert_allclose(drive(second, prepared), usual_drive(name), atol=1e-6)
 
 
-@every_odometry
+@but_lockstep
 def test_two_instances_side_by_side_do_not_meet(name):
     prepared = prepared_drive(name)
     there, back = make(name), make(name)
@@ -130,7 +140,7 @@ def test_two_instances_side_by_side_do_not_meet(name):
     assert T_back[0, 3] == pytest.approx(-STEP * (N_SCANS - 1), abs=DRIFT.get(name, 0.1))
 
 
-@every_odometry
+@but_lockstep
 def test_start_forgets_all_before(name):
     prepared = prepared_drive(name)
     odometry = make(name)
@@ -149,7 +159,7 @@ def test_where_it_starts_does_not_matter(name):
     np.testing.assert_allclose(invert(T) @ poses, usual_drive(name), atol=0.02)
 
 
-@scan_by_scan
+@also_contained
 def test_it_goes_on_from_a_pose_and_a_motion(name):
     prepared = prepared_drive(name)
     T = np.eye(4)
@@ -168,7 +178,7 @@ def test_it_goes_on_from_a_pose_and_a_motion(name):
         np.testing.assert_allclose(T_next[:3, 3], [5.0, 6.0 + STEP * (i - 4), 7.0], atol=0.1)
 
 
-@scan_by_scan
+@also_contained
 def test_without_a_motion_it_stood_still(name):
     odometry = make(name)
     odometry.start(prepared_drive(name)[0], np.eye(4))
@@ -242,11 +252,12 @@ def test_prepared_scans_say_what_they_take(name):
 
 
 def parameter_cases():
-    return [
+    cases = [
         (name, parameter)
-        for name in [*CLEAN, *PROGRAMS]
+        for name in HERE
         for parameter in space_of("gicp" if name == "process" else name).names
     ]
+    return cases + [(name, space_of(name).names[0]) for name in CONTAINERS]
 
 
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())
@@ -273,7 +284,7 @@ def test_parameters_not_given_keep_their_baseline(name):
     assert cls().parameters == cls.space.baseline
 
 
-@scan_by_scan
+@also_contained
 def test_the_same_parameters_again_change_nothing(name):
     prepared = prepared_drive(name)
     if not is_live(name):
@@ -312,12 +323,12 @@ def test_parameters_change_between_scans_or_not_at_all(name):
     )
 
 
-@every_odometry
+@but_lockstep
 def test_preparing_leaves_the_scan_and_serves_all_instances(name):
     points = scan(0).points.copy()
     times = np.linspace(0.0, 0.09, len(points), dtype=np.float32)
     before = points.copy(), times.copy()
-    prepared = [make(name).prepare(Scan(0, points, times)), *prepared_drive(name)[1:6]]
+    prepared = [make(name).prepare(Scan(scan(0).stamp, points, times)), *prepared_drive(name)[1:6]]
     first = drive(make(name), prepared)
     np.testing.assert_allclose(drive(make(name), prepared), first, atol=1e-6)
     np.testing.assert_array_equal(points, before[0])
@@ -341,7 +352,7 @@ def test_parameters_that_do_not_exist_are_refused(name):
 @every_odometry
 def test_settings_that_do_not_exist_are_refused(name):
     with pytest.raises(ValidationError, match="donwsampling"):
-        odometry_class(name).settings_type(donwsampling=0.5)
+        odometry_class(name.partition(",")[0]).settings_type(donwsampling=0.5)
 
 
 @pytest.mark.parametrize(
