@@ -144,7 +144,9 @@ class PlayedBag(WholeRun):
     def _renamed(self, given: ProgramInput) -> dict[str, str]:
         """Topics of the recording that the system expects by another name."""
         pairs = ((given.points, self.settings.points), (given.imu, self.settings.imu))
-        return {old: new for old, new in pairs if old and new and old != new}
+        renamed = {old: new for old, new in pairs if old and new and old != new}
+        # Poses that were recorded with the bag are not the system's.
+        return renamed | {self.settings.odometry: f"/recorded{self.settings.odometry}"}
 
     def _play(
         self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str, end: float
