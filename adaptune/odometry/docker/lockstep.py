@@ -139,6 +139,9 @@ class Lockstep(Faulting):
     def close(self) -> None:
         if self._system is not None:
             self._look(self._system)
+            if self._has_run:
+                with contextlib.suppress(OdometryError, LinkError):
+                    warn_of_unread(self._system.link, self.name, self._keys)
             self._system.close()
             self._system = None
             self._used_before = Usage(self.usage.cpu, self.usage.memory)
@@ -165,8 +168,7 @@ class Lockstep(Faulting):
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
         self._topics = topics
         system.wait(topics[0], connected=True)
-        keys = server_keys(template, self.parameters, link.ask("parameters"))
-        warn_of_unread(link, self.name, keys)
+        self._keys = keys = server_keys(template, self.parameters, link.ask("parameters"))
         self._steering = None
         if (node := self._settings.node) is not None:
 
