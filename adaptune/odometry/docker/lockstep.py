@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+import weakref
 from collections.abc import Mapping
 from typing import Any
 
@@ -162,7 +163,8 @@ class Lockstep(Faulting):
         self._system = system = RosSystem(self._settings, self._limits.memory, text)
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(1)
-        link.record(self._settings.odometry, self._take)
+        take = weakref.WeakMethod(self._take)  # the link must not keep this alive
+        link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
         self._clock = system.run_clock(scan.stamp)
         self._send_cloud = link.advertise(topics[0], _CLOUD)
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
