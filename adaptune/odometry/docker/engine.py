@@ -170,6 +170,12 @@ def default_user(settings: ContainerSettings) -> str:
     return f"{me}:{group}" if me else f"{_NOBODY}:{_NOBODY}"
 
 
+def _home(user: str) -> dict[str, str]:
+    """A folder that a user without a name can write to."""
+    nameless = user[0].isdigit() and user.partition(":")[0] != "0"
+    return {"HOME": "/tmp"} if nameless else {}
+
+
 class Container:
     """A running container.
 
@@ -237,7 +243,7 @@ class Container:
                 digest,
                 list(command) or None,
                 user=user,
-                environment=dict(environment or {}),
+                environment=_home(user) | dict(environment or {}),
                 labels={_OWNER: _owner()[0]},
                 host_config=host,
                 entrypoint=[] if bare else None,

@@ -12,7 +12,7 @@ import numpy as np
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import OdometryError, Registration, Usage
 from adaptune.odometry.docker.ros_container import RosSystem
-from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread
+from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread, whole_name
 from adaptune.odometry.isolation import Faulting, Limits, pose_fault
 from adaptune.ros.ros_link import LinkError
 from adaptune.ros.steering import Steering
@@ -133,7 +133,12 @@ class Lockstep(Faulting):
         self.parameters |= selection.parameters
         if self._system is not None and self._steering is not None:
             try:
-                self._steering.apply(selection.parameters)
+                self._steering.apply(
+                    {
+                        whole_name(self._template, name): value
+                        for name, value in selection.parameters.items()
+                    }
+                )
             except LinkError as error:
                 raise OdometryError(str(error)) from error
 
@@ -159,7 +164,7 @@ class Lockstep(Faulting):
 
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
-        template, text = filled(self._settings, self.parameters)
+        self._template, text = filled(self._settings, self.parameters)
         self._system = system = RosSystem(self._settings, self._limits.memory, text)
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(1)
@@ -170,7 +175,7 @@ class Lockstep(Faulting):
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
         self._topics = topics
         system.wait(topics[0], connected=True)
-        self._keys = keys = server_keys(template, self.parameters, link.ask("parameters"))
+        self._keys = keys = server_keys(self._template, self.parameters, link.ask("parameters"))
         self._steering = None
         if (node := self._settings.node) is not None:
 

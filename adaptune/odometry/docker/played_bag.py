@@ -61,6 +61,8 @@ class PoseRecorder:
         if self.received:
             self.longest_pause = max(self.longest_pause, now - self.last)
         self.last = now
+        if kind == PATH:  # which repeats all poses
+            self.received.clear()
         self.received.append((kind, data))
 
     def poses(self) -> list[Any]:
@@ -76,8 +78,6 @@ class PoseRecorder:
             raise OdometryError(
                 f"{self.topic} is {kind}; odometry.settings.odometry must name poses"
             )
-        if messages and messages[0][0] == PATH:
-            messages = messages[-1:]
         return [
             pose
             for kind, data in messages

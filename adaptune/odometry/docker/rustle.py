@@ -50,6 +50,9 @@ class RustleSettings(ContainerSettings, WholeSettings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        words = " ".join(self.set_parameter or ("{name} {value}",))
+        if lacking := [key for key in ("{name}", "{value}") if key not in words]:
+            raise ValueError(f"set_parameter: names no {' and no '.join(lacking)} in its arguments")
         if self.set_parameter is not None and self.node is None:
             raise ValueError("set_parameter: name the node, too (node)")
         if self.node is not None and self.play == "bag":
