@@ -10,7 +10,6 @@ two at a time. `kills` sends SIGKILL to a campaign with two workers, or to one o
 random moment, and counts what the engine holds: 5 s later, and when the next campaign has begun.
 """
 
-import logging
 import os
 import signal
 import sys
@@ -31,7 +30,7 @@ import kills
 import needs
 
 from adaptune import yaml
-from adaptune.odometry.docker.engine import engine
+from adaptune.odometry.docker.engine import OWNER, engine, is_orphan
 from adaptune.simulation import Course
 from adaptune.simulation.recording import record
 from offline.offline_study import load_study
@@ -124,11 +123,12 @@ def parallel(path: Path, n: int) -> None:
 
 
 def left() -> tuple[int, int, int]:
-    """Containers of adaptune's, and volumes and networks besides the engine's own."""
+    """Containers of ended processes, and volumes and networks besides the engine's own."""
     api = engine().api
-    containers = api.containers(all=True, filters={"label": "adaptune.owner"})
+    containers = api.containers(all=True, filters={"label": OWNER})
+    orphans = [one for one in containers if is_orphan(one["Labels"][OWNER])]
     networks = [n for n in api.networks() if n["Name"] not in ("bridge", "host", "none")]
-    return len(containers), len(api.volumes()["Volumes"] or ()), len(networks)
+    return len(orphans), len(api.volumes()["Volumes"] or ()), len(networks)
 
 
 def kill(path: Path, n: int, seed: int) -> None:
@@ -138,7 +138,8 @@ def kill(path: Path, n: int, seed: int) -> None:
     for i in range(n):
         process = kills.begin(path, path.parent / f"run-{i}")
         threading.Event().wait(rng.uniform(1.0, 20.0))
-        workers, running = kills.workers(process.pid), left()[0]
+        workers = kills.workers(process.pid)
+        running = len(engine().api.containers(filters={"label": OWNER}))
         victim = "driver"
         if workers and rng.random() < 0.3:
             victim = "worker"
@@ -154,7 +155,7 @@ def kill(path: Path, n: int, seed: int) -> None:
         engine()
         next_time.append([now - then for now, then in zip(left(), before, strict=True)])
         print(
-            f"kill {i + 1} ({victim}, {running} containers ran): {found[0]} left after 5 s, "
+            f"kill {i + 1} ({victim}, of {running} containers): {found[0]} left after 5 s, "
             f"{next_time[-1]} containers, volumes and networks when the next begins",
             flush=True,
         )
@@ -165,7 +166,6 @@ def kill(path: Path, n: int, seed: int) -> None:
 
 def main(what: str, n: int, seed: int) -> None:
     """Measure one of the three."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     with study_file() as path:
         if what == "cost":
             cost(path, n)
