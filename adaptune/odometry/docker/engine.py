@@ -245,12 +245,12 @@ class Container:
         try:
             made = client.api.create_container(
                 digest,
-                list(command) or None,
+                None if bare else list(command) or None,
                 user=user,
                 environment=_home(user) | dict(environment or {}),
                 labels={OWNER: _owner()[0]},
                 host_config=host,
-                entrypoint=[] if bare else None,
+                entrypoint=list(command) if bare else None,
             )
             self.id = made["Id"]
             client.api.start(self.id)

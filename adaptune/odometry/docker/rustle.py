@@ -39,7 +39,7 @@ class RustleSettings(ContainerSettings, WholeSettings):
     use_sim_time: bool | None = None
     ready: float = Field(60.0, gt=0, le=3600)
     drain: float = Field(2.0, ge=0, le=3600)
-    patience: float = Field(1.0, gt=0, le=3600)
+    patience: float = Field(2.0, gt=0, le=3600)
     node: Topic | None = None
     set_parameter: tuple[str, ...] | None = Field(None, min_length=1)
 
