@@ -44,7 +44,8 @@ services:
 	DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install --yes --no-install-recommends \
 		ros-core python3-rospy python3-dynamic-reconfigure debootstrap \
 		$(if $(shell command -v dockerd),,docker.io)
-	$(SUDO) docker info >/dev/null 2>&1 || $(SUDO) service docker start
+	$(SUDO) docker info >/dev/null 2>&1 || $(SUDO) service docker start \
+		|| $(SUDO) sh -c 'setsid dockerd >/var/log/docker.log 2>&1 </dev/null &'
 	$(SUDO) sh -c 'for i in $$(seq 30); do docker info >/dev/null 2>&1 && exit; sleep 1; done; \
 		echo "the Docker engine does not answer: see /var/log/docker.log" >&2; exit 1'
 

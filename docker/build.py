@@ -15,6 +15,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 
 import docker
@@ -70,9 +71,15 @@ def build(name: str, tag: str | None = None) -> str:
     tag
         By default ``adaptune-reference`` or ``adaptune``.
     """
-    client, tag = engine(), tag or TAGS[name]
-    make_base(client)
-    context = _context(name)
+    tag = tag or TAGS[name]
+    with closing(engine()) as client:
+        make_base(client)
+        context = _context(name)
+        _build(client, context, tag)
+    return tag
+
+
+def _build(client: docker.DockerClient, context: Path, tag: str) -> None:
     said = []
     for answer in client.api.build(path=str(context), tag=tag, rm=True, forcerm=True, decode=True):
         if "error" in answer:
@@ -82,7 +89,6 @@ def build(name: str, tag: str | None = None) -> str:
             _log.info("%s", said[-1].rstrip())
         else:
             _log.debug("%s", said[-1].rstrip())
-    return tag
 
 
 def make_base(client: docker.DockerClient) -> None:
@@ -120,7 +126,7 @@ def _bootstrap(client: docker.DockerClient) -> None:
 def _context(name: str) -> Path:
     """Gather what a build sees: the Dockerfile and its folders, wheels, and adaptune's wheel."""
     context = ROOT / "build/docker" / name
-    (context / "wheels").mkdir(parents=True, exist_ok=True)
+    context.mkdir(parents=True, exist_ok=True)
     shutil.copy(FOLDERS[name] / "Dockerfile", context)
     for folder in FILES[name]:
         shutil.rmtree(context / folder, ignore_errors=True)
@@ -137,10 +143,8 @@ def _download(folder: Path, requirements: Iterable[str]) -> None:
     constraints = ROOT / "constraints.txt"
     machine = platform.machine()
     digest = _digest([constraints], BASE, machine, *requirements)
-    stamp = folder.with_suffix(".made")
-    if stamp.exists() and stamp.read_text() == digest:
+    if _is_made(folder, digest):
         return
-    shutil.rmtree(folder)
     platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
     platforms.append(f"manylinux2014_{machine}")
     _run(
@@ -149,7 +153,21 @@ def _download(folder: Path, requirements: Iterable[str]) -> None:
         *(f"--platform={it}" for it in platforms),
         *(f"--dest={folder}", f"--constraint={constraints}", *requirements),
     )
-    stamp.write_text(digest)
+    _stamp(folder).write_text(digest)
+
+
+def _stamp(folder: Path) -> Path:
+    return folder.with_suffix(".made")
+
+
+def _is_made(folder: Path, digest: str) -> bool:
+    """Whether a folder holds the wheels that a digest stands for; if not, it is removed."""
+    stamp = _stamp(folder)
+    if stamp.exists() and stamp.read_text() == digest and any(folder.glob("*.whl")):
+        return True
+    stamp.unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    return False
 
 
 def _own_wheel(folder: Path) -> None:
@@ -160,16 +178,14 @@ def _own_wheel(folder: Path) -> None:
             _copy(ROOT / name, sources / name)
         files = sorted(path for path in sources.rglob("*") if path.is_file())
         digest = _digest(files, *(str(path.relative_to(sources)) for path in files))
-        stamp = folder.with_suffix(".made")
-        if stamp.exists() and stamp.read_text() == digest:
+        if _is_made(folder, digest):
             return
-        shutil.rmtree(folder, ignore_errors=True)
         _run(
             *(sys.executable, "-m", "pip", "wheel", "--quiet", "--disable-pip-version-check"),
             *("--no-deps", f"--wheel-dir={folder}", made),
             env=os.environ | {"SOURCE_DATE_EPOCH": SOURCE_DATE},
         )
-        stamp.write_text(digest)
+        _stamp(folder).write_text(digest)
 
 
 def _copy(source: Path, target: Path) -> None:

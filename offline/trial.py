@@ -1,7 +1,7 @@
 """One parameter set on one sequence, or several at once on one pass over it."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -286,10 +286,13 @@ def run_trials(
     # For every set every repeat, and for every repeat every piece.
     runs = [[repeat(s) for _ in range(_n_runs(settings, odometry, s))] for s in sets]
     each = [run for of_set in runs for of_repeat in of_set for run in of_repeat]
-    for i, scan in enumerate(_watched(scans, len(frames.stamps), advance)):
+    with ExitStack() as ended:
         for run in each:
-            if run.begin <= i < run.end:
-                run.step(i, scan)
+            ended.callback(run.close)
+        for i, scan in enumerate(_watched(scans, len(frames.stamps), advance)):
+            for run in each:
+                if run.begin <= i < run.end:
+                    run.step(i, scan)
     return [
         _mean(s, [_trial(settings, s, scans, pieces) for pieces in of_set])
         for s, of_set in zip(sets, runs, strict=True)

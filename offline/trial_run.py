@@ -67,6 +67,11 @@ class TrialRun:
         if self._failure:
             self._step_without_pose(i)
 
+    def close(self) -> None:
+        """End the odometry's processes; what they used stays known."""
+        if self._odometry is not None:
+            self._odometry.close()
+
     def _started(self) -> OdometryInstance:
         self._odometry = self._make()
         return self._odometry

@@ -29,7 +29,8 @@ until rostopic info /points | grep -q '/gicp'; do sleep 0.1; done
 [ -z "$SET" ] || rosservice call /gicp/set_parameters "$SET"
 rostopic echo -p /Odometry > /output/poses.csv &
 until rostopic info /Odometry | grep -q '/rostopic'; do sleep 0.1; done
-rosbag play --quiet --clock -r 4 --delay 1 --wait-for-subscribers /rustle/dataset/drive.bag > /dev/null
+rosbag play --quiet --clock -r 4 --delay 1 --wait-for-subscribers \\
+    /rustle/dataset/drive.bag > /dev/null
 sleep 1
 kill %1
 """

@@ -77,10 +77,16 @@ class Template:
         return place[1][place[2]]
 
     def fill(self, parameters: Mapping[str, Any]) -> str:
-        """The file's text with new values; parameters that are not in it are ignored."""
+        """The file's text with new values; parameters that are not in it are ignored.
+
+        A real number stays one where the new value is whole.
+        """
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
-                place[1][place[2]] = value
+                held = place[1][place[2]]
+                # ROS 1 and other readers tell 20 from 20.0.
+                real = isinstance(held, float) and type(value) is int
+                place[1][place[2]] = float(value) if real else value
         return self._write(self._data)
 
     def _find(self, name: str) -> _Place | None:

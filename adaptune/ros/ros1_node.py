@@ -19,7 +19,7 @@ except ImportError:
 _LENGTH = struct.Struct("<I")
 _SECONDS = 2.0  # in which another node must answer
 _BUFFER = 1 << 24  # bytes
-_OWN = ("/adaptune", "/rosout", "/play", "/record")  # nodes that are no odometry, by their begin
+_OWN = ("/adaptune", "/rosout", "/play_", "/record_")  # nodes that are no odometry, by their begin
 
 
 class Stream(object):
@@ -88,6 +88,8 @@ class _Node(object):
         self._subscribers = []  # type: list[Any]
         self._publishers = {}  # type: dict[str, tuple[Any, Any]]
         self._pids = {}  # type: dict[str, int]
+        self._usage = {}  # type: dict[str, tuple[float, float]]
+        self._watched = set()  # type: set[str]
 
     def subscribe(self, header, _):  # type: (dict[str, Any], bytes) -> None
         topic = header["topic"]
@@ -144,23 +146,35 @@ class _Node(object):
         """All that the parameter server holds."""
         return self._rospy.get_param("/")
 
-    def state(self, _):  # type: (dict[str, Any]) -> dict[str, Any]
+    def state(self, header):  # type: (dict[str, Any]) -> dict[str, Any]
         """Who subscribes to which topics, and what other nodes have used so far.
 
-        Those that have ended are dead. Of the topics that this node sends, the number of
-        subscribers that are connected.
+        A node that was seen at one of the `topics` and has ended is dead. Of the topics that this
+        node sends, the number of subscribers that are connected.
         """
-        _, subscribed, _ = self._master().getSystemState()
-        others = {topic: [n for n in nodes if not _is_own(n)] for topic, nodes in subscribed}
-        nodes, dead = {}, []
-        for name in sorted({n for names in others.values() for n in names} | set(self._pids)):
+        published, subscribed, _ = self._master().getSystemState()
+        listened = {}  # type: dict[str, list[str]]
+        nodes = set()  # type: set[str]
+        for topic, names in published + subscribed:
+            others = [name for name in names if not name.startswith(_OWN)]
+            nodes.update(others)
+            if topic in header["topics"]:
+                self._watched.update(others)
+        for topic, names in subscribed:
+            listened[topic] = [name for name in names if not name.startswith(_OWN)]
+        dead = []
+        for name in sorted(nodes | set(self._usage)):
             try:
-                nodes[name] = _used(self._pid(name))
+                self._usage[name] = _used(self._pid(name))
             except Exception:
                 dead.append(name)
-        listened = {topic: names for topic, names in others.items() if names}
         sending = {t: p.get_num_connections() for t, (_, p) in self._publishers.items()}
-        return {"subscribed": listened, "nodes": nodes, "dead": dead, "sending": sending}
+        return {
+            "subscribed": {topic: names for topic, names in listened.items() if names},
+            "nodes": self._usage,
+            "dead": [name for name in dead if name in self._watched],
+            "sending": sending,
+        }
 
     def _pid(self, name):  # type: (str) -> int
         if name not in self._pids:
@@ -193,10 +207,6 @@ def _server(uri):  # type: (str) -> Any
     except ImportError:
         from xmlrpclib import ServerProxy  # type: ignore[no-redef]
     return ServerProxy(uri)
-
-
-def _is_own(node):  # type: (str) -> bool
-    return node.startswith(_OWN)
 
 
 _ASKED = ("topics", "set_parameters", "parameters", "state")

@@ -17,7 +17,7 @@ from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings, OdometryError
 from adaptune.odometry.docker import undertaker
 
-_OWNER = "adaptune.owner"
+OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
 _NOBODY = 65534
 _TAIL = 50
@@ -101,15 +101,19 @@ def _identity(pid: int) -> str | None:
     return f"{boot}.{space}.{pid}.{started}"
 
 
+def is_orphan(owner: str) -> bool:
+    """Whether the process that a label names has ended."""
+    boot_and_space, pid, _ = owner.rsplit(".", 2)
+    here = str(_identity(os.getpid())).rsplit(".", 2)[0]
+    if boot_and_space.split(".")[0] != here.split(".")[0]:
+        return True
+    return boot_and_space == here and _identity(int(pid)) != owner
+
+
 def _remove_leftovers(client: Any) -> None:
     """Remove containers whose process has ended."""
-    here = str(_identity(os.getpid())).rsplit(".", 2)[0]
-    for container in client.api.containers(all=True, filters={"label": _OWNER}):
-        owner = container["Labels"][_OWNER]
-        boot_and_space, pid, _ = owner.rsplit(".", 2)
-        another_boot = boot_and_space.split(".")[0] != here.split(".")[0]
-        ours = boot_and_space == here
-        if another_boot or (ours and _identity(int(pid)) != owner):
+    for container in client.api.containers(all=True, filters={"label": OWNER}):
+        if is_orphan(container["Labels"][OWNER]):
             _log.info("removing container %s of an earlier run", container["Id"][:12])
             _remove(client, container["Id"])
 
@@ -127,7 +131,7 @@ def _owner() -> tuple[str, Any]:
     """Label of this process's containers, and who removes them if it is killed."""
     owner = str(_identity(os.getpid()))
     process = subprocess.Popen(
-        [sys.executable, undertaker.__file__, f"{_OWNER}={owner}"],
+        [sys.executable, undertaker.__file__, f"{OWNER}={owner}"],
         stdin=subprocess.PIPE,  # which closes with this process
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -168,6 +172,12 @@ def default_user(settings: ContainerSettings) -> str:
         return own
     me, group = os.getuid(), os.getgid()
     return f"{me}:{group}" if me else f"{_NOBODY}:{_NOBODY}"
+
+
+def _home(user: str) -> dict[str, str]:
+    """A folder that a user without a name can write to."""
+    nameless = user[0].isdigit() and user.partition(":")[0] != "0"
+    return {"HOME": "/tmp"} if nameless else {}
 
 
 class Container:
@@ -235,12 +245,12 @@ class Container:
         try:
             made = client.api.create_container(
                 digest,
-                list(command) or None,
+                None if bare else list(command) or None,
                 user=user,
-                environment=dict(environment or {}),
-                labels={_OWNER: _owner()[0]},
+                environment=_home(user) | dict(environment or {}),
+                labels={OWNER: _owner()[0]},
                 host_config=host,
-                entrypoint=[] if bare else None,
+                entrypoint=list(command) if bare else None,
             )
             self.id = made["Id"]
             client.api.start(self.id)

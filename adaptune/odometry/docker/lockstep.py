@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+import weakref
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import OdometryError, Registration, Usage
 from adaptune.odometry.docker.ros_container import RosSystem
-from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread
+from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread, whole_name
 from adaptune.odometry.isolation import Faulting, Limits, pose_fault
 from adaptune.ros.ros_link import LinkError
 from adaptune.ros.steering import Steering
@@ -134,13 +135,21 @@ class Lockstep(Faulting):
         self.parameters |= selection.parameters
         if self._system is not None and self._steering is not None:
             try:
-                self._steering.apply(selection.parameters)
+                self._steering.apply(
+                    {
+                        whole_name(self._template, name): value
+                        for name, value in selection.parameters.items()
+                    }
+                )
             except LinkError as error:
                 raise OdometryError(str(error)) from error
 
     def close(self) -> None:
         if self._system is not None:
             self._look(self._system)
+            if self._has_run:
+                with contextlib.suppress(OdometryError, LinkError):
+                    warn_of_unread(self._system.link, self.name, self._keys)
             self._system.close()
             self._system = None
             self._used_before = Usage(self.usage.cpu, self.usage.memory)
@@ -157,18 +166,18 @@ class Lockstep(Faulting):
 
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
-        template, text = filled(self._settings, self.parameters)
+        self._template, text = filled(self._settings, self.parameters)
         self._system = system = RosSystem(self._settings, self._limits.memory, text)
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(1)
-        link.record(self._settings.odometry, self._take)
+        take = weakref.WeakMethod(self._take)  # the link must not keep this alive
+        link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
         self._clock = system.run_clock(scan.stamp)
         self._send_cloud = link.advertise(topics[0], _CLOUD)
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
         self._topics = topics
         system.wait(topics[0], connected=True)
-        keys = server_keys(template, self.parameters, link.ask("parameters"))
-        warn_of_unread(link, self.name, keys)
+        self._keys = keys = server_keys(self._template, self.parameters, link.ask("parameters"))
         self._steering = None
         if (node := self._settings.node) is not None:
 

@@ -61,6 +61,8 @@ class PoseRecorder:
         if self.received:
             self.longest_pause = max(self.longest_pause, now - self.last)
         self.last = now
+        if kind == PATH:  # which repeats all poses
+            self.received.clear()
         self.received.append((kind, data))
 
     def poses(self) -> list[Any]:
@@ -76,8 +78,6 @@ class PoseRecorder:
             raise OdometryError(
                 f"{self.topic} is {kind}; odometry.settings.odometry must name poses"
             )
-        if messages and messages[0][0] == PATH:
-            messages = messages[-1:]
         return [
             pose
             for kind, data in messages
@@ -144,7 +144,9 @@ class PlayedBag(WholeRun):
     def _renamed(self, given: ProgramInput) -> dict[str, str]:
         """Topics of the recording that the system expects by another name."""
         pairs = ((given.points, self.settings.points), (given.imu, self.settings.imu))
-        return {old: new for old, new in pairs if old and new and old != new}
+        renamed = {old: new for old, new in pairs if old and new and old != new}
+        # Poses that were recorded with the bag are not the system's.
+        return renamed | {self.settings.odometry: f"/recorded{self.settings.odometry}"}
 
     def _play(
         self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str, end: float
@@ -156,7 +158,7 @@ class PlayedBag(WholeRun):
             time.sleep(_BETWEEN_LOOKS)
             if time.monotonic() - looked > _BETWEEN_STATES:
                 looked = time.monotonic()
-                self._usage = system.used()
+                self._see(system, given)
                 system.state()
             self._check_time(end)
         over = time.monotonic()
@@ -166,8 +168,13 @@ class PlayedBag(WholeRun):
             time.sleep(_BETWEEN_LOOKS)
             self._check_time(end)
         system.state()
-        self._usage = system.used()
+        self._see(system, given)
         return over - begin, time.monotonic() - over
+
+    def _see(self, system: RosSystem, given: ProgramInput) -> None:
+        """See what the system has used; the bag sets the pace, so CPU time counts as its time."""
+        used = system.used()
+        self._usage = used._replace(seconds=used.cpu / len(given.stamps))
 
     def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
         """Whether the pose of the last scan is there, or nothing came for a while."""

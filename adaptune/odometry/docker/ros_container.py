@@ -98,7 +98,7 @@ class RosSystem:
     """
 
     def __init__(self, settings: Any, memory: float, parameters: str, mounts: Sequence[Mount] = ()):
-        self._settings = settings
+        self._settings, self._topics = settings, [settings.odometry]
         self._folder = tempfile.TemporaryDirectory(prefix="adaptune-", ignore_cleanup_errors=True)
         self.folder = Path(self._folder.name)
         self.folder.chmod(0o777)  # for any user of the image
@@ -175,7 +175,7 @@ class RosSystem:
         OdometryError
             It names the node that has died.
         """
-        found: dict[str, Any] = self.link.ask("state")
+        found: dict[str, Any] = self.link.ask("state", topics=self._topics)
         if found["dead"]:
             raise OdometryError(f"node {found['dead'][0]} died")
         if (code := self._container.finished(self._launch)) is not None:
@@ -190,6 +190,7 @@ class RosSystem:
         OdometryError
             If none does in time; it names the topics to which nodes subscribe.
         """
+        self._topics.append(topic)
         begin = changed = time.monotonic()
         before: AbstractSet[str] = set()
         while (now := time.monotonic()) - begin < self._settings.ready:
@@ -240,7 +241,7 @@ class RosSystem:
 
     def used(self) -> Usage:
         """What the system's nodes have used; the memory is the sum of their peaks."""
-        nodes = self.link.ask("state")["nodes"].values()
+        nodes = self.link.ask("state", topics=self._topics)["nodes"].values()
         return Usage(sum(cpu for cpu, _ in nodes), sum(memory for _, memory in nodes))
 
     def words(self) -> str:

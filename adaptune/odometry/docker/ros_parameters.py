@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 def server_keys(
     template: Template, parameters: ParameterSet, held: Any
 ) -> Mapping[str, Sequence[str]]:
-    """Keys of the parameter server that hold each parameter.
+    """Keys of the parameter server that hold each parameter, by its whole name.
 
     Parameters
     ----------
@@ -37,18 +37,23 @@ def server_keys(
     every = dict(_flat(held))
     keys = {}
     for name, value in parameters.items():
-        end = "/" + "/".join(template.path_of(name))
-        keys[name] = [key for key in every if key.endswith(end)]
-        if not keys[name]:
+        whole = whole_name(template, name)
+        keys[whole] = [key for key in every if key.endswith(f"/{whole}")]
+        if not keys[whole]:
             raise OdometryError(
-                f"the parameter server holds no {end[1:]}: the launch file does not load "
+                f"the parameter server holds no {whole}: the launch file does not load "
                 f"/rustle/config/params.yaml"
             )
-        for key in keys[name]:
+        for key in keys[whole]:
             if not equal_values(value, every[key]):
                 what = f"{key} is {every[key]!r} on the parameter server, not {value!r}"
                 raise OdometryError(f"{what}: the launch file sets it, too")
     return keys
+
+
+def whole_name(template: Template, name: str) -> str:
+    """All keys of a parameter, with slashes between them, as ROS has them."""
+    return "/".join(template.path_of(name))
 
 
 def warn_of_unread(link: Ros1, image: str, keys: Mapping[str, Sequence[str]]) -> None:

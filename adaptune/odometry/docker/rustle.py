@@ -39,7 +39,7 @@ class RustleSettings(ContainerSettings, WholeSettings):
     use_sim_time: bool | None = None
     ready: float = Field(60.0, gt=0, le=3600)
     drain: float = Field(2.0, ge=0, le=3600)
-    patience: float = Field(1.0, gt=0, le=3600)
+    patience: float = Field(2.0, gt=0, le=3600)
     node: Topic | None = None
     set_parameter: tuple[str, ...] | None = Field(None, min_length=1)
 
@@ -50,6 +50,9 @@ class RustleSettings(ContainerSettings, WholeSettings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        words = " ".join(self.set_parameter or ("{name} {value}",))
+        if lacking := [key for key in ("{name}", "{value}") if key not in words]:
+            raise ValueError(f"set_parameter: names no {' and no '.join(lacking)} in its arguments")
         if self.set_parameter is not None and self.node is None:
             raise ValueError("set_parameter: name the node, too (node)")
         if self.node is not None and self.play == "bag":
