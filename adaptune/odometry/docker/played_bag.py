@@ -146,7 +146,9 @@ class PlayedBag(WholeRun):
         pairs = ((given.points, self.settings.points), (given.imu, self.settings.imu))
         renamed = {old: new for old, new in pairs if old and new and old != new}
         # Poses that were recorded with the bag are not the system's.
-        return renamed | {self.settings.odometry: f"/recorded{self.settings.odometry}"}
+        if (odometry := self.settings.odometry) not in (given.points, given.imu):
+            renamed[odometry] = f"/recorded{odometry}"
+        return renamed
 
     def _play(
         self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str, end: float
