@@ -121,8 +121,9 @@ def _remove_leftovers(client: Any) -> None:
 def _remove(client: Any, container: str) -> None:
     from docker.errors import APIError
 
-    # One that is gone, or on its way, is as good as removed.
-    with contextlib.suppress(APIError):
+    # One that is gone, or on its way, is as good as removed; the next use of an engine that does
+    # not answer removes the others.
+    with contextlib.suppress(APIError, OSError):
         client.api.remove_container(container, v=True, force=True)
 
 
@@ -161,6 +162,12 @@ def _image(name: str) -> Any:
         raise EngineError(f"there is no image {name!r} on this machine: {help_}") from error
     except APIError as error:
         raise EngineError(f"image {name!r}: {error.explanation or error}") from error
+    except OSError as error:
+        raise _silent(error) from error
+
+
+def _silent(error: OSError) -> EngineError:
+    return EngineError(f"the Docker engine does not answer any more ({error})")
 
 
 def default_user(settings: ContainerSettings) -> str:
@@ -257,6 +264,9 @@ class Container:
         except APIError as error:
             self.close()
             raise EngineError(f"image {settings.image!r}: {error.explanation or error}") from error
+        except OSError as error:
+            self.close()
+            raise _silent(error) from error
 
     id: str | None = None
     out_of_memory = False
@@ -270,6 +280,8 @@ class Container:
             state = engine().api.inspect_container(self.id)["State"]
         except APIError:
             return -9
+        except OSError as error:
+            raise _silent(error) from error
         if state["Running"]:
             return None
         self.out_of_memory = bool(state["OOMKilled"])
@@ -282,7 +294,7 @@ class Container:
 
         try:
             stats = engine().api.stats(self.id, stream=False, one_shot=True)
-        except APIError:
+        except (APIError, OSError):
             return Ended(0, 0.0, 0.0)
         memory = stats.get("memory_stats", {})
         # Files that were read may be forgotten at any time.
@@ -315,6 +327,8 @@ class Container:
             output = engine().api.exec_start(made["Id"], detach=detach)
         except APIError as error:
             raise EngineError(f"image {self.image!r}: {error.explanation or error}") from error
+        except OSError as error:
+            raise _silent(error) from error
         return made["Id"], b"" if detach else output
 
     def finished(self, name: str) -> int | None:
@@ -325,6 +339,8 @@ class Container:
             state = engine().api.exec_inspect(name)
         except APIError:
             return -9  # with its container
+        except OSError as error:
+            raise _silent(error) from error
         return None if state["Running"] else int(state["ExitCode"] or 0)
 
     def last_lines(self) -> str:
@@ -333,7 +349,7 @@ class Container:
 
         try:
             return hosting.plain_lines(engine().api.logs(self.id, tail=_TAIL))
-        except APIError:
+        except (APIError, OSError):
             return ""
 
     def log(self) -> bytes:
@@ -342,7 +358,7 @@ class Container:
 
         try:
             written: bytes = engine().api.logs(self.id)
-        except APIError:
+        except (APIError, OSError):
             return b""
         return written
 
