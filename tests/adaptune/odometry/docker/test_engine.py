@@ -1,3 +1,4 @@
+import copy
 import json
 import os
 import subprocess
@@ -7,6 +8,7 @@ from contextlib import closing
 from functools import cache
 
 import pytest
+import requests
 from contained import LABEL
 from needs import reference_image
 
@@ -235,6 +237,39 @@ def test_without_permission_it_says_what_to_do(fresh, monkeypatch):
     monkeypatch.setattr(docker.DockerClient, "from_env", from_env)
     with pytest.raises(EngineError, match=r"this user may not use the Docker engine at unix:.*-aG"):
         fresh()
+
+
+class Gone:
+    """An engine that was stopped."""
+
+    def __getattr__(self, name):
+        if name == "api":
+            return self
+
+        def ask(*_, **__):
+            raise requests.ConnectionError("refused")
+
+        return ask
+
+
+def test_an_engine_that_ends_on_the_way(settings, monkeypatch):
+    with closing(started(settings, "sleep", "60")) as container:
+        name = container.run("sleep 60")
+        with monkeypatch.context() as patch:
+            patch.setattr(engine_module, "engine", Gone)
+            words = r"the Docker engine does not answer any more \(refused\)"
+            for ask in (
+                container.ended,
+                lambda: container.finished(name),
+                lambda: container.run("true"),
+                lambda: started(settings, "true"),
+            ):
+                with pytest.raises(EngineError, match=words):
+                    ask()
+            assert container.last_lines() == ""
+            assert container.log() == b""
+            assert container.used() == (0, 0.0, 0.0)
+            engine_module.Container.close(copy.copy(container))
 
 
 def test_images_that_are_not_there(settings):

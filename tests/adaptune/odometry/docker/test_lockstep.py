@@ -32,8 +32,10 @@ from adaptune.selection import Selection
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
 OTHER = {"max_correspondence_distance": 3.0}
-SET = "test {name} != keyframe_interval || { echo 'I do not know {name}'; exit 4; }; exec rosparam \
-set {node}/{name} {value}"
+SET = """
+    test {name} != gicp/keyframe_interval || { echo 'I do not know {name}'; exit 4; }
+    exec rosparam set /{name} {value}
+"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -122,7 +124,9 @@ def test_parameters_get_there_as_numbers_and_change_while_it_runs(make, systems)
     np.testing.assert_allclose(poses, expected, atol=1e-6)
     assert np.abs(poses - host_poses()[7:20]).max() > 1e-5
     # The node bounds it to 10, and says so.
-    with pytest.raises(OdometryError, match=r"/gicp holds max_correspondence_distance = 10\.0"):
+    with pytest.raises(
+        OdometryError, match=r"/gicp holds gicp/max_correspondence_distance = 10\.0"
+    ):
         odometry.apply(Selection(0, {"max_correspondence_distance": 30.0}))
 
 
@@ -132,7 +136,7 @@ def test_nobody_says_whether_a_node_without_reconfigure_reads_its_parameters_aga
     with Said() as said:
         odometry.apply(Selection(0, OTHER))
     assert str(said) == (
-        "/gicp: nobody says whether max_correspondence_distance takes effect before the node "
+        "/gicp: nobody says whether gicp/max_correspondence_distance takes effect before the node "
         "starts again"
     )
     held = systems[0].link.ask("parameters")
@@ -147,7 +151,7 @@ def test_a_command_sets_parameters(make, systems):
     odometry.apply(Selection(0, {"max_correspondence_distance": 3.5}))
     held = systems[0].link.ask("parameters")
     assert held["gicp"]["max_correspondence_distance"] == 3.5
-    with pytest.raises(OdometryError, match="exit code 4: I do not know keyframe_interval"):
+    with pytest.raises(OdometryError, match="exit code 4: I do not know gicp/keyframe_interval"):
         odometry.apply(Selection(0, {"keyframe_interval": 2.0}))
 
 
@@ -168,7 +172,7 @@ def test_hand_over_between_containers(make):
     odometry.close()
 
 
-def test_one_that_dies_is_a_fault_with_its_last_lines_and_starts_again(make):
+def test_one_that_dies_is_a_fault_with_its_last_lines(make):
     odometry = make(imitate={"die_at": 4}, settings={"patience": 2.0})
     poses = drive(odometry)
     np.testing.assert_allclose(poses[:4], host_poses()[:4], atol=1e-6)
@@ -178,10 +182,6 @@ def test_one_that_dies_is_a_fault_with_its_last_lines_and_starts_again(make):
     assert "gicp: terminating after 4 scans: the map is corrupt" in fault
     assert odometry.ended
     assert not containers()
-    odometry.start(scans()[0], np.eye(4))
-    np.testing.assert_allclose(
-        [r.T_odom_sensor for r in on(odometry, 1, 4)], host_poses()[1:4], atol=1e-6
-    )
 
 
 def test_a_pose_that_is_none_is_a_fault(make):

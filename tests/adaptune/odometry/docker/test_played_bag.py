@@ -46,7 +46,11 @@ TRIALS = {
     },
     "rate": {"imitate": {"rate": 5000}},
     "by the clock": {"imitate": {"stamp_now": True, "seconds_per_scan": 0.02}},
-    "present time": {"imitate": {"stamp_now": True}, "sim": "false"},
+    "present time": {
+        "imitate": {"stamp_now": True},
+        "sim": "false",
+        "settings": {"use_sim_time": False},
+    },
     "lag": {"imitate": {"seconds_per_scan": 0.1}, "settings": {"drain": 2.0}},
     "no time": {"imitate": {"seconds_per_scan": 3.0}, "settings": {"rate": 20.0, "drain": 0.0}},
     "too slow": {
@@ -149,7 +153,7 @@ def test_the_poses_are_those_of_the_odometry(ran):
 def test_a_parameter_that_no_node_reads_is_named(ran):
     warned = [line for line in ran("plain").said.splitlines() if "no node has read" in line]
     assert warned == [
-        "adaptune-reference: no node has read the parameter other.voxel, so its value changes "
+        "adaptune-reference: no node has read the parameter other/voxel, so its value changes "
         "nothing; is its name in the template right?"
     ]
 

@@ -1,4 +1,5 @@
 import pytest
+import yaml
 from contained import template
 
 from adaptune.odometry import OdometryError
@@ -48,14 +49,23 @@ def test_a_value_of_many_names(tmp_path):
         Template(path).path_of("x")
 
 
+def test_numbers_stay_what_they_are_to_ros(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text("a: 1e3\nb: 20\nc: 2.0\nd: 1e-7\n")
+    assert yaml.safe_load(Template(path).fill({})) == {"a": 1000.0, "b": 20, "c": 2.0, "d": 1e-7}
+    filled = yaml.safe_load(Template(path).fill({"a": 1e22, "b": 3, "c": 3, "d": 2e-9}))
+    assert filled == {"a": 1e22, "b": 3, "c": 3.0, "d": 2e-9}
+    assert [type(value) for value in filled.values()] == [float, int, float, float]
+
+
 def test_where_the_parameter_server_holds_them(file):
     given = {"keyframe_interval": 1.5, "iterations": 20, "gicp.robust": True, "voxel": 2.0}
     assert server_keys(file, given, HELD) == {
         # A launch file may load the file into groups, and more than once.
-        "keyframe_interval": ["/gicp/keyframe_interval", "/front/gicp/keyframe_interval"],
-        "iterations": ["/gicp/iterations"],
-        "gicp.robust": ["/gicp/robust"],
-        "voxel": ["/other/voxel"],
+        "gicp/keyframe_interval": ["/gicp/keyframe_interval", "/front/gicp/keyframe_interval"],
+        "gicp/iterations": ["/gicp/iterations"],
+        "gicp/robust": ["/gicp/robust"],
+        "other/voxel": ["/other/voxel"],
     }
     assert server_keys(file, {}, None) == {}
 

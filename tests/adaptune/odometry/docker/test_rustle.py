@@ -28,10 +28,14 @@ def settings(**given):
         ({"memory": 1}, "memory"),
         ({"node": "/gicp"}, "node: parameters change only with play: lockstep"),
         (
-            {"play": "lockstep", "set_parameter": ("x",)},
+            {"play": "lockstep", "set_parameter": ("x", "{name}={value}")},
             r"set_parameter: name the node, too \(node\)",
         ),
         ({"play": "lockstep", "node": "/n", "set_parameter": ()}, "set_parameter"),
+        (
+            {"play": "lockstep", "node": "/n", "set_parameter": ("x", "{value}")},
+            "set_parameter: names no {name} in its arguments",
+        ),
     ],
 )
 def test_settings_that_are_refused(given, words):
