@@ -298,7 +298,7 @@ def test_the_same_parameters_again_change_nothing(name):
     np.testing.assert_allclose(poses, usual_drive(name), atol=1e-6)
 
 
-@every_odometry
+@but_lockstep
 def test_parameters_change_between_scans_or_not_at_all(name):
     space, prepared = space_of(name), prepared_drive(name)
     (other,) = space.from_unit(np.zeros((1, len(space))))

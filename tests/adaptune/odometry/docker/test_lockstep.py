@@ -131,7 +131,7 @@ def test_parameters_get_there_as_numbers_and_change_while_it_runs(make, systems)
 
 
 def test_nobody_says_whether_a_node_without_reconfigure_reads_its_parameters_again(make, systems):
-    odometry = make(imitate={"read_once": True}, settings={"node": "/gicp"})
+    odometry = make(imitate={"read_once": True, "jump": 11}, settings={"node": "/gicp"})
     odometry.start(scans()[0], np.eye(4))
     with Said() as said:
         odometry.apply(Selection(0, OTHER))
@@ -143,6 +143,11 @@ def test_nobody_says_whether_a_node_without_reconfigure_reads_its_parameters_aga
     assert held["gicp"]["max_correspondence_distance"] == 3.0
     poses = [registration.T_odom_sensor for registration in on(odometry, 1, 10)]
     np.testing.assert_allclose(poses, host_poses()[1:10], atol=1e-6)
+    # A pose that is none is a fault.
+    assert np.isnan([found.T_odom_sensor for found in on(odometry, 10, 12)]).all()
+    (fault,) = odometry.faults
+    assert fault.startswith("it gave a pose that is not finite: ")
+    assert odometry.ended
 
 
 def test_a_command_sets_parameters(make, systems):
@@ -153,6 +158,12 @@ def test_a_command_sets_parameters(make, systems):
     assert held["gicp"]["max_correspondence_distance"] == 3.5
     with pytest.raises(OdometryError, match="exit code 4: I do not know gicp/keyframe_interval"):
         odometry.apply(Selection(0, {"keyframe_interval": 2.0}))
+    # A container that is killed is a fault.
+    (container,) = containers()
+    engine().api.kill(container)
+    assert all(np.isnan(found.T_odom_sensor).all() for found in on(odometry, 1, 4))
+    assert len(odometry.faults) == 1
+    assert odometry.ended
 
 
 def test_hand_over_between_containers(make):
@@ -182,24 +193,6 @@ def test_one_that_dies_is_a_fault_with_its_last_lines(make):
     assert "gicp: terminating after 4 scans: the map is corrupt" in fault
     assert odometry.ended
     assert not containers()
-
-
-def test_a_pose_that_is_none_is_a_fault(make):
-    odometry = make(imitate={"jump": 1})
-    odometry.start(scans()[0], np.eye(4))
-    (fault,) = odometry.faults
-    assert fault.startswith("it gave a pose that is not finite: ")
-    assert np.isnan(on(odometry, 1, 2)[0].T_odom_sensor).all()
-
-
-def test_a_container_that_is_killed_is_a_fault(make):
-    odometry = make()
-    odometry.start(scans()[0], np.eye(4))
-    (container,) = containers()
-    engine().api.kill(container)
-    assert all(np.isnan(r.T_odom_sensor).all() for r in on(odometry, 1, 4))
-    assert len(odometry.faults) == 1
-    assert odometry.ended
 
 
 def test_scans_without_a_pose_continue_the_motion(make, monkeypatch):
