@@ -257,7 +257,8 @@ def parameter_cases():
         for name in HERE
         for parameter in space_of("gicp" if name == "process" else name).names
     ]
-    return cases + [(name, space_of(name).names[0]) for name in CONTAINERS]
+    # Tests of their own compare whole runs in containers with those of this process.
+    return [*cases, ("docker_process", space_of("docker_process").names[0])]
 
 
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())
