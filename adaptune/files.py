@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import tempfile
 import zipfile
 import zlib
@@ -28,6 +29,21 @@ def expand_user(path: str) -> Path:
 
 class FullError(AdaptuneError, OSError):
     """There is no room for a file."""
+
+
+def temporary_prefix() -> str:
+    """Path with which the names of this process's temporary folders begin."""
+    return str(Path(tempfile.gettempdir()) / f"adaptune-{os.getpid()}-")
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A folder for the block; what cannot be removed afterwards stays."""
+    folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

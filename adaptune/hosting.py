@@ -50,7 +50,9 @@ def verdict(code: int) -> str:
     """How a process ended, by its exit code, or minus the signal's number."""
     if code >= 0:
         return f"its process ended with code {code}"
-    return f"its process was ended by {signal.Signals(-code).name}"
+    known = -code in set(signal.Signals)
+    by = signal.Signals(-code).name if known else f"signal {-code}"
+    return f"its process was ended by {by}"
 
 
 def last_lines(output: BinaryIO) -> str:

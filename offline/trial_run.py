@@ -9,7 +9,7 @@ import numpy as np
 from adaptune.archive import Frames
 from adaptune.errors import in_a_line
 from adaptune.geometry import Poses, invert, steps
-from adaptune.odometry.base import OdometryInstance, Usage
+from adaptune.odometry.base import OdometryInstance, UnavailableError, Usage
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import Tracker
 from offline.prepared import SharedScan, SharedScans
@@ -62,6 +62,8 @@ class TrialRun:
         if not self._failure:
             try:
                 self._step(i, scan)
+            except UnavailableError:
+                raise
             except Exception as error:
                 self._failure = (in_a_line(error),)
         if self._failure:

@@ -24,6 +24,10 @@ class OdometryError(AdaptuneError):
     """An odometry that cannot do what is asked of it."""
 
 
+class UnavailableError(OdometryError):
+    """What runs an odometry is gone, whatever its parameters: a trial says nothing then."""
+
+
 class NotInstalledError(OdometryError):
     """An odometry whose package is not installed."""
 

@@ -22,6 +22,7 @@ from adaptune.odometry.base import (
     OdometryError,
     OdometryInstance,
     Registration,
+    UnavailableError,
     Usage,
 )
 from adaptune.selection import Selection
@@ -170,6 +171,8 @@ class Isolated(Faulting):
                 return
             try:
                 self._stream = self._connect()
+            except UnavailableError:
+                raise
             except OdometryError as error:
                 # One that has run can be gone for good.
                 if not self.faults:

@@ -1,6 +1,5 @@
 """Odometries that run once on a whole recording."""
 
-import tempfile
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from logging import getLogger
@@ -10,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.files import temporary_folder
 from adaptune.geometry import Poses, invert, steps
 from adaptune.odometry.base import (
     BaseSettings,
@@ -18,6 +18,7 @@ from adaptune.odometry.base import (
     OdometryError,
     OdometryInstance,
     Registration,
+    UnavailableError,
     Usage,
 )
 from adaptune.odometry.frame_check import check_frame
@@ -149,8 +150,7 @@ class WholeRun(OdometryInstance):
     def _run(self, given: ProgramInput) -> Poses:
         """Poses at the scans' stamps, of shape (n, 4, 4), NaN where the program wrote none."""
         T_own_sensor, failure = np.full((len(given.stamps), 4, 4), np.nan), None
-        with tempfile.TemporaryDirectory(prefix="adaptune-", ignore_cleanup_errors=True) as name:
-            folder = Path(name)
+        with temporary_folder() as folder:
             try:
                 trajectory = self.trajectory(given, folder)
                 if self.settings.extrinsic is not None:
@@ -158,6 +158,8 @@ class WholeRun(OdometryInstance):
                     trajectory = Trajectory(trajectory.stamps, T)
                 T_own_sensor = poses_at(trajectory, given.stamps)
                 failure = _lacking(T_own_sensor, given)
+            except UnavailableError:
+                raise
             except (TrajectoryError, OdometryError, LinkError) as error:
                 failure = str(error)
             words = self.words(folder)

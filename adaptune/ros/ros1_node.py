@@ -194,6 +194,9 @@ class _Node(object):
         try:
             known = client.get_configuration(timeout=_SECONDS) or {}
             own = {name: name.replace(".", "/").rpartition("/")[2] for name in values}
+            # Two parameters may end alike.
+            last = list(own.values())
+            known = {name for name in known if last.count(name) == 1}
             mine = {own[name]: value for name, value in values.items() if own[name] in known}
             held = client.update_configuration(mine) if mine else {}
             return {name: held[own[name]] for name in values if own[name] in mine}

@@ -15,6 +15,8 @@ from adaptune.odometry.docker.engine import (
     default_user,
     image_digest,
 )
+from adaptune.odometry.docker.shared_folder import copy_regular, make_shared, remove_shared
+from adaptune.odometry.docker.trial_log import costs, kept_log
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.template import Template, replace
 from adaptune.odometry.whole_run import WholeRun
@@ -67,10 +69,11 @@ class DockerCommand(WholeRun):
         return self._words
 
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
-        output = folder / "output"
-        output.mkdir()
-        output.chmod(0o777)  # for any user of the image
-        (output / self.settings.output).parent.mkdir(parents=True, exist_ok=True)
+        shared = make_shared(folder / "shared")
+        output = make_shared(shared / "output")
+        nested = output
+        for part in Path(self.settings.output).parts[:-1]:
+            nested = make_shared(nested / part)
         source = given.path.resolve()
         inside = "/data" if source.is_dir() else f"/data/{source.name}"
         mounts = [Mount(source, inside), Mount(output, _OUTPUT, writable=True)]
@@ -85,15 +88,22 @@ class DockerCommand(WholeRun):
             self._limits.memory,
             [replace(argument, values) for argument in self.settings.command],
             mounts,
-            user=default_user(self.settings),
+            user=(user := default_user(self.settings)),
             environment={"ADAPTUNE_POINTS": given.points, "ADAPTUNE_IMU": given.imu},
         )
         with closing(container):
             failure = self._watch(container, len(given.stamps))
             self._words = container.last_lines()
+            about = costs(self._usage, {}) | ({"fault": failure} if failure else {})
+            with kept_log(given.logs, self.settings, self.parameters, about) as kept:
+                if kept is not None:
+                    (kept / "output.log").write_bytes(container.log())
+        checked = folder / "checked"
+        copy_regular(output / self.settings.output, output, checked / self.settings.output)
+        remove_shared(shared, self.called, user)
         if failure is not None:
             raise OdometryError(failure)
-        return read_output(output, self.settings, given.stamps)
+        return read_output(checked, self.settings, given.stamps)
 
     def _fill(self, folder: Path) -> Mount:
         template = Template(Path(self.settings.template))

@@ -3,26 +3,33 @@
 import contextlib
 import logging
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from adaptune import hosting
+from adaptune.files import temporary_prefix
 from adaptune.keeper import Ended
-from adaptune.odometry.base import BaseSettings, OdometryError
+from adaptune.odometry.base import BaseSettings, OdometryError, UnavailableError
 from adaptune.odometry.docker import undertaker
 
 OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
 _NOBODY = 65534
+_SIGNALS = {int(one) for one in signal.Signals}
 _TAIL = 50
 
 _log = logging.getLogger(__name__)
+
+
+def _text(user: Any) -> Any:
+    return str(user) if isinstance(user, int) and not isinstance(user, bool) else user
 
 
 class ContainerSettings(BaseSettings):
@@ -44,11 +51,11 @@ class ContainerSettings(BaseSettings):
     image: str = Field(min_length=1)
     cpus: float = Field(1.0, ge=0.01, le=4096)
     pids: int = Field(1024, ge=16, le=10**6)
-    user: str | None = None
+    user: Annotated[str | None, BeforeValidator(_text)] = None
 
 
-class EngineError(OdometryError):
-    """A Docker engine that does not do what it is asked."""
+class EngineError(UnavailableError):
+    """A Docker engine that does not answer, or does not have the image."""
 
 
 class Mount(NamedTuple):
@@ -84,6 +91,8 @@ def engine() -> Any:
                 f"this user may not use the Docker engine at {where}: {help_}"
             ) from error
         help_ = "install Docker Engine, or start it: `sudo service docker start`"
+        if "DOCKER_HOST" in os.environ:
+            help_ = "is DOCKER_HOST right?"
         raise EngineError(f"no Docker engine answers at {where}: {help_}") from error
     _remove_leftovers(client)
     return client
@@ -132,7 +141,7 @@ def _owner() -> tuple[str, Any]:
     """Label of this process's containers, and who removes them if it is killed."""
     owner = str(_identity(os.getpid()))
     process = subprocess.Popen(
-        [sys.executable, undertaker.__file__, f"{OWNER}={owner}"],
+        [sys.executable, undertaker.__file__, f"{OWNER}={owner}", temporary_prefix()],
         stdin=subprocess.PIPE,  # which closes with this process
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -164,6 +173,10 @@ def _image(name: str) -> Any:
         raise EngineError(f"image {name!r}: {error.explanation or error}") from error
     except OSError as error:
         raise _silent(error) from error
+
+
+def _refusal(image: str, error: Any) -> str:
+    return f"image {image!r}: {error.explanation or error}"
 
 
 def _silent(error: OSError) -> EngineError:
@@ -263,7 +276,7 @@ class Container:
             client.api.start(self.id)
         except APIError as error:
             self.close()
-            raise EngineError(f"image {settings.image!r}: {error.explanation or error}") from error
+            raise OdometryError(_refusal(settings.image, error)) from error
         except OSError as error:
             self.close()
             raise _silent(error) from error
@@ -282,11 +295,11 @@ class Container:
             return -9
         except OSError as error:
             raise _silent(error) from error
+        self.out_of_memory = bool(state["OOMKilled"])
         if state["Running"]:
             return None
-        self.out_of_memory = bool(state["OOMKilled"])
         code = int(state["ExitCode"])
-        return 128 - code if code > 128 else code
+        return 128 - code if code - 128 in _SIGNALS else code
 
     def used(self) -> Ended:
         """CPU seconds and megabytes now; zero where it has ended."""
@@ -326,7 +339,7 @@ class Container:
             )
             output = engine().api.exec_start(made["Id"], detach=detach)
         except APIError as error:
-            raise EngineError(f"image {self.image!r}: {error.explanation or error}") from error
+            raise OdometryError(_refusal(self.image, error)) from error
         except OSError as error:
             raise _silent(error) from error
         return made["Id"], b"" if detach else output

@@ -1,16 +1,20 @@
 """A ROS 1 system in a container that receives scan after scan, and can change its parameters."""
 
 import contextlib
+import shutil
+import tempfile
 import threading
 import time
 import weakref
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify
-from adaptune.odometry.base import OdometryError, Registration, Usage
+from adaptune.odometry.base import OdometryError, Registration, UnavailableError, Usage
 from adaptune.odometry.docker.ros_container import RosSystem
 from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread, whole_name
 from adaptune.odometry.isolation import Faulting, Limits, pose_fault
@@ -22,6 +26,7 @@ from adaptune.sequence.export import IMU, POINTS, Messages, structured
 from adaptune.sequence.pose_messages import POSES
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
+from adaptune.trajectory import Trajectory
 
 _CLOUD, _IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 _MOST_SILENT = 30
@@ -85,10 +90,14 @@ class Lockstep(Faulting):
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
         self._silent, self._stamp, self._poses = 0, prepared.stamp, []
+        self._late: int | None = None
+        self._before: tuple[int, Poses] | None = None
         try:
             self._begin(prepared)
             self._show(prepared)
             self._correct()
+        except UnavailableError:
+            raise
         except (OdometryError, LinkError) as error:
             told = self._told(error)
             # One that has run can be gone for good.
@@ -102,6 +111,8 @@ class Lockstep(Faulting):
         if self._system is not None:
             try:
                 self._show(prepared)
+            except UnavailableError:
+                raise
             except (OdometryError, LinkError) as error:
                 self.note_fault(self._told(error))
 
@@ -114,6 +125,8 @@ class Lockstep(Faulting):
         self._T_odom_sensor = T_before @ self._T_step
         try:
             registered = self._correct()
+        except UnavailableError:
+            raise
         except (OdometryError, LinkError) as error:
             return self.note_fault(self._told(error))
         if registered:
@@ -151,6 +164,7 @@ class Lockstep(Faulting):
                 with contextlib.suppress(OdometryError, LinkError):
                     warn_of_unread(self._system.link, self.name, self._keys)
             self._system.close()
+            shutil.rmtree(self._folder, ignore_errors=True)
             self._system = None
             self._used_before = Usage(self.usage.cpu, self.usage.memory)
             self._used = Usage(0.0, 0.0)
@@ -162,12 +176,15 @@ class Lockstep(Faulting):
         """See what the system has used."""
         self._looked = time.monotonic()
         with contextlib.suppress(OdometryError, LinkError):
-            self._used = system.used()
+            system.state()
+        self._used = system.usage
 
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
         self._template, text = filled(self._settings, self.parameters)
-        self._system = system = RosSystem(self._settings, self._limits.memory, text)
+        self._folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        system = RosSystem(self._settings, self._limits.memory, text, self._folder)
+        self._system = system
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(1)
         take = weakref.WeakMethod(self._take)  # the link must not keep this alive
@@ -176,7 +193,7 @@ class Lockstep(Faulting):
         self._send_cloud = link.advertise(topics[0], _CLOUD)
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
         self._topics = topics
-        system.wait(topics[0], connected=True)
+        system.wait(topics[0], topics)
         self._keys = keys = server_keys(self._template, self.parameters, link.ask("parameters"))
         self._steering = None
         if (node := self._settings.node) is not None:
@@ -189,6 +206,8 @@ class Lockstep(Faulting):
 
     def _show(self, scan: Scan) -> None:
         """Publish what the system hears until the end of a scan."""
+        with self._news:
+            self._poses = []
         messages, (points, imu_topic) = self._messages, self._topics
         if scan.imu is not None and self._send_imu is not None:
             imu = scan.imu
@@ -203,33 +222,54 @@ class Lockstep(Faulting):
 
     def _correct(self) -> bool:
         """Correct the predicted pose; False if the system gave none."""
-        T_own = self._pose(min(self._settings.patience, self._limits.seconds))
+        seconds = min(self._settings.patience, self._limits.seconds)
+        found = self._pose(seconds)
         assert self._system is not None
-        if T_own is None:
+        if found is None:
             self._silent += 1
             self._system.state()
             if self._silent >= _MOST_SILENT:
+                published = self._system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
                 raise OdometryError(
-                    f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row"
+                    f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row; "
+                    f"topics that are published: {', '.join(sorted(published)) or 'none'}"
                 )
             return False
+        stamp, T_own = found
         self._silent, self._has_run = 0, True
         if wrong := pose_fault(T_own):
             raise OdometryError(f"it gave a pose {wrong}")
         T_own = T_own @ self._T_base_sensor
+        if self._late is None:
+            self._late = stamp - self._stamp
+        T_own = self._at_scan(stamp, T_own)
         if self._T_odom_own is None:
             self._T_odom_own = self._T_odom_sensor @ invert(T_own)
         self._T_odom_sensor = self._T_odom_own @ T_own
         return True
 
-    def _pose(self, seconds: float) -> Poses | None:
-        """The system's pose of the scan that was published last; None if it does not come."""
+    def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
+        """The pose at the scan's stamp, if the system gives that at the scan's end."""
+        before, self._before = self._before, (stamp, T_own_sensor)
+        if before is None or not before[0] <= self._stamp < stamp:
+            return T_own_sensor
+        both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
+        T: Poses = both.at(np.array([self._stamp], np.int64), 1e9)[0]
+        return T
+
+    def _pose(self, seconds: float) -> tuple[int, Poses] | None:
+        """The system's pose of the scan that was published last; None if it does not come.
+
+        It comes after the scan was published. Its stamp is as late as that of the first pose was:
+        a system gives it at the scan's begin, or at its end, where the next scan begins.
+        """
+        earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
 
         def there() -> bool:
-            return bool(self._poses) and self._poses[-1][0] >= self._stamp - _EARLY
+            return bool(self._poses) and self._poses[-1][0] >= earliest
 
         with self._news:
-            return self._poses[-1][1] if self._news.wait_for(there, seconds) else None
+            return self._poses[-1] if self._news.wait_for(there, seconds) else None
 
     def _take(self, kind: str, data: bytes) -> None:
         if self._system is None or kind not in POSES:

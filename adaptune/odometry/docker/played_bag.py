@@ -1,12 +1,11 @@
 """A ROS 1 system in a container, on a bag that is played."""
 
-import hashlib
-import json
 import logging
 import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +13,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys.store import Typestore
 
-from adaptune import yaml
-from adaptune.files import replacing_folder
+from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import OdometryError
-from adaptune.odometry.docker.engine import Mount, image_digest
+from adaptune.odometry.docker.engine import Mount
 from adaptune.odometry.docker.ros_container import RosSystem
 from adaptune.odometry.docker.ros_parameters import filled, server_keys, warn_of_unread
+from adaptune.odometry.docker.trial_log import costs, kept_log
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.whole_run import WholeRun
 from adaptune.ros.ros1 import Ros1
@@ -34,16 +33,6 @@ _STEADY = 0.9
 """Least share of poses whose stamps are as far from the scans' as those of the others."""
 
 _log = logging.getLogger(__name__)
-
-
-class _Times(NamedTuple):
-    """Seconds that parts of a trial took."""
-
-    container: float
-    ready: float
-    bag: float
-    drained: float
-    removed: float = 0.0
 
 
 class PoseRecorder:
@@ -114,32 +103,37 @@ class PlayedBag(WholeRun):
     def words(self, folder: Path) -> str:  # noqa: ARG002
         return self._words
 
-    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:  # noqa: ARG002
-        begin = time.monotonic()
+    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
+        self._seconds: dict[str, float] = {}
+        self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
         template, text = filled(self.settings, self.parameters)
         source = given.path.resolve()
         # As RUSTLE mounts the folder of a data set.
-        inside = f"/rustle/dataset/{source.name}"
-        system = RosSystem(self.settings, self._limits.memory, text, [Mount(source, inside)])
-        recorder = None
+        bag = Mount(source, f"/rustle/dataset/{source.name}")
+        with self._timed("container"):
+            system = RosSystem(self.settings, self._limits.memory, text, folder, [bag])
+        recorder, fault = PoseRecorder(system.link, self.settings.odometry), ""
         with closing(system):
             try:
-                times = time.monotonic() - begin
-                recorder = PoseRecorder(system.link, self.settings.odometry)
                 renamed = self._renamed(given)
-                system.wait(renamed.get(given.points, given.points))
-                keys = server_keys(template, self.parameters, system.link.ask("parameters"))
-                ready = time.monotonic() - begin - times
-                end = begin + self._limits.seconds * len(given.stamps)
-                played, drained = self._play(system, recorder, given, inside, end)
+                with self._timed("ready"):
+                    system.wait(renamed.get(given.points, given.points))
+                    keys = server_keys(template, self.parameters, system.link.ask("parameters"))
+                self._play(system, recorder, given, bag.target)
                 warn_of_unread(system.link, self.called, keys)
                 self._check_published(system, recorder)
+                return self._checked(recorder, given)
+            except AdaptuneError as error:
+                fault = str(error)
+                raise
             finally:
-                self._finish(system, recorder, given)
-        took = _Times(times, ready, played, drained)
-        removed = time.monotonic() - begin - sum(took)
-        self._note(given, took._replace(removed=removed))
-        return self._checked(recorder, given)
+                self._finish(system, recorder, given, fault)
+
+    @contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
+        begin = time.monotonic()
+        yield
+        self._seconds[what] = time.monotonic() - begin
 
     def _renamed(self, given: ProgramInput) -> dict[str, str]:
         """Topics of the recording that the system expects by another name."""
@@ -151,32 +145,35 @@ class PlayedBag(WholeRun):
         return renamed
 
     def _play(
-        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str, end: float
-    ) -> tuple[float, float]:
-        """Play the bag and wait until nothing comes any more; seconds that each took."""
-        begin = looked = time.monotonic()
-        system.play(bag, self.settings.rate, self._renamed(given))
-        while not system.played():
-            time.sleep(_BETWEEN_LOOKS)
-            if time.monotonic() - looked > _BETWEEN_STATES:
-                looked = time.monotonic()
-                self._see(system, given)
-                system.state()
-            self._check_time(end)
-        over = time.monotonic()
-        # Nodes that sleep by the clock must wake up to finish.
-        system.run_clock(_end_of(given.path), self.settings.rate)
-        while not self._drained(recorder, over, int(given.stamps[-1])):
-            time.sleep(_BETWEEN_LOOKS)
-            self._check_time(end)
-        system.state()
-        self._see(system, given)
-        return over - begin, time.monotonic() - over
+        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str
+    ) -> None:
+        """Play the bag and wait until nothing comes any more."""
+        n = len(given.stamps)
+        with self._timed("bag"):
+            looked = time.monotonic()
+            system.play(bag, self.settings.rate, self._renamed(given))
+            while not system.played():
+                time.sleep(_BETWEEN_LOOKS)
+                if time.monotonic() - looked > _BETWEEN_STATES:
+                    looked = time.monotonic()
+                    self._see(system, n)
+                self._check_time()
+        with self._timed("drained"):
+            over = time.monotonic()
+            # Nodes that sleep by the clock must wake up to finish.
+            system.run_clock(_end_of(given.path), self.settings.rate)
+            while not self._drained(recorder, over, int(given.stamps[-1])):
+                time.sleep(_BETWEEN_LOOKS)
+                self._check_time()
+            self._see(system, n)
 
-    def _see(self, system: RosSystem, given: ProgramInput) -> None:
-        """See what the system has used; the bag sets the pace, so CPU time counts as its time."""
-        used = system.used()
-        self._usage = used._replace(seconds=used.cpu / len(given.stamps))
+    def _see(self, system: RosSystem, n: int) -> None:
+        """See whether the system runs, and what it has used.
+
+        The bag sets the pace, so CPU time counts as the system's time.
+        """
+        system.state()
+        self._usage = system.usage._replace(seconds=system.usage.cpu / n)
 
     def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
         """Whether the pose of the last scan is there, or nothing came for a while."""
@@ -187,8 +184,8 @@ class PlayedBag(WholeRun):
         pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
         return bool(time.monotonic() - max(recorder.last, over) > pause)
 
-    def _check_time(self, end: float) -> None:
-        if time.monotonic() > end:
+    def _check_time(self) -> None:
+        if time.monotonic() > self._end:
             limit = f"isolation.seconds = {self._limits.seconds:g}"
             raise OdometryError(f"it took longer than {limit} for each scan")
 
@@ -210,46 +207,21 @@ class PlayedBag(WholeRun):
         )
 
     def _finish(
-        self, system: RosSystem, recorder: PoseRecorder | None, given: ProgramInput
+        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, fault: str
     ) -> None:
-        """Keep what is left of the run."""
-        self._words = system.words()
-        self._kept = None
-        if given.logs is None:
-            return
-        whole = json.dumps([self.settings.model_dump(mode="json"), self.parameters], sort_keys=True)
-        name = hashlib.blake2b(whole.encode(), digest_size=4).hexdigest()
-        self._kept = given.logs / name
-        with replacing_folder(self._kept) as temporary:
-            temporary.mkdir()
-            system.keep(temporary)
-            if recorder is not None and recorder.received and recorder.received[0][0] in POSES:
-                recorder.write(temporary / "odometry.bag")
-
-    def _note(self, given: ProgramInput, took: _Times) -> None:
-        seconds = {name: round(value, 2) for name, value in took._asdict().items()}
-        fixed = sum(took) - took.bag
-        _log.info(
-            "%s: bag %.1f s, and %.1f s besides (container %.1f, ready %.1f, drained %.1f, "
-            "removed %.1f); %.0f %% of a core, %.0f MB",
-            *(self.called, took.bag, fixed),
-            *(took.container, took.ready, took.drained, took.removed),
-            *(100.0 * self._usage.cpu / max(took.bag, 1e-9), self._usage.memory or 0.0),
-        )
-        if self._kept is not None:
-            note = {
-                "image": self.called,
-                "digest": image_digest(self.called),
-                "parameters": self.parameters,
-                "rate": self.settings.rate,
-                "cpus": self.settings.cpus,
-                "memory": self._limits.memory,
-                "seconds": seconds,
-                "cpu": round(self._usage.cpu, 3),
-                "peak_memory": round(self._usage.memory or 0.0, 1),
-                "input": str(given.path),
-            }
-            (self._kept / "trial.yaml").write_text(yaml.dump(note), encoding="utf-8")
+        """End the system, and keep what is left of the run."""
+        self._words, written = system.words(), system.log()
+        with self._timed("removed"):
+            system.stop()
+        limits = {"rate": self.settings.rate, "cpus": self.settings.cpus}
+        about = limits | costs(self._usage, self._seconds) | ({"fault": fault} if fault else {})
+        with kept_log(given.logs, self.settings, self.parameters, about) as kept:
+            if kept is None:
+                return
+            (kept / "roscore.log").write_bytes(written)
+            system.keep(kept)
+            if recorder.received and recorder.received[0][0] in POSES:
+                recorder.write(kept / "odometry.bag")
 
     def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
         """The trajectory, if its stamps are those of the data."""

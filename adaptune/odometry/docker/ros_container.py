@@ -7,7 +7,6 @@ import re
 import shlex
 import shutil
 import socket
-import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -17,20 +16,26 @@ from pathlib import Path
 from typing import Any
 
 from adaptune import hosting, ros
-from adaptune.odometry.base import OdometryError, Usage
+from adaptune.odometry.base import OdometryError, UnavailableError, Usage
 from adaptune.odometry.docker.engine import (
     Container,
     ContainerSettings,
-    EngineError,
     Mount,
     default_user,
     image_digest,
+)
+from adaptune.odometry.docker.shared_folder import (
+    copy_regular,
+    make_shared,
+    opened,
+    regular_files,
+    remove_shared,
 )
 from adaptune.ros.ros1 import Ros1
 from adaptune.ros.ros_link import LinkError
 
 CLOCK = "rosgraph_msgs/msg/Clock"
-_FOLDER = "/adaptune"
+_FOLDER, _PROGRAMS = "/adaptune", "/adaptune-programs"
 _ENVIRONMENT = {
     "ROS_HOSTNAME": "localhost",
     "ROS_MASTER_URI": "http://localhost:11311",
@@ -39,31 +44,35 @@ _ENVIRONMENT = {
     "PYTHONDONTWRITEBYTECODE": "1",
     "PYTHONUNBUFFERED": "1",
 }
+_SETUP = "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
 _FIND = 'for package in {packages}; do rospack find "$package" >/dev/null 2>&1 && {then}; done; '
 _MASTER = (
-    "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
-    "for python in python3 python; do "
-    f'"$python" {_FOLDER}/ros1_container.py {_FOLDER}/link {{use_sim_time}}; '
+    _SETUP + "for python in python3 python; do "
+    f'"$python" {_PROGRAMS}/ros1_container.py {_FOLDER}/link {{use_sim_time}}; '
     "code=$?; [ $code = 9 ] || [ $code = 127 ] || exit $code; "
     "done; echo 'no Python of the image imports rospy: is it a ROS 1 image?' >&2; exit 127"
 )
-_CLOSING = re.compile(
-    rb"(\x1b\[\d*m)*(=*|log file: .*|Initiating shutdown!|\[\S+\] killing on exit|"
+_NOISE = re.compile(
+    rb"(\x1b\[\d*m)*(=*|/|  \S+ \(\S+/\S+\)|NODES|auto-starting new master|ROS_MASTER_URI=.*|"
+    rb"process\[\S+\]: started with pid \[\d+\]|roscore/master is not yet running.*|"
+    rb"master has started.*|.*rustle\.launch http\S*|log file: .*|Initiating shutdown!|\[\S+\] killing on exit|"
     rb"all processes on machine have died.*|(\.\.\. )?shutting down .*|done)(\x1b\[\d*m)*"
 )
-"""Lines that roslaunch writes at its end, after the last ones of the nodes."""
+"""Lines that roslaunch writes at its begin and at its end, before and after those of the nodes."""
 _LAUNCH = (
-    "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
-    f"exec > {_FOLDER}/roslaunch.log 2>&1; "
+    _SETUP
+    + f"exec > {_FOLDER}/roslaunch.log 2>&1; "
     + _FIND.replace("{then}", 'exec roslaunch --wait "$package" {launch}')
     + "echo 'there is no package {packages}'; exit 1"
 )
 _PROBE = (
-    "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
-    "command -v roslaunch >/dev/null || exit 1; " + _FIND.replace("{then}", "exit 0") + "exit 1"
+    _SETUP
+    + "command -v roslaunch >/dev/null || exit 1; "
+    + _FIND.replace("{then}", "exit 0")
+    + "exit 1"
 )
 _BETWEEN_LOOKS = 0.1
-_OTHERS_ONLY = 10.0
+_OTHERS_ONLY = 30.0
 """Seconds in which nodes have subscribed to other topics only."""
 _TAIL = 1 << 14
 """Bytes of a log in which its last lines are."""
@@ -88,6 +97,8 @@ class RosSystem:
         Gigabytes.
     parameters
         Text of the parameter file.
+    folder
+        An empty folder, which the caller removes.
     mounts
         More files and folders of the host.
 
@@ -97,51 +108,65 @@ class RosSystem:
         If there is no such image, or it holds no ROS 1.
     """
 
-    def __init__(self, settings: Any, memory: float, parameters: str, mounts: Sequence[Mount] = ()):
+    def __init__(
+        self,
+        settings: Any,
+        memory: float,
+        parameters: str,
+        folder: Path,
+        mounts: Sequence[Mount] = (),
+    ):
         self._settings, self._topics = settings, [settings.odometry]
-        self._folder = tempfile.TemporaryDirectory(prefix="adaptune-", ignore_cleanup_errors=True)
-        self.folder = Path(self._folder.name)
-        self.folder.chmod(0o777)  # for any user of the image
+        self._user, self.usage = ros_user(settings), Usage(0.0, 0.0)
         self._clock: SimClock | None = None
         self._play: str | None = None
+        self.folder, given = make_shared(folder / "shared"), folder / "given"
+        given.mkdir()
         for name in ("ros1_node.py", "ros1_container.py"):
-            shutil.copy(Path(ros.__path__[0]) / name, self.folder)
-        file = self.folder / "params.yaml"
-        file.write_text(parameters, encoding="utf-8")
-        file.chmod(0o644)
+            shutil.copy(Path(ros.__path__[0]) / name, given)
+        self._parameters = given / "params.yaml"
+        self._parameters.write_text(parameters, encoding="utf-8")
+        for file in given.iterdir():
+            file.chmod(0o644)
+        given.chmod(0o755)
+        mounts = [
+            Mount(self.folder, _FOLDER, writable=True),
+            Mount(given, _PROGRAMS),
+            Mount(self._parameters, "/rustle/config/params.yaml"),
+            *mounts,
+        ]
+        self._environment = dict(_ENVIRONMENT)
+        if self._user.partition(":")[0] not in ("0", "root"):
+            self._environment["HOME"] = _FOLDER
         with contextlib.ExitStack() as undo:
-            undo.callback(self._folder.cleanup)
-            user = ros_user(settings)
-            self._environment = dict(_ENVIRONMENT)
-            if user.partition(":")[0] not in ("0", "root"):
-                self._environment["HOME"] = _FOLDER
             with socket.socket(socket.AF_UNIX) as server:
                 server.bind(str(self.folder / "link"))
                 (self.folder / "link").chmod(0o777)
                 server.listen()
-                sim = {None: "''", True: "true", False: "false"}[settings.use_sim_time]
-                self._container = Container(
-                    settings,
-                    memory,
-                    ["/bin/bash", "-l", "-c", _MASTER.format(use_sim_time=sim)],
-                    [
-                        Mount(self.folder, _FOLDER, writable=True),
-                        Mount(file, "/rustle/config/params.yaml"),
-                        *mounts,
-                    ],
-                    user=user,
-                    environment=self._environment,
-                    bare=True,
-                )
-                undo.callback(self._container.close)
+                self._container = self._start(memory, mounts)
+                undo.callback(self.stop)
                 try:
                     self._launch = self._container.run(self._launched(), self._environment)
-                except EngineError as error:
+                except UnavailableError:
+                    raise
+                except OdometryError as error:
                     time.sleep(_UNTIL_NOTED)
                     raise self._no_roscore() or error from error
                 connection = self._accept(server)
             self.link = Ros1(connection, self._running, self._container.close)
             undo.pop_all()
+
+    def _start(self, memory: float, mounts: Sequence[Mount]) -> Container:
+        sim = {None: "''", True: "true", False: "false"}[self._settings.use_sim_time]
+        return Container(
+            self._settings,
+            memory,
+            ["/bin/bash", "-l", "-c", _MASTER.format(use_sim_time=sim)],
+            mounts,
+            user=self._user,
+            environment=self._environment,
+            bare=True,
+        )
 
     def _launched(self) -> str:
         launch = " ".join(("rustle.launch", *self._settings.arguments))
@@ -176,14 +201,23 @@ class RosSystem:
             It names the node that has died.
         """
         found: dict[str, Any] = self.link.ask("state", topics=self._topics)
+        nodes = found["nodes"].values()
+        self.usage = Usage(sum(cpu for cpu, _ in nodes), sum(memory for _, memory in nodes))
         if found["dead"]:
             raise OdometryError(f"node {found['dead'][0]} died")
         if (code := self._container.finished(self._launch)) is not None:
             raise OdometryError(f"roslaunch ended with code {code}")
         return found
 
-    def wait(self, topic: str, connected: bool = False) -> None:
-        """Wait until a node subscribes to a topic, and is connected if adaptune publishes it.
+    def wait(self, topic: str, sent: Sequence[str] = ()) -> None:
+        """Wait until a node subscribes to a topic, and is connected to what adaptune sends.
+
+        Parameters
+        ----------
+        topic
+            That of the clouds.
+        sent
+            Topics that adaptune publishes.
 
         Raises
         ------
@@ -200,7 +234,7 @@ class RosSystem:
                 before, changed = heard, now
             elif topic in heard:
                 # A node subscribes to one after the other.
-                if not connected or state["sending"].get(topic, 0):
+                if all(state["sending"].get(one, 0) for one in sent if one in heard):
                     return
             elif heard and now - changed > _OTHERS_ONLY:
                 break
@@ -216,8 +250,8 @@ class RosSystem:
         """Begin to play a bag that is mounted in the container."""
         names = " ".join(f"{old}:={new}" for old, new in renamed.items())
         self._play = self._container.run(
-            f"exec rosbag play --quiet --clock -r {rate:g} '{bag}' {names} "
-            f"> {_FOLDER}/rosbag.log 2>&1",
+            f"{_SETUP}exec rosbag play --quiet --clock --delay 0.5 -r {rate:g} "
+            f"{shlex.quote(bag)} {names} > {_FOLDER}/rosbag.log 2>&1",
             self._environment,
         )
 
@@ -225,7 +259,7 @@ class RosSystem:
         """Whether the bag has been played to its end; an error if that went wrong."""
         code = self._container.finished(str(self._play))
         if code:
-            words = _last_lines(self.folder / "rosbag.log")
+            words = self._last_lines("rosbag.log")
             raise OdometryError(f"rosbag play ended with code {code}: {words}")
         return code is not None
 
@@ -239,34 +273,47 @@ class RosSystem:
         """Run a command of the image; its exit code and what it wrote."""
         return self._container.call(["/bin/bash", "-l", "-c", shlex.join(command)])
 
-    def used(self) -> Usage:
-        """What the system's nodes have used; the memory is the sum of their peaks."""
-        nodes = self.link.ask("state", topics=self._topics)["nodes"].values()
-        return Usage(sum(cpu for cpu, _ in nodes), sum(memory for _, memory in nodes))
-
     def words(self) -> str:
         """The last lines that the system wrote."""
+        with contextlib.suppress(OdometryError):
+            self._container.ended()
         if self._container.out_of_memory:
-            return "it was out of isolation.memory"
-        return _last_lines(self.folder / "roslaunch.log")
+            return "out of isolation.memory"
+        return self._last_lines("roslaunch.log")
+
+    def _last_lines(self, name: str) -> str:
+        with opened(self.folder / name, self.folder) as file:
+            if file is None:
+                return ""
+            file.seek(max(file.seek(0, os.SEEK_END) - _TAIL, 0))
+            lines = [line for line in file.read().splitlines() if not _NOISE.fullmatch(line)]
+            return hosting.plain_lines(re.sub(rb"={10,}", b"", b"\n".join(lines)))
+
+    def log(self) -> bytes:
+        """What the roscore wrote."""
+        return self._container.log()
 
     def keep(self, folder: Path) -> None:
-        """Copy what was written to a folder."""
-        for file in ("params.yaml", "roslaunch.log", "rosbag.log"):
-            with contextlib.suppress(OSError):
-                shutil.copy(self.folder / file, folder)
-        with contextlib.suppress(OSError, shutil.Error):
-            shutil.copytree(self.folder / "ros" / "log", folder / "ros", dirs_exist_ok=True)
-        (folder / "roscore.log").write_bytes(self._container.log())
+        """Copy what was written, and what was given, to a folder."""
+        shutil.copy(self._parameters, folder)
+        for name in ("roslaunch.log", "rosbag.log"):
+            copy_regular(self.folder / name, self.folder, folder / name)
+        logs = self.folder / "ros" / "log"
+        for path in regular_files(logs):
+            copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """Remove the container."""
         if self._clock is not None:
             self._clock.close()
             self._clock = None
         self._container.close()
+
+    def close(self) -> None:
+        """Remove the container, and what it has written."""
+        self.stop()
         self.link.close()
-        self._folder.cleanup()
+        remove_shared(self.folder, self._settings.image, self._user)
 
 
 class SimClock:
@@ -319,14 +366,6 @@ class SimClock:
         self._publish(self._types[CLOCK](clock=time_))
 
 
-def _last_lines(path: Path) -> str:
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        file.seek(max(file.seek(0, os.SEEK_END) - _TAIL, 0))
-        lines = [line for line in file.read().splitlines() if not _CLOSING.fullmatch(line)]
-        return hosting.plain_lines(re.sub(rb"={10,}", b"", b"\n".join(lines)))
-    return ""
-
-
 def ros_user(settings: Any) -> str:
     """User who runs ROS in an image: root only where nobody else finds the packages."""
     user = default_user(settings)
@@ -340,10 +379,11 @@ def _probed(image: str, user: str, packages: str) -> str:
     limits = ContainerSettings(image=image)
     command = ["/bin/bash", "-l", "-c", _PROBE.format(packages=packages)]
     container = Container(limits, 1.0, command, user=user, environment={"HOME": "/"}, bare=True)
+    begin = time.monotonic()
     with contextlib.closing(container):
-        while (code := container.ended()) is None:
+        while (code := container.ended()) is None and time.monotonic() - begin < _START:
             time.sleep(0.02)
-    if code:
+    if code != 0:
         _log.info("only root finds %s in the image, so root runs it", packages)
         return "0"
     return user

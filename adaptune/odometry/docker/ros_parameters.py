@@ -47,7 +47,8 @@ def server_keys(
         for key in keys[whole]:
             if not equal_values(value, every[key]):
                 what = f"{key} is {every[key]!r} on the parameter server, not {value!r}"
-                raise OdometryError(f"{what}: the launch file sets it, too")
+                help_ = "the launch file, or the node, has changed it: is it in the node's range?"
+                raise OdometryError(f"{what}: {help_}")
     return keys
 
 

@@ -1,14 +1,27 @@
-"""Removes the containers of a process that has ended; runs as a script beside that process."""
+"""Removes what a process that has ended leaves: containers, and folders that it shared with them.
 
+It runs as a script beside that process.
+"""
+
+import shutil
 import sys
 import time
+from pathlib import Path
 
 _LOOKS, _BETWEEN = 3, 1.0
 """How often it looks for containers, and seconds between: one may just be made."""
 
 
-def main(label: str) -> None:
-    """Wait until the other side of the standard input has ended, then remove what has the label."""
+def main(label: str, prefix: str) -> None:
+    """Wait until the other side of the standard input has ended, then remove what it has left.
+
+    Parameters
+    ----------
+    label
+        Of its containers.
+    prefix
+        Path with which its folders begin.
+    """
     sys.stdin.buffer.read()
     from docker import DockerClient
     from docker.errors import APIError
@@ -22,7 +35,10 @@ def main(label: str) -> None:
                 continue  # it is being removed
         if look < _LOOKS - 1:
             time.sleep(_BETWEEN)
+    begin = Path(prefix)
+    for folder in begin.parent.glob(f"{begin.name}*"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])
