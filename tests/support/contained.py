@@ -86,10 +86,9 @@ def host_poses(**parameters):
 
 def containers():
     """Containers that this process has started and not removed."""
-    ids = engine().api.containers(quiet=True, all=True, filters={"label": LABEL})
-    own = (engine().api.inspect_container(found["Id"]) for found in ids)
+    labelled = engine().api.containers(all=True, filters={"label": LABEL})
     pid = f".{os.getpid()}."
-    return [found["Id"] for found in own if pid in found["Config"]["Labels"][LABEL]]
+    return [found["Id"] for found in labelled if pid in found["Labels"][LABEL]]
 
 
 class Said(logging.Handler):
