@@ -125,6 +125,23 @@ class Document:
             # PyYAML's constructors raise these.
             raise YamlError("a tag (!!...) does not fit its value; leave tags out") from error
 
+    def span(self, path: Sequence[str | int]) -> tuple[int, int] | None:
+        """Where in the text a single value begins and ends; None if there is none."""
+        node = self._node
+        for part in path:
+            if isinstance(node, yaml.MappingNode):
+                found = [value for key, value in node.value if key.value == str(part)]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+                found = node.value[part : part + 1]
+            else:
+                return None
+            if not found:
+                return None
+            node = found[0]
+        if not isinstance(node, yaml.ScalarNode):
+            return None
+        return node.start_mark.index, node.end_mark.index
+
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""
         node, line = self._node, None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import tomli_w
+import yaml as pyyaml
 
 from adaptune import yaml
 from adaptune.odometry.base import OdometryError
@@ -24,8 +25,8 @@ _FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
 
 _ROS2 = "ros__parameters"
 
-_Place = tuple[tuple[str, ...], Any, Any]
-"""Path of a value, what holds it, and under which key."""
+_Place = tuple[tuple[str, ...], Any, Any, tuple[Any, ...]]
+"""Path of a value, what holds it, under which key, and all keys as they are."""
 
 
 class Template:
@@ -47,7 +48,8 @@ class Template:
             raise OdometryError(f"{path}: a template is a file of {', '.join(_FORMATS)}")
         read, self._write = _FORMATS[path.suffix]
         try:
-            self._data = read(path.read_text(encoding="utf-8"))
+            self._text = path.read_text(encoding="utf-8")
+            self._data = read(self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
         except (OSError, ValueError, yaml.YamlError) as error:
@@ -79,15 +81,22 @@ class Template:
     def fill(self, parameters: Mapping[str, Any]) -> str:
         """The file's text with new values; parameters that are not in it are ignored.
 
-        A real number stays one where the new value is whole.
+        A real number stays one where the new value is whole. All else in a YAML file stays as it
+        is, because its readers differ in what they take for a number or a truth value. Only
+        numbers such as ``1e3``, which ROS 1 takes for a text, are written as 1000.0.
         """
+        changed = []
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
-                held = place[1][place[2]]
+                _, held_in, key, _ = place
                 # ROS 1 and other readers tell 20 from 20.0.
-                real = isinstance(held, float) and type(value) is int
-                place[1][place[2]] = float(value) if real else value
-        return self._write(self._data)
+                real = isinstance(held_in[key], float) and type(value) is int
+                held_in[key] = float(value) if real else value
+                changed.append(place)
+        written = self._write(self._data)
+        if self.path.suffix in (".yaml", ".yml"):
+            return _replaced(self._text, self._places, changed, self._data) or written
+        return written
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
@@ -104,15 +113,44 @@ def _parts(name: Any) -> tuple[str, ...]:
     return tuple(part for part in re.split(r"[./]", str(name)) if part)
 
 
-def _places(data: Any, path: tuple[str, ...] = ()) -> Iterator[_Place]:
+def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -> Iterator[_Place]:
     """Every value that is neither a mapping nor a list of them."""
     items = data.items() if isinstance(data, dict) else enumerate(data)
     for key, value in items:
         below = path if key == _ROS2 else path + _parts(key)
         if isinstance(value, dict | list) and value:
-            yield from _places(value, below)
+            yield from _places(value, below, (*keys, key))
         else:
-            yield below, data, key
+            yield below, data, key, (*keys, key)
+
+
+def _replaced(
+    text: str, places: Iterable[_Place], changed: Iterable[_Place], data: Any
+) -> str | None:
+    """A YAML text with the new values in their places; None where that is not possible."""
+    document = yaml.Document(text)
+    names = {keys for *_, keys in changed}
+    spans = []
+    for _, held_in, key, keys in places:
+        span, value = document.span(keys), held_in[key]
+        if span is None:
+            continue
+        if keys in names or (isinstance(value, float) and not _is_number(text[slice(*span)])):
+            spans.append((*span, yaml.dump([value]).removeprefix("- ").strip()))
+    for begin, end, new in sorted(spans, reverse=True):
+        text = text[:begin] + new + text[end:]
+    try:
+        return text if yaml.Document(text).data == data else None
+    except yaml.YamlError:
+        return None
+
+
+def _is_number(text: str) -> bool:
+    """Whether readers of YAML 1.1, as ROS 1, take a text for a number."""
+    try:
+        return isinstance(pyyaml.safe_load(text), int | float)
+    except pyyaml.YAMLError:
+        return False
 
 
 _PLACEHOLDER = re.compile(r"\{([\w./-]+)\}")
