@@ -213,7 +213,9 @@ class PlayedBag(WholeRun):
         self._words, written = system.words(), system.log()
         with self._timed("removed"):
             system.stop()
-        limits = {"rate": self.settings.rate, "cpus": self.settings.cpus}
+        steps = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
+        _log.info("%s: %s; %.1f s of CPU time", self.called, steps, self._usage.cpu)
+        limits = {"input": str(given.path), "rate": self.settings.rate, "cpus": self.settings.cpus}
         about = limits | costs(self._usage, self._seconds) | ({"fault": fault} if fault else {})
         with kept_log(given.logs, self.settings, self.parameters, about) as kept:
             if kept is None:
@@ -295,8 +297,10 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> float:
     missing = max(0, len(scans) - len(stamps))
     n = min(len(stamps), len(scans))
     late = 1e-9 * float(np.percentile(stamps[:n] - scans[missing : missing + n], 95))
-    if late > 2e-9 * period:
-        raise OdometryError(f"its stamps are up to {late:.3f} s late: {_OWN_CLOCK}")
+    early = 1e-9 * float(np.percentile(scans[:n] - stamps[:n], 95))
+    if max(late, early) > 2e-9 * period:
+        how = f"{late:.3f} s late" if late > early else f"{early:.3f} s early"
+        raise OdometryError(f"its stamps are up to {how}: {_OWN_CLOCK}")
     i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
     off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
     steady = np.abs(off - np.median(off)) < max(5e6, 0.1 * period)

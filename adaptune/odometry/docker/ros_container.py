@@ -56,7 +56,8 @@ _NOISE = re.compile(
     rb"(\x1b\[\d*m)*(=*|/|  \S+ \(\S+/\S+\)|NODES|auto-starting new master|ROS_MASTER_URI=.*|"
     rb"process\[\S+\]: started with pid \[\d+\]|roscore/master is not yet running.*|"
     rb"master has started.*|.*rustle\.launch http\S*|log file: .*|Initiating shutdown!|"
-    rb"\[\S+\] killing on exit|"
+    rb"\[\S+\] killing on exit| \* /\S+: .*|PARAMETERS|SUMMARY|started roslaunch server .*|"
+    rb"\.\.\. logging to .*|Checking log directory .*|Press Ctrl-C .*|Done checking log .*|"
     rb"all processes on machine have died.*|(\.\.\. )?shutting down .*|done)(\x1b\[\d*m)*"
 )
 """Lines that roslaunch writes at its begin and at its end, before and after those of the nodes."""

@@ -110,7 +110,8 @@ class GicpNode:
 
     def _publish(self, stamp, T) -> None:
         said = Odometry()
-        said.header.stamp = rospy.Time.now() if self._imitate.get("stamp_now") else stamp
+        later = rospy.Duration(self._imitate.get("stamp_later", 0.0))
+        said.header.stamp = rospy.Time.now() if self._imitate.get("stamp_now") else stamp + later
         said.header.frame_id, said.child_frame_id = "odom", "base_link"
         position, orientation = said.pose.pose.position, said.pose.pose.orientation
         position.x, position.y, position.z = T[:3, 3]

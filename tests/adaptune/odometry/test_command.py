@@ -106,7 +106,7 @@ def test_every_layout_of_parameters(tmp_path, template):
         # As programs that go by YAML 1.1 read it.
         data = yaml.safe_load(text)
     expected = {
-        "ros1.yaml": {"odometry/registration": {"voxel": 1e-05, "distance": 2.0}, "frame": "on"},
+        "ros1.yaml": {"odometry/registration": {"voxel": 1e-05, "distance": 2.0}, "frame": True},
         "ros2.yaml": {
             "/**": {"ros__parameters": {"registration.voxel": 1e-05, "registration.distance": 2.0}}
         },
@@ -351,3 +351,14 @@ def test_a_template_whose_values_share_a_name(make, tmp_path):
     (tmp_path / "file.json").write_text("{1}")
     with pytest.raises(ConfigurationError, match=r"file.json: Expecting"):
         load_study(tmp_path / "study.yaml")
+
+
+def test_what_is_not_tuned_stays_as_it_is(tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text(
+        "# for the robot\na: yes\nb: {c: 0.5, d: [1, 2.0]}  # near\ne: 010\nf: 1e3\ng: 3.0\n"
+    )
+    text = Template(path).fill({"b/c": 1e-05, "b/d/1": 3, "g": 4})
+    assert text == (
+        "# for the robot\na: yes\nb: {c: 1.0e-05, d: [1, 3.0]}  # near\ne: 010\nf: 1000.0\ng: 4.0\n"
+    )

@@ -19,6 +19,7 @@ from needs import reference_image
 from setups import setup_of
 
 from adaptune.odometry.docker.docker_command import DockerCommand, DockerCommandSettings
+from adaptune.odometry.docker.engine import Container, EngineError
 from adaptune.odometry.isolation import Limits
 from adaptune.odometry.template import Template
 from adaptune.study.mistakes import ConfigurationError
@@ -78,15 +79,19 @@ def test_the_poses_are_those_of_the_program_on_this_machine(tmp_path, given):
     assert odometry.usage.cpu == begun
 
 
-def test_a_trial_of_a_study(tmp_path, study_file):
+def study_overrides(tmp_path):
     template(tmp_path / "params.yaml")
-    overrides = [
+    return [
         "odometry.name=docker_command",
         f"odometry.settings={{image: {reference_image()}, command: [odometry-plain, '{{points}}'], "
         f"template: {tmp_path}/params.yaml}}",
         "odometry.parameters={max_correspondence_distance: {type: float, low: 1, high: 5, "
         "baseline: 2}, gicp.keyframe_interval: {type: float, low: 1, high: 5, baseline: 1.5}}",
     ]
+
+
+def test_a_trial_of_a_study(tmp_path, study_file):
+    overrides = study_overrides(tmp_path)
     study = load_study(study_file, overrides, tmp_path / "run")
     assert study.odometry.one_by_one
     setup = setup_of(study)
@@ -214,3 +219,28 @@ def test_a_file_of_another_user_is_read(tmp_path, given):
         return
     assert not odometry.faults
     np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.1)
+
+
+@pytest.mark.usefixtures("nothing_left")
+@pytest.mark.parametrize(
+    "script",
+    ["mkfifo /output/trajectory.tum", "ln -s /etc/hostname /output/trajectory.tum", "exit 255"],
+    ids=["pipe", "link", "255"],
+)
+def test_what_a_container_leaves_is_not_trusted(script, tmp_path, given):
+    odometry = made(shell(tmp_path, script), given)
+    drive(odometry)
+    (fault,) = odometry.faults
+    told = "its process ended with code 255" if "255" in script else "it left no trajectory.tum"
+    assert fault.startswith(told)
+
+
+def test_an_engine_that_goes_away_is_no_trial(tmp_path, study_file, monkeypatch):
+    def gone(_):
+        raise EngineError("the Docker engine does not answer any more")
+
+    setup = setup_of(load_study(study_file, study_overrides(tmp_path), tmp_path / "run"))
+    sequence = setup.prepare("one", 1e9)
+    monkeypatch.setattr(Container, "ended", gone)
+    with pytest.raises(EngineError, match="does not answer"):
+        setup.run(sequence, [{"max_correspondence_distance": 2.0}])

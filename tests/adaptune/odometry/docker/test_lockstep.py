@@ -208,7 +208,7 @@ def test_scans_without_a_pose_continue_the_motion(make, monkeypatch):
     assert not odometry.faults
     assert np.isnan(on(odometry, 3, 5)[-1].T_odom_sensor).all()
     (fault,) = odometry.faults
-    assert fault.startswith("no pose on /Odometry for 4 scans in a row: ")
+    assert fault.startswith("no pose on /Odometry for 4 scans in a row; topics that are published")
 
 
 @pytest.mark.parametrize(
@@ -226,3 +226,13 @@ def test_one_that_cannot_begin_says_why(make, given, words, monkeypatch):
         odometry.start(scans()[0], np.eye(4))
     assert odometry.ended
     assert not containers()
+
+
+@pytest.mark.parametrize("later", [0.05, 0.1])
+def test_poses_at_the_end_of_scans_are_those_of_their_stamps(make, later):
+    T = drive(make(imitate={"stamp_later": later}))
+    expected = host_poses()
+    # The system says of each pose that it is of a later time.
+    share = later / 0.1
+    lag = (1.0 - share) * expected[2:, 0, 3] + share * expected[1:-1, 0, 3]
+    np.testing.assert_allclose(np.diff(T[2:, 0, 3]), np.diff(lag), atol=1e-3)

@@ -145,7 +145,7 @@ def test_the_poses_are_those_of_the_odometry(ran):
     trial = ran("plain")
     assert_good(trial)
     np.testing.assert_allclose(trial.poses, truth(), atol=0.1)
-    assert re.search(r"adaptune-reference: bag \d.* s besides \(container", trial.said)
+    assert re.search(r"adaptune-reference: container \d.* s, ready .*, bag .* of CPU", trial.said)
     assert 0.0 < trial.odometry.usage.cpu < 100.0
     assert 0.0 < trial.odometry.usage.memory < 1000.0
 
@@ -201,7 +201,7 @@ def test_stamps_of_the_present_time_are_refused(ran):
     (fault,) = ran("present time").odometry.faults
     assert re.search(
         r"its poses are of \d+\.\d{3} s to .*, the scans of 1700000000\.123 s to 1700000004.*: the "
-        r"system stamps poses by its own clock, .*use_sim_time, or lower the rate",
+        r"system stamps poses by its own clock",
         fault,
     )
 

@@ -39,15 +39,26 @@ def test_poses_that_come_more_often_are_judged_by_begin_and_end(often, late):
 
 
 @given(seed=st.integers(0, 1000))
-def test_stamps_of_another_clock_are_refused(seed):
+def test_stamps_that_scatter_are_measured(seed):
     rng = np.random.default_rng(seed)
     # As of a system that stamps when it has finished, and takes its time.
     stamps = np.sort(SCANS + rng.integers(0, PERIOD // 2, 40))
-    with pytest.raises(OdometryError, match=r"stamps are not those of the scans, but up to 0\.0\d"):
-        check_stamps(stamps, SCANS)
+    assert 0.01 < check_stamps(stamps, SCANS) < 0.5e-9 * PERIOD
+    assert check_stamps(SCANS, SCANS) == 0.0
 
 
-@given(rate=st.floats(1.03, 4.0))
+@given(seed=st.integers(0, 1000), missing=st.integers(0, 4))
+def test_stamps_that_are_late_are_refused(seed, missing):
+    rng = np.random.default_rng(seed)
+    stamps = np.delete(SCANS + 2 * PERIOD + PERIOD // 4, rng.choice(40, missing, replace=False))
+    if missing == 0:
+        with pytest.raises(OdometryError, match=r"its stamps are up to 0\.225 s late: the system"):
+            check_stamps(stamps, SCANS)
+    with pytest.raises(OdometryError, match="late: the system stamps poses by its own clock"):
+        check_stamps(stamps + missing * PERIOD, SCANS)
+
+
+@given(rate=st.floats(1.1, 4.0))
 def test_a_clock_of_another_speed_is_refused(rate):
     stamps = SCANS[0] + ((SCANS - SCANS[0]) / rate).astype(np.int64)
     with pytest.raises(OdometryError, match="the system stamps poses by its own clock"):
