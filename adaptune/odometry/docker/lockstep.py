@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from adaptune.errors import AdaptuneError
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import OdometryError, Registration, UnavailableError, Usage
@@ -183,7 +184,11 @@ class Lockstep(Faulting):
         """Start the system, and wait until it listens."""
         self._template, text = filled(self._settings, self.parameters)
         self._folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
-        system = RosSystem(self._settings, self._limits.memory, text, self._folder)
+        try:
+            system = RosSystem(self._settings, self._limits.memory, text, self._folder)
+        except AdaptuneError:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
         self._system = system
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(1)
@@ -193,7 +198,7 @@ class Lockstep(Faulting):
         self._send_cloud = link.advertise(topics[0], _CLOUD)
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
         self._topics = topics
-        system.wait(topics[0], topics)
+        system.wait(topics[0], topics if self._settings.imu else topics[:1])
         self._keys = keys = server_keys(self._template, self.parameters, link.ask("parameters"))
         self._steering = None
         if (node := self._settings.node) is not None:

@@ -252,7 +252,7 @@ class RosSystem:
         """Begin to play a bag that is mounted in the container."""
         names = " ".join(f"{old}:={new}" for old, new in renamed.items())
         self._play = self._container.run(
-            f"{_SETUP}exec rosbag play --quiet --clock --delay 0.5 -r {rate:g} "
+            f"{_SETUP}exec rosbag play --quiet --clock --delay 0.3 -r {rate:g} "
             f"{shlex.quote(bag)} {names} > {_FOLDER}/rosbag.log 2>&1",
             self._environment,
         )
