@@ -10,6 +10,7 @@ two at a time. `kills` sends SIGKILL to a campaign with two workers, or to one o
 random moment, and counts what the engine holds: 5 s later, and when the next campaign has begun.
 """
 
+import logging
 import os
 import signal
 import sys
@@ -167,6 +168,8 @@ def kill(path: Path, n: int, seed: int) -> None:
 
 def main(what: str, n: int, seed: int) -> None:
     """Measure one of the three."""
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("adaptune.odometry.docker.played_bag").setLevel(logging.INFO)
     with study_file() as path:
         if what == "cost":
             cost(path, n)

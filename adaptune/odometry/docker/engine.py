@@ -23,6 +23,8 @@ OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
 _NOBODY = 65534
 _SIGNALS = {int(one) for one in signal.Signals}
+_PERIOD = 100_000
+"""Microseconds over which the use of cores is counted."""
 _TAIL = 50
 
 _log = logging.getLogger(__name__)
@@ -221,6 +223,8 @@ class Container:
         Variables.
     bare
         Whether the command takes the place of the image's entry point, too.
+    hurried
+        Whether it may use all cores until `hold_to_cores`.
 
     Raises
     ------
@@ -238,12 +242,13 @@ class Container:
         user: str,
         environment: Mapping[str, str] | None = None,
         bare: bool = False,
+        hurried: bool = False,
     ):
         from docker.errors import APIError
         from docker.types import Mount as Bind
         from docker.types import Ulimit
 
-        self.image = settings.image
+        self.image, self._cpus = settings.image, settings.cpus
         digest, client = image_digest(settings.image), engine()
         binds = [
             Bind(m.target, str(m.source.resolve()), type="bind", read_only=not m.writable)
@@ -255,7 +260,8 @@ class Container:
             network_mode="none",
             mem_limit=limit,
             memswap_limit=limit,
-            nano_cpus=int(settings.cpus * 1e9),
+            cpu_period=_PERIOD,
+            cpu_quota=-1 if hurried else int(settings.cpus * _PERIOD),
             pids_limit=settings.pids,
             cap_drop=["ALL"],
             security_opt=["no-new-privileges"],
@@ -300,6 +306,18 @@ class Container:
             return None
         code = int(state["ExitCode"])
         return 128 - code if code - 128 in _SIGNALS else code
+
+    def hold_to_cores(self) -> None:
+        """Let it use no more cores than the settings say from now on."""
+        from docker.errors import APIError
+
+        quota = int(self._cpus * _PERIOD)
+        try:
+            engine().api.update_container(self.id, cpu_period=_PERIOD, cpu_quota=quota)
+        except APIError as error:
+            raise OdometryError(_refusal(self.image, error)) from error
+        except OSError as error:
+            raise _silent(error) from error
 
     def used(self) -> Ended:
         """CPU seconds and megabytes now; zero where it has ended."""

@@ -168,6 +168,7 @@ class RosSystem:
             user=self._user,
             environment=self._environment,
             bare=True,
+            hurried=True,
         )
 
     def _launched(self) -> str:
@@ -237,6 +238,7 @@ class RosSystem:
             elif topic in heard:
                 # A node subscribes to one after the other.
                 if all(state["sending"].get(one, 0) for one in sent if one in heard):
+                    self._container.hold_to_cores()
                     return
             elif heard and now - changed > _OTHERS_ONLY:
                 break

@@ -125,7 +125,7 @@ def test_its_limits_are_those_that_were_given(settings):
         found = api.inspect_container(container.id)
         limits = found["HostConfig"]
         assert limits["Memory"] == limits["MemorySwap"] == 250_000_000
-        assert limits["NanoCpus"] == 500_000_000
+        assert (limits["CpuQuota"], limits["CpuPeriod"]) == (50_000, 100_000)
         assert limits["PidsLimit"] == 40
         assert limits["NetworkMode"] == "none"
         assert not limits["Privileged"]
@@ -338,3 +338,15 @@ def test_a_process_that_is_killed_leaves_no_container(settings):
     while not all(gone(client, container) for container in made):
         assert time.monotonic() < end
         time.sleep(0.1)
+
+
+def test_one_that_is_hurried_is_held_to_its_cores_later(settings):
+    with closing(started(settings, "sleep", "60", hurried=True)) as container:
+
+        def quota():
+            found = engine_module.engine().api.inspect_container(container.id)
+            return found["HostConfig"]["CpuQuota"]
+
+        assert quota() == -1
+        container.hold_to_cores()
+        assert quota() == 50_000
