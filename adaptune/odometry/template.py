@@ -3,7 +3,7 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +172,7 @@ def replace(argument: str, values: Mapping[str, Any]) -> str:
 
 
 def check_names(
-    parameters: ParameterSet, template: Template | None, command: Iterable[str]
+    parameters: ParameterSet, template: Template | None, command: Collection[str]
 ) -> None:
     """Raise an `OdometryError` if a parameter is neither in the template nor in the arguments."""
     inside = {name for argument in command for name in placeholders(argument)}
@@ -182,4 +182,5 @@ def check_names(
         lacking = "there is no template"
         if template is not None:
             lacking = f"{template.path.name} has no such value; {nearest(name, template.names)}"
-        raise OdometryError(f"{name}: no argument holds {{{name}}}, and {lacking}")
+        unless = f"no argument holds {{{name}}}, and " if command else ""
+        raise OdometryError(f"{name}: {unless}{lacking}")

@@ -120,7 +120,7 @@ class DockerProcess(Isolated):
                 return connection
             connection.close()
             if (ended := self._ended()) is not None:
-                what = ended
+                what = f"{ended} before it listened at its socket"
                 break
             time.sleep(_BETWEEN_LOOKS)
         words = self._container.last_lines()

@@ -4,6 +4,7 @@ Such an image has a package with ``rustle.launch``, which loads ``/rustle/config
 login shell finds it.
 """
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -19,7 +20,14 @@ from adaptune.odometry.whole_run import WholeSettings
 from adaptune.sequence.config import resolve
 from adaptune.space import ParameterSet
 
-Topic = Annotated[str, Field(pattern=r"^/[A-Za-z][\w/]*$")]
+
+def _topic(name: str) -> str:
+    if not re.fullmatch(r"/[A-Za-z][\w/]*", name):
+        raise ValueError(f"{name!r} is no name in ROS; it begins with a slash, as /Odometry")
+    return name
+
+
+Topic = Annotated[str, AfterValidator(_topic)]
 
 
 class RustleSettings(ContainerSettings, WholeSettings):

@@ -93,10 +93,19 @@ def test_one_that_is_killed_is_a_fault_and_the_next_start_works(make):
 @pytest.mark.parametrize(
     ("script", "words"),
     [
-        ("echo no licence >&2; exit 7", r"its process ended with code 7: no licence"),
+        (
+            "echo no licence >&2; exit 7",
+            r"its process ended with code 7 before it listened at its socket: no licence",
+        ),
         ("echo waiting; exec sleep 300", r"it does not listen at its socket: waiting"),
-        ("no-such-program", r"its process ended with code 127: .*no-such-program.*"),
-        ("python3 -c 'bytearray(10**9)'", r"out of isolation\.memory = 0\.3 GB: Killed"),
+        (
+            "no-such-program",
+            r"its process ended with code 127 before it listened at its socket: .*no-such-program.*",
+        ),
+        (
+            "python3 -c 'bytearray(10**9)'",
+            r"out of isolation\.memory = 0\.3 GB before it listened at its socket: Killed",
+        ),
     ],
 )
 def test_programs_that_do_not_serve(make, script, words, monkeypatch):
