@@ -1,19 +1,42 @@
 """Which cores a process may use."""
 
+import ctypes
+import gc
 import itertools
 import os
 import resource
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
+
+from adaptune.errors import AdaptuneError
 
 
 def resident_megabytes() -> float:
-    """Memory that this process takes at present; where the system does not tell, at most so far."""
+    """Memory that this process takes at present, without the files that it maps.
+
+    Where the system does not tell, the most so far.
+    """
     try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        _, resident, shared, *_ = Path("/proc/self/statm").read_text(encoding="ascii").split()
     except OSError:
         return 1e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return 1e-6 * pages * os.sysconf("SC_PAGE_SIZE")
+    return 1e-6 * (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE")
+
+
+def release_memory() -> None:
+    """Give memory that is free back to the system, so that what comes next is measured alone.
+
+    Threads that prepare scans leave hundreds of megabytes to the C library, which keeps them.
+    """
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # glibc has it
+        trim(0)
 
 
 _before: set[int] | None = None
@@ -90,3 +113,37 @@ def other_core(number: int) -> int | None:
         return None
     others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
     return others[number % len(others)]
+
+
+@contextmanager
+def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
+    """Processes to compute in, one a core; those of the block's tasks that wait end with it.
+
+    Parameters
+    ----------
+    most
+        No more processes than this.
+    preload
+        Modules that all of them need: they are imported once.
+
+    Raises
+    ------
+    AdaptuneError
+        If a process ends before its time.
+    """
+    # A process forked from one with threads may deadlock.
+    context = get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    n = max(1, min(most, available()))
+    pool = ProcessPoolExecutor(n, context, _ignore_interrupts)
+    try:
+        yield pool
+    except BrokenProcessPool as error:
+        raise AdaptuneError("a process was ended from outside; was the memory full?") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    # Ctrl-C reaches all processes; the first of them decides what happens.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

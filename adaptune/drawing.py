@@ -10,9 +10,9 @@ import numpy as np
 
 from adaptune.files import replacing
 
-# Colours that the colour-blind tell apart, all but one of them Okabe and Ito's. Lines that coincide
+# Colours that the colour-blind tell apart, most of them Okabe and Ito's. Lines that coincide
 # lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
-# grey, too.
+# grey, too. Modes on demand are dashed, each in its own way.
 LINES: dict[str, dict[str, Any]] = {
     "baseline": {"color": "#bbbbbb", "lw": 10.2},
     "best_default": {"color": "#882255", "lw": 8.4},
@@ -20,6 +20,11 @@ LINES: dict[str, dict[str, Any]] = {
     "fixed": {"color": "#0072b2", "lw": 4.8},
     "paired": {"color": "#e69f00", "lw": 3.0},
     "untrained": {"color": "#7b3294", "lw": 1.2},
+    "one_set": {"color": "#66ccee", "lw": 1.7, "ls": (0, (5, 3, 1, 3))},
+    "bank": {"color": "#a04000", "lw": 1.7, "ls": (0, (6, 6))},
+    "bank_learned": {"color": "#ddcc77", "lw": 1.7, "ls": (0, (4, 4))},
+    "even": {"color": "#117733", "lw": 1.7, "ls": (0, (2, 2))},
+    "random": {"color": "#dd6688", "lw": 1.7, "ls": (0, (1, 1.5))},
     "paper": {"color": "#000000", "lw": 0.9, "ls": (0, (4, 4))},
 }
 """Lines of the modes, the lowest first."""
@@ -31,6 +36,12 @@ POINTS: dict[str, dict[str, Any]] = {
     "one set": {"marker": "D", "color": "#d55e00"},
     "paired": {"marker": "o", "color": "#e69f00"},
     "paper": {"marker": "^", "color": "#000000"},
+    "one_set": {"marker": "d", "color": "#66ccee"},
+    "bank": {"marker": "H", "color": "#a04000"},
+    "bank_learned": {"marker": "p", "color": "#ddcc77"},
+    "even": {"marker": "h", "color": "#117733"},
+    "random": {"marker": "X", "color": "#dd6688"},
+    "untrained": {"marker": "<", "color": "#7b3294"},
     "oracle, sequence": {"marker": "_", "color": "#009e73", "ms": 12, "mew": 4.0},
     "oracle, period": {"marker": "x", "color": "#009e73"},
 }
@@ -49,7 +60,7 @@ _STYLE: Any = {
     "axes.formatter.useoffset": False,
     "legend.frameon": False,
     "legend.fontsize": "small",
-    "savefig.dpi": 110,
+    "figure.dpi": 110,
     # Names are printed literally, and text in an SVG can be searched. No name changes its bytes.
     "text.parse_math": False,
     "svg.fonttype": "none",
@@ -69,6 +80,8 @@ def picture(files: Iterable[Path], width: float, height: float) -> Iterator[Any]
         Inches.
     """
     import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(), warnings.catch_warnings():
@@ -78,12 +91,19 @@ def picture(files: Iterable[Path], width: float, height: float) -> Iterator[Any]
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
         yield figure
+        # Laid out once; `savefig` would also draw everything twice.
+        layout: Any = figure.get_layout_engine()
+        layout.execute(figure)
+        figure.set_layout_engine("none")
         for file in files:
             with replacing(file) as temporary:
-                # Without a date, the same picture has the same bytes.
-                metadata = {"Date": None} if file.suffix == ".svg" else None
-                figure.savefig(temporary, metadata=metadata)
-            figure.set_layout_engine("none")  # which takes most of the time; it is laid out
+                if file.suffix == ".svg":
+                    svg: Any = FigureCanvasSVG(figure)
+                    # Without a date, the same picture has the same bytes.
+                    svg.print_svg(temporary, metadata={"Date": None})
+                else:
+                    png: Any = FigureCanvasAgg(figure)
+                    png.print_png(temporary)
 
 
 def as_png_and_svg(path: Path) -> tuple[Path, Path]:

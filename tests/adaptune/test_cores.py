@@ -1,8 +1,10 @@
 import os
 
+import numpy as np
 import pytest
 
 from adaptune import cores
+from adaptune.errors import AdaptuneError
 
 
 @pytest.fixture
@@ -52,3 +54,29 @@ def test_those_that_work_for_this_process_get_other_cores(allowed):
     allowed.add(7)
     assert [cores.other_core(i) for i in range(2)] == [7, 7]
     assert cores.together() == 1
+
+
+def test_mapped_files_are_no_memory_of_the_process(tmp_path):
+    path = tmp_path / "mapped"
+    np.zeros(50_000_000, np.uint8).tofile(path)
+    mapped = np.memmap(path, np.uint8, "r")
+    before = cores.resident_megabytes()
+    assert mapped.sum() == 0  # now all of it is there
+    assert cores.resident_megabytes() < before + 20.0
+    held = np.ones(50_000_000, np.uint8)
+    assert cores.resident_megabytes() > before + 40.0
+    del held
+    cores.release_memory()
+    assert cores.resident_megabytes() < before + 20.0
+
+
+def test_processes_compute_and_say_what_went_wrong():
+    with cores.processes(2) as pool:
+        assert list(pool.map(divmod, (7, 9), (2, 4))) == [(3, 1), (2, 1)]
+        with pytest.raises(ZeroDivisionError):
+            list(pool.map(divmod, (7, 9), (0, 4)))
+
+
+def test_a_process_that_is_killed_is_told():
+    with pytest.raises(AdaptuneError, match="was the memory full"), cores.processes(1) as pool:
+        pool.submit(os._exit, 1).result()

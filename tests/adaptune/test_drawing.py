@@ -6,6 +6,9 @@ from matplotlib.colors import to_rgb
 from pictures import is_white, share_of, texts
 
 from adaptune.drawing import LINES, OTHERS, POINTS, as_png_and_svg, log_scale, picture, plain
+from adaptune.study.config import ALSO
+
+DASHED = [mode for mode in ALSO if mode != "untrained"]
 
 
 def draw(path, drawn=lambda axes: axes.plot([0, 1], [0, 1])):
@@ -71,13 +74,20 @@ def test_nothing_is_left_of_a_picture_that_fails(tmp_path):
 
 
 def test_each_of_several_equal_lines_is_seen(tmp_path):
-    def drawn(axes):
-        for line in LINES.values():
-            axes.plot([0.0, 1.0, 2.0], [0.0, 1.0, 0.5], **line)
+    usual = {mode: line for mode, line in LINES.items() if mode not in DASHED}
+    # Of modes on demand, hardly two are the same.
+    for one in DASHED:
+        lines = {mode: line for mode, line in LINES.items() if mode in usual or mode == one}
 
-    path = draw(tmp_path / "a.png", drawn)
-    for mode, line in LINES.items():
-        assert share_of(path, line["color"]) > 0.05, mode
+        def drawn(axes, lines=lines):
+            for line in lines.values():
+                axes.plot([0.0, 1.0, 2.0], [0.0, 1.0, 0.5], **line)
+
+        path = draw(tmp_path / "a.png", drawn)
+        for mode, line in lines.items():
+            assert share_of(path, line["color"]) > 0.03, (one, mode)
+    assert len({LINES[mode]["ls"] for mode in DASHED}) == len(DASHED)
+    assert len({line["color"] for line in LINES.values()}) == len(LINES)
 
 
 def grey(colour):
