@@ -32,7 +32,7 @@ _NOT_KEPT = "%s: not kept in the cache (%s)"
 
 SMALL = 1 << 24
 """Bytes below which the content of a file counts, all of it."""
-_VERSION = 4
+_VERSION = 5
 _SAMPLE = 1 << 16
 _CAP_GB, _MOST_GB = 50.0, 1e9
 # Seconds. A writer that has not written for this long is dead.

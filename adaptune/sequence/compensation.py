@@ -80,15 +80,19 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
 def compensate_neighbours(scans: Iterable[Scan]) -> Iterator[Scan]:
     """Undo the motion within each scan, as fast as it was since the one read before.
 
-    Scans without a known motion, such as the first, pass as they are.
+    Where that is not known, the motion known last still holds for a second. Other scans, such as
+    the first, pass as they are.
     """
+    known: tuple[Poses, float, int] | None = None
     for scan, T_before_scan, seconds in neighbour_motions(scans):
-        if T_before_scan is None:
+        if T_before_scan is not None:
+            known = T_before_scan, seconds, scan.stamp
+        if known is None or abs(scan.stamp - known[2]) > _FAR * 1e9:
             yield scan
-        elif seconds > 0:
-            yield compensate(scan, T_before_scan, seconds)
+        elif known[1] > 0:
+            yield compensate(scan, known[0], known[1])
         else:
-            yield compensate(scan, geometry.invert(T_before_scan), -seconds)
+            yield compensate(scan, geometry.invert(known[0]), -known[1])
 
 
 def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

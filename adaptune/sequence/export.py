@@ -13,10 +13,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from adaptune import geometry
 from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
+from adaptune.trajectory import write_kitti
 
 Message = tuple[str, int, Any]
 """Topic, nanoseconds at which it is sent, content."""
@@ -26,6 +28,11 @@ Layout = Literal["bag", "ros2", "kitti"]
 
 POINTS, IMU = "/points", "/imu"
 """Topics of the bags."""
+
+T_CAMERA_LIDAR = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""A camera in the LiDAR's place which looks ahead, z forward, as KITTI's do."""
 
 _KINDS = {"<f4": 7, "<u2": 4}
 
@@ -123,7 +130,7 @@ def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -
     frame. Scans are in order of time, the IMU is on their clock, and nothing is at `path` yet.
     """
     if layout == "kitti":
-        _write_kitti(scans, path)
+        write_kitti_sequence(scans, path)
         return
     messages = Messages(1 if layout == "bag" else 2)
     types = {POINTS: "sensor_msgs/msg/PointCloud2"}
@@ -159,8 +166,24 @@ def _measurements(messages: Messages, imu: Imu) -> Iterator[Message]:
         yield IMU, stamp, messages.imu(messages.header(IMU, stamp, "imu"), gyro, accel)
 
 
-def _write_kitti(scans: Iterable[Scan], path: Path) -> None:
-    sequence = path / "sequences" / "00"
+def write_kitti_sequence(
+    scans: Iterable[Scan], root: Path, name: str = "00", T_camera_lidar: Poses | None = None
+) -> None:
+    """Write a sequence of the KITTI odometry benchmark, without its poses.
+
+    Parameters
+    ----------
+    scans
+        In order of time. Intensities are 0 where they have none.
+    root
+        Folder of the benchmark; it receives ``sequences/<name>``.
+    name
+        Of the sequence, which is not there yet.
+    T_camera_lidar
+        Pose of shape (4, 4) for ``calib.txt``: KITTI's poses are those of the camera. The camera
+        is in the LiDAR's frame when left out.
+    """
+    sequence = root / "sequences" / name
     (sequence / "velodyne").mkdir(parents=True)
     stamps = []
     for number, scan in enumerate(scans):
@@ -170,16 +193,22 @@ def _write_kitti(scans: Iterable[Scan], path: Path) -> None:
         if scan.intensities is not None:
             cloud[:, 3] = scan.intensities
         (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.tobytes())
-    write_kitti_times(sequence, (np.array(stamps) - stamps[0]) * 1e-9, np.eye(4))
-
-
-def write_kitti_times(sequence: Path, seconds: NDArray[np.float64], T_camera_lidar: Poses) -> None:
-    """Write ``times.txt`` and ``calib.txt`` into the folder of a KITTI odometry sequence.
-
-    `seconds` of each scan are of shape (n,). KITTI's poses are those of the camera.
-    """
+    seconds = (np.array(stamps) - stamps[0]) * 1e-9
     write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
-    rows = " ".join(f"{v:.12e}" for v in T_camera_lidar[:3].ravel())
+    T = np.eye(4) if T_camera_lidar is None else T_camera_lidar
+    rows = " ".join(f"{v:.12e}" for v in T[:3].ravel())
     camera = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
     lines = [*(f"P{i}: {camera}\n" for i in range(4)), f"Tr: {rows}\n"]
     write_text(sequence / "calib.txt", "".join(lines))
+
+
+def write_kitti_poses(
+    T_world_lidar: Poses, root: Path, name: str = "00", T_camera_lidar: Poses | None = None
+) -> None:
+    """Write ``poses/<name>.txt`` of the KITTI odometry benchmark: the camera's, the first at 0.
+
+    `T_world_lidar` are of shape (n, 4, 4), one a scan. For the rest see `write_kitti_sequence`.
+    """
+    T = np.eye(4) if T_camera_lidar is None else T_camera_lidar
+    of_lidar = geometry.invert(T_world_lidar[0]) @ T_world_lidar
+    write_kitti(root / "poses" / f"{name}.txt", T @ of_lidar @ geometry.invert(T))

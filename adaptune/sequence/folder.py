@@ -25,8 +25,8 @@ from adaptune.sequence.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
-# KITTI's LiDAR reports its rays too low by so many degrees.
-_ELEVATION = 0.205
+ELEVATION = 0.205
+"""Degrees by which KITTI's LiDAR reports its rays too low."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     degrees: 0.205 when left out, and 0 for KITTI-360.
     """
     if (folder / "velodyne").is_dir():
-        return _kitti_odometry(folder, _ELEVATION if elevation is None else elevation)
+        return _kitti_odometry(folder, ELEVATION if elevation is None else elevation)
     if (folder / "velodyne_points" / "data").is_dir():
         return _kitti_drive(folder, elevation)
     if not folder.is_dir():
@@ -261,7 +261,7 @@ def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
         pose_files = [record / "poses.txt", *sorted(calibrations.glob("*.txt"))]
     if elevation is None:
         # Only the raw drives record the start of each turn; KITTI-360 has another LiDAR.
-        elevation = _ELEVATION if started.exists() else 0.0
+        elevation = ELEVATION if started.exists() else 0.0
     return FileSource(
         str(folder),
         files,

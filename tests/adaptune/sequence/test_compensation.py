@@ -104,6 +104,25 @@ def test_the_velocity_since_the_scan_before_is_undone(backward: bool) -> None:
         assert np.abs(after.points - world).max() < 0.15
 
 
+def test_the_motion_known_last_holds_for_a_second() -> None:
+    rng = np.random.default_rng(0)
+    twist = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    step = np.eye(4)
+    step[:3, 3] = twist[:3] * 0.1
+    first, second = (
+        drive_through(room(rng), 10**18 + i * 10**8, T, twist)
+        for i, T in enumerate((np.eye(4), step))
+    )
+    few = [
+        Scan(10**18 + stamp, np.ones((5, 3), np.float32), np.full(5, 0.1, np.float32))
+        for stamp in (2 * 10**8, 10**9, 15 * 10**8)
+    ]
+    *_, soon, late, too_late = compensate_neighbours([first, second, *few])
+    for scan in (soon, late):
+        np.testing.assert_allclose(scan.points - 1.0, np.tile([0.2, 0.0, 0.0], (5, 1)), atol=0.02)
+    assert too_late is few[-1]
+
+
 def test_scans_that_cannot_be_registered_stay_as_they_are() -> None:
     rng = np.random.default_rng(0)
     few = Scan(10**18, np.ones((5, 3), np.float32), np.zeros(5, np.float32))
