@@ -1,0 +1,1 @@
+"""Figures as data, drawn for papers and for the report."""
