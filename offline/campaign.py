@@ -116,7 +116,7 @@ class _Campaign:
     def _tasks(self, missing: Sequence["Missing"]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []
         n_workers = len(self._workers.workers())
-        return _tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
+        return trial_tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
 
     def _verdict(self, n: int) -> Verdict:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
@@ -134,7 +134,7 @@ class Missing(NamedTuple):
     parameters: Callable[[int], ParameterSet]  # the set of a trial
 
 
-def _tasks(
+def trial_tasks(
     missing: Sequence[Missing],
     without_frames: Sequence[str],
     n_workers: int,

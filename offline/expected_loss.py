@@ -6,13 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.metrics import worst_tenth
 from adaptune.model.paired import ERROR_FLOOR
 from adaptune.study.driven import MIN_RECORDINGS
 
 RISK = 0.5
 """Weight of the worst tenth."""
-WORST = 0.1
-"""Share of the stretches that are the worst."""
 BLOCK = 2
 """Consecutive stretches that a bootstrap draws together."""
 RESAMPLES = 500
@@ -51,16 +50,6 @@ def log_ratios(
     n_frames = np.bincount(number)
     means, of_fixed = (np.bincount(number, e) / n_frames + ERROR_FLOOR for e in (errors, fixed))
     return np.asarray(np.log(means / of_fixed))
-
-
-def worst_tenth(logs: Logs) -> float:
-    """Mean logarithm over the worst tenth of the stretches, over one stretch at least.
-
-    It is the conditional value at risk: where a tenth is no whole number, a stretch counts in part.
-    """
-    share = max(1.0, WORST * len(logs))
-    counts = np.clip(share - np.arange(len(logs)), 0.0, 1.0)
-    return float(np.sort(logs)[::-1] @ counts / share)
 
 
 def expected_loss(logs: Logs, recordings: Sequence[str]) -> float:

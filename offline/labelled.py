@@ -16,7 +16,7 @@ from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.names import origin, places, stretch_numbers
 from adaptune.study.driven import MIN_RECORDINGS
 from offline.bank_simulation import BankSimulation
-from offline.objective import affordable, choose_fixed, margin, mean_value
+from offline.objective import affordable, choose_fixed, few, margin, mean_value
 from offline.stretches import Extent, part_of
 from offline.whole_runs import mean_values
 
@@ -238,14 +238,23 @@ class LabelledData(NamedTuple):
     def best(self, trials: Collection[int]) -> int:
         """Trial number of the best of some sets, see `offline.objective.choose_fixed`.
 
-        Where no candidate but the baseline has whole runs on all these sequences, the trials alone
-        decide.
+        The candidates are the best by their trials on these sequences. Those of the study were
+        chosen on all sequences: where one is left out, they would owe something to it. A candidate
+        without whole runs counts with its trials if it lost track in none. Where no set but the
+        baseline has whole runs on all these sequences, the trials alone decide.
         """
         bounds = {n: bound for n, bound in self.bounds().items() if n in trials}
         whole = {n: value for n, value in self.whole().items() if n in trials}
-        if set(whole) - {0}:
-            return choose_fixed(whole, bounds)
-        return min(bounds, key=lambda n: bounds[n])
+        if not set(whole) - {0}:
+            return min(bounds, key=lambda n: bounds[n])
+        unlost = {n: bounds[n] for n in few(bounds) if self._never_lost(n)}
+        known = {n: value for n, value in (unlost | whole).items() if n in few(bounds)}
+        return choose_fixed(known or whole, bounds)
+
+    def _never_lost(self, trial: int) -> bool:
+        """Whether a set lost track in no trial on these sequences."""
+        column = self.sets.column(trial)
+        return all(bool(np.isfinite(s.errors[:, column]).all()) for s in self.sequences)
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""

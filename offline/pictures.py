@@ -21,7 +21,8 @@ _SPREAD = 20.0
 
 THRIFTY = "bank, thrifty"
 """A bank whose next member gains most for its cost."""
-CANCELLING = "bank"
+CANCELLING = "bank, cancelling"
+"""A bank whose next member lowers the error most."""
 
 
 class Point(NamedTuple):

@@ -60,7 +60,7 @@ class Search:
         self.numbers: list[int] = []
         self.order = self.sequences
         self.end: str | None = None
-        self._make_sampler, self._config = sampler, config
+        self.make_sampler, self._config = sampler, config
         self._limit = max_trials(config)
         self._finished = finished
         self._known, self._slot = known, slot
@@ -71,7 +71,7 @@ class Search:
     @cached_property
     def _sampler(self) -> Sampler:
         # Where nothing is to be proposed, it is not needed, and takes long to import.
-        return self._make_sampler()
+        return self.make_sampler()
 
     def number(self, i: int) -> int:
         """Trial number in the study of trial `i` of this search."""

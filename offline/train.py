@@ -165,7 +165,7 @@ def train(
         )
     archive = Archive(study.folder / "trials", InputNotes(study))
     archive.tidy()
-    with _workers(study, cluster) as workers:
+    with trial_workers(study, study.training, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = run_batches(study, archive, workers, progress)
         best = candidates(config, _affordable(study, archive, verdicts))
@@ -242,8 +242,10 @@ def _fixed(
     return fixed, rivalry(config, values, best[0], fixed)
 
 
-def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
-    """Processes of this machine, or of a cluster."""
+def trial_workers(
+    study: OfflineStudy, names: Sequence[str], cluster: str | None
+) -> Cluster | Workers:
+    """Processes of this machine, or of a cluster, that run trials on some sequences."""
     config = study.config.offline
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
@@ -251,7 +253,7 @@ def _workers(study: OfflineStudy, cluster: str | None) -> Cluster | Workers:
     odometry = study.odometry.allowing(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = config.memory * 1e9
-    return Cluster(setup, study.training, memory, cluster) if cluster else Workers(setup, n, memory)
+    return Cluster(setup, names, memory, cluster) if cluster else Workers(setup, n, memory)
 
 
 def _fitted(

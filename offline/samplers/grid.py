@@ -22,7 +22,7 @@ LARGEST = 10_000
 
 
 @dataclass(frozen=True)
-class Axis:
+class GridAxis:
     """The values of one parameter that a grid tries."""
 
     parameter: Float | Integer | Categorical
@@ -65,7 +65,7 @@ class Grid:
         Number of points.
     """
 
-    def __init__(self, axes: Mapping[str, Axis]):
+    def __init__(self, axes: Mapping[str, GridAxis]):
         self.axes = dict(axes)
         self.size = math.prod(axis.count for axis in self.axes.values())
 
@@ -94,9 +94,9 @@ class Grid:
             if isinstance(p, Float):
                 return None
             axes[name] = (
-                Axis(p, len(p.choices), choices=p.choices)
+                GridAxis(p, len(p.choices), choices=p.choices)
                 if isinstance(p, Categorical)
-                else Axis(p, int(p.high - p.low) + 1, p.low, 1.0)
+                else GridAxis(p, int(p.high - p.low) + 1, p.low, 1.0)
             )
         return cls(axes)
 
@@ -106,7 +106,9 @@ def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]])
     return Grid({name: _axis(p, grid.get(name)) for name, p in space.parameters.items()})
 
 
-def _axis(parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None) -> Axis:
+def _axis(
+    parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None
+) -> GridAxis:
     if isinstance(parameter, Categorical):
         return _choices(parameter, parameter.choices if given is None else given)
     if given is None:
@@ -118,7 +120,7 @@ def _axis(parameter: Float | Integer | Categorical, given: Span | Sequence[Value
     return axis
 
 
-def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> Axis:
+def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> GridAxis:
     if isinstance(given, Span) or not given:
         raise ValueError("give a list of its choices")
     for choice in given:
@@ -126,10 +128,10 @@ def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> Axis:
             raise ValueError(f"{choice!r} is not one of {describe(parameter)}")
     if len(set(map(repr, given))) < len(given):
         raise ValueError("choices repeat themselves")
-    return Axis(parameter, len(given), choices=tuple(given))
+    return GridAxis(parameter, len(given), choices=tuple(given))
 
 
-def _span(parameter: Float | Integer, given: Span) -> Axis:
+def _span(parameter: Float | Integer, given: Span) -> GridAxis:
     low, high, count = given.low, given.high, given.count
     if low > high or (count > 1 and low == high):
         raise ValueError(f"low ({low:g}) must be less than high ({high:g})")
@@ -139,10 +141,10 @@ def _span(parameter: Float | Integer, given: Span) -> Axis:
         if low <= 0:
             raise ValueError(f"a log scale needs low ({low:g}) above 0")
         low, high = math.log(low), math.log(high)
-    return Axis(parameter, count, low, (high - low) / max(count - 1, 1), parameter.log)
+    return GridAxis(parameter, count, low, (high - low) / max(count - 1, 1), parameter.log)
 
 
-def _steps(parameter: Float | Integer, given: Sequence[Value]) -> Axis:
+def _steps(parameter: Float | Integer, given: Sequence[Value]) -> GridAxis:
     if len(given) != 3 or any(isinstance(v, bool | str) for v in given):
         raise ValueError("give [first, step, count], three numbers, or {low, high, count}")
     first, step, count = map(float, given)
@@ -152,7 +154,7 @@ def _steps(parameter: Float | Integer, given: Sequence[Value]) -> Axis:
         raise ValueError("a step of 0 gives the same value again and again")
     if isinstance(parameter, Integer) and not (first.is_integer() and step.is_integer()):
         raise ValueError("first and step must be whole numbers, as the parameter is")
-    return Axis(parameter, int(count), first, step)
+    return GridAxis(parameter, int(count), first, step)
 
 
 def check_grid(

@@ -13,7 +13,7 @@ from adaptune.space import Float, ParameterSpace
 from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST
 from offline.frontier import frontier
 from offline.leave_one_out import PAIRED, leave_one_out
-from offline.pictures import draw_frontier
+from offline.pictures import CANCELLING, draw_frontier
 from offline.rivals import driven_cost, rivals
 from offline.tuning import NO_BANK, Policy
 
@@ -111,7 +111,7 @@ def test_error_against_cost(validation, tmp_path):
     points = frontier(known, found, BankSettings())
     sets = [p for p in points if p.what in ("gicp", "ndt")]
     assert [p.cost for p in sets] == [COSTS.alone(t) for t in TRIALS]
-    banks = [p for p in points if p.what == "bank"]
+    banks = [p for p in points if p.what == CANCELLING]
     assert [p.name for p in banks] == ["2", "3", "4", "5"]
     assert all(a.cost < b.cost for a, b in itertools.pairwise(banks))
     modes = {p.what: p for p in points}

@@ -1,0 +1,157 @@
+"""Trials of a model's sets on the test sequences, to know the best choice in hindsight."""
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from adaptune.archive import Archive
+from adaptune.errors import AdaptuneError
+from adaptune.metrics import cap
+from adaptune.model import ErrorModel
+from adaptune.model.base import TrainingData, complementary, mean_errors
+from adaptune.sequence.config import NO_REFERENCE
+from adaptune.study.inputs import FILE, check_model
+from adaptune.study.oracle_runs import OracleErrors, oracle_archive, oracle_changes, read_oracle
+from adaptune.study.references import ensure_references
+from offline.campaign import Missing, Progress, trial_tasks, watch_tasks
+from offline.offline_study import OfflineStudy
+from offline.train import trial_workers
+
+_log = logging.getLogger(__name__)
+
+
+def run_oracle(
+    study: OfflineStudy,
+    n_sets: int = 16,
+    progress: Progress = lambda *_: None,
+    cluster: str | None = None,
+) -> list[dict[str, Any]]:
+    """Run some of the model's sets as trials on the test sequences, unless that was done before.
+
+    What was run with another recording, odometry or set is run again.
+
+    Parameters
+    ----------
+    study
+        The study, with its model. ``oracle`` in its folder receives the trials, which no model is
+        fitted to.
+    n_sets
+        How many, see `oracle_sets`.
+    progress
+        Called about every finished trial.
+    cluster
+        See `offline.train.train`.
+
+    Returns
+    -------
+    list of dict
+        For every test sequence the errors of the fixed set and of the best one, in percent.
+
+    Raises
+    ------
+    AdaptuneError
+        If there is no model, it was fitted to something else, or no test sequence has a reference.
+    """
+    model = ErrorModel.load(study.model_path)
+    check_model(study, model.sequences, model.provenance)
+    study.open()
+    names = _judged(study, progress)
+    numbers = oracle_sets(model, n_sets)
+    for name in names:
+        _remove_stale(study, name, model)
+    archive = oracle_archive(study)
+    archive.tidy()
+    due = {name: [n for n in numbers if n not in archive.finished(name)] for name in names}
+    described = study.config.descriptor.names
+    without_frames = [name for name in names if not archive.has_frames(name, described)]
+    if any(due.values()) or without_frames:
+        _run(study, archive, due, without_frames, model, progress, cluster)
+    found = {name: read_oracle(study, name, model) for name in names}
+    return [_row(name, errors) for name, errors in found.items() if errors is not None]
+
+
+def oracle_sets(model: ErrorModel, n: int) -> list[int]:
+    """Trial numbers of some of a model's complete sets.
+
+    The fixed set, the members of the bank, sets that complement each other (see `complementary`),
+    and, where these are too few, those with the least training error.
+    """
+    data = TrainingData(
+        np.empty((len(model.sequence), 0)),
+        model.stretches(),
+        model.errors,
+        model.sets,
+        model.fixed,
+        allowed=model.allowed(),
+    )
+    means = np.where(data.allows(), mean_errors(data.errors, data.sequence), np.inf)
+    best = [model.sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
+    chosen = dict.fromkeys([model.fixed, *model.bank, *complementary(data, n), *best])
+    return list(chosen)[:n]
+
+
+def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
+    """The test sequences that have a reference, or get an estimated one."""
+    refused = ensure_references(
+        study, study.config.test, lambda what, i, n: progress(what, i, n, ""), required=False
+    )
+    for name, said in refused.items():
+        _log.warning("%s; so %s is left out", said, name)
+    recordings = study.sequences.recordings
+    names = [
+        name
+        for name in study.config.test
+        if name not in refused
+        and (name not in recordings or recordings[name].reference != NO_REFERENCE)
+    ]
+    if not names:
+        raise AdaptuneError(
+            "test: name at least one sequence with a reference; without one, nobody knows which "
+            "set was best"
+        )
+    return names
+
+
+def _remove_stale(study: OfflineStudy, name: str, model: ErrorModel) -> None:
+    """Remove the trials on a sequence that depend on something that has changed."""
+    archive = oracle_archive(study)
+    if changes := oracle_changes(study, name):
+        _log.info("%s: run again, with another %s", name, ", ".join(changes))
+        # The note goes last: until then, the trials are known to be stale.
+        for path in (*(archive.folder / name).glob("*.npz"), archive.folder / name / FILE):
+            path.unlink(missing_ok=True)
+        return
+    for number, summary in archive.finished(name).items():
+        if number in model.sets and summary.parameters != model.sets[number]:
+            archive.trial_path(name, number).unlink()
+
+
+def _run(
+    study: OfflineStudy,
+    archive: Archive,
+    due: dict[str, list[int]],
+    without_frames: Sequence[str],
+    model: ErrorModel,
+    progress: Progress,
+    cluster: str | None,
+) -> None:
+    with trial_workers(study, list(due), cluster) as workers:
+        missing = Missing(due, model.sets.__getitem__)
+        n_workers, one_by_one = len(workers.workers()), study.odometry.one_by_one
+        tasks = trial_tasks([missing], without_frames, n_workers, one_by_one)
+        watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
+
+
+def _row(name: str, found: OracleErrors) -> dict[str, Any]:
+    means = np.nanmean(cap(found.errors), axis=0)
+    best = int(means.argmin())
+    return {
+        "sequence": name,
+        "fixed": float(means[0]),
+        "best": float(means[best]),
+        "best / fixed": float(means[best] / means[0]),
+        "trial": found.trials[best],
+        "sets": len(found.trials),
+    }

@@ -1,0 +1,336 @@
+"""Charts of trials: where they lie, what they found, and which parameters matter."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.archive import OF_SLOT
+from adaptune.charts.chart import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Drawn,
+    Line,
+    Mark,
+    Panel,
+    Points,
+)
+from adaptune.charts.parameter_axis import Parameter, on_axis, parameter_axis
+from adaptune.space import Categorical, Integer
+from offline.objective import pareto_front
+from offline.trial_table import TrialTable
+
+BEST = 0.1
+"""Share of the trials that are the best."""
+FEW = 8
+"""With fewer trials, densities and importances mean nothing."""
+MOST_PANELS = 12
+"""Panels of a chart; further parameters and sequences are not shown."""
+_COLOURED = 4.0
+"""Colours say errors of up to so many times the least."""
+_BINS, _STEPS = 20, 120
+_WHOLE = 12
+"""A whole number of so many values at most has bars, and no density."""
+
+
+def best_tenth(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which trials are the tenth with the least values, at least one, of shape (n,).
+
+    Trials without a finite value are none of them.
+    """
+    known = np.isfinite(values)
+    n = max(1, round(BEST * int(known.sum()))) if known.any() else 0
+    chosen = np.zeros(len(values), bool)
+    chosen[np.argsort(np.where(known, values, np.inf), kind="stable")[:n]] = True
+    return chosen
+
+
+def density_chart(table: TrialTable) -> Chart | None:
+    """Density of each parameter over all trials, and over the best tenth."""
+    known = table.shared()
+    known = known.some(np.isfinite(known.values))
+    if len(known) < FEW:
+        return None
+    best = best_tenth(known.values)
+    groups = {"all trials": np.ones(len(known), bool), f"best tenth ({best.sum()})": best}
+    return Chart(
+        "parameter-density",
+        "Where the trials lie, and where the best of them",
+        tuple(_density_panels(known, groups, filled=True)),
+        "Density of each parameter over the trials, relative to trials that are spread evenly over "
+        "the range (1). Where the best tenth is much denser than all trials, values do well; where "
+        "it is flat, the parameter hardly matters.",
+        columns=min(2, len(known.space.parameters)),
+    )
+
+
+def density_by_group_chart(
+    table: TrialTable, groups: Mapping[str, Sequence[str]], kind: str = "sequence"
+) -> Chart | None:
+    """Density of each parameter over the best tenth of the trials in each group of sequences.
+
+    Parameters
+    ----------
+    table
+        The trials.
+    groups
+        By name, training sequences.
+    kind
+        What a group is, in a word.
+    """
+    chosen = {}
+    for name, sequences in groups.items():
+        values = np.mean([table.on(sequence) for sequence in sequences], axis=0)
+        if np.isfinite(values).sum() >= FEW:
+            chosen[name] = best_tenth(values)
+    if len(chosen) < 2:
+        return None
+    return Chart(
+        "parameter-density-by-group",
+        f"Where the best tenth of the trials lies, by {kind}",
+        tuple(_density_panels(table, chosen, filled=False)),
+        f"As above, for the best tenth of the trials on each {kind}. Peaks that lie apart mean "
+        f"that no one set is best everywhere: this is what adapting can gain from.",
+        columns=min(2, len(table.space.parameters)),
+    )
+
+
+def _density_panels(
+    table: TrialTable, groups: Mapping[str, NDArray[np.bool_]], filled: bool
+) -> Iterator[Panel]:
+    for name, parameter in list(table.space.parameters.items())[:MOST_PANELS]:
+        values = table.column(name)
+        there = np.array([value is not None for value in values], bool)
+        of_groups = {
+            group: [v for v, its in zip(values, kept & there, strict=True) if its]
+            for group, kept in groups.items()
+        }
+        x = parameter_axis(name, parameter)
+        if (marks := _bar_places(parameter)) is not None:
+            bars = tuple(_share_bars(of_groups, parameter, marks))
+            yield Panel(x, Axis("share of the trials [%]"), bars)
+        else:
+            drawn = tuple(_densities(of_groups, parameter, filled))
+            yield Panel(x, Axis("density, relative to even [-]"), drawn)
+
+
+def _bar_places(parameter: Parameter) -> NDArray[np.float64] | None:
+    """Where bars stand for the values of a parameter; None if it has too many."""
+    if isinstance(parameter, Categorical):
+        return np.arange(float(len(parameter.choices)))
+    if isinstance(parameter, Integer) and parameter.high - parameter.low < _WHOLE:
+        return np.arange(parameter.low, parameter.high + 1.0)
+    return None
+
+
+def _share_bars(
+    groups: Mapping[str, Sequence[Any]], parameter: Parameter, places: NDArray[np.float64]
+) -> Iterator[Bars]:
+    width = 0.8 / max(len(groups), 1)
+    for i, (name, values) in enumerate(groups.items()):
+        at = on_axis(values, parameter)
+        shares = 100.0 * (at[:, None] == places).sum(axis=0) / max(len(at), 1)
+        yield Bars(places + (i - 0.5 * (len(groups) - 1)) * width, shares, name, width=width)
+
+
+def _densities(
+    groups: Mapping[str, Sequence[Any]], parameter: Parameter, filled: bool
+) -> Iterator[Drawn]:
+    """Histograms and kernel densities, computed where the range is the unit interval."""
+    assert not isinstance(parameter, Categorical)
+
+    def placed(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        low, high = float(parameter.low), float(parameter.high)
+        return low * (high / low) ** unit if parameter.log else low + unit * (high - low)
+
+    for name, values in groups.items():
+        if not values:
+            continue
+        unit = np.array([parameter.to_unit(value) for value in values])
+        if filled:
+            counts, edges = np.histogram(unit, _BINS, (0.0, 1.0), density=True)
+            yield Band(
+                placed(np.repeat(edges, 2)[1:-1]),
+                np.zeros(2 * _BINS),
+                np.repeat(counts, 2),
+                name,
+            )
+        grid = np.linspace(0.0, 1.0, _STEPS)
+        if len(density := kernel_density(unit, grid)):
+            yield Line(placed(grid), density, name)
+
+
+def kernel_density(unit: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Density of points of the unit interval, at some of its points; empty if all are equal.
+
+    What lies near a bound is reflected at it: the density does not end before the range does.
+    """
+    from scipy.stats import gaussian_kde
+
+    if len(unit) < 2 or np.ptp(unit) < 1e-9:
+        return np.empty(0)
+    of_points = gaussian_kde(unit)
+    return np.asarray(of_points(at) + of_points(-at) + of_points(2.0 - at))
+
+
+def scatter_chart(
+    table: TrialTable, parameters: Sequence[str], sequences: Sequence[str]
+) -> Chart | None:
+    """Two parameters of all trials, coloured by the error: on each sequence, and in the mean.
+
+    Parameters
+    ----------
+    table
+        The trials.
+    parameters
+        The names of two.
+    sequences
+        Names of training sequences.
+    """
+    if len(parameters) != 2:
+        return None
+    x_axis, y_axis = (parameter_axis(name, table.space.parameters[name]) for name in parameters)
+    xy = [on_axis(table.column(name), table.space.parameters[name]) for name in parameters]
+    shown = list(sequences)[: MOST_PANELS - 1]
+    values = {name: table.on(name) for name in shown}
+    if len(sequences) > 1:
+        values["mean over all sequences"] = table.values
+    panels = []
+    for title, of in values.items():
+        kept = np.isfinite(of)
+        if kept.sum() < 2:
+            continue
+        x, y = xy[0][kept], xy[1][kept]
+        label = table.objective
+        log = bool((of[kept] > 0.0).all())
+        # The worst would take nearly all colours.
+        colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
+        drawn: list[Drawn] = [Points(x, y, "trial", colour, label, log_colour=log)]
+        best = int(of[kept].argmin())
+        drawn.append(Points(x[[best]], y[[best]], "best trial here", marker="D"))
+        drawn += _marked(table, xy[0], xy[1])
+        panels.append(Panel(x_axis, y_axis, tuple(drawn), title))
+    if not panels:
+        return None
+    left_out = len(sequences) - len(shown)
+    more = f" {left_out} more sequences are not shown." if left_out > 0 else ""
+    return Chart(
+        "parameter-scatter",
+        f"Error of the trials over {parameters[0]} and {parameters[1]}",
+        tuple(panels),
+        f"Each point is a trial; its colour is its error, and each panel has colours of its own; "
+        f"they end at {_COLOURED:g} times the least error there. "
+        "Where the good region lies elsewhere from panel to panel, adapting can gain." + more,
+        columns=min(3, len(panels)),
+    )
+
+
+def _marked(table: TrialTable, x: NDArray[Any], y: NDArray[Any]) -> list[Drawn]:
+    """The baseline and the fixed set, where they are known."""
+    numbers = {"baseline": 0, "fixed": table.fixed}
+    places = {mode: np.flatnonzero(table.numbers == n) for mode, n in numbers.items()}
+    return [Points(x[at], y[at], mode) for mode, at in places.items() if len(at)]
+
+
+def iteration_chart(table: TrialTable, reannealed: Mapping[int, Sequence[int]]) -> Chart | None:
+    """Error of each trial, and the least so far, over the trial's number: one panel a search.
+
+    Parameters
+    ----------
+    table
+        The trials.
+    reannealed
+        By the number of a search, 0 for that over all sequences, the numbers in it of the trials
+        after which annealing was heated again.
+    """
+    panels = []
+    slots = table.numbers // OF_SLOT
+    for slot in np.unique(slots).tolist()[:MOST_PANELS]:
+        values, title = table.values, ""
+        if slot:
+            # A search of its own is on one sequence.
+            of = max(table.by_sequence, key=lambda n: _n_known(table.on(n)[slots == slot]))
+            values, title = table.on(of), f"{of} alone"
+        kept = (slots == slot) & np.isfinite(values)
+        number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
+        if len(number) < 2:
+            continue
+        allowed = np.where(table.feasible[kept], errors, np.inf)
+        least = np.minimum.accumulate(allowed)
+        drawn: list[Drawn] = [
+            Points(number, errors, "trial", texts=[f"trial {n}" for n in table.numbers[kept]]),
+            Line(number, np.where(np.isfinite(least), least, np.nan), "best so far", steps=True),
+        ]
+        first = number == 0
+        drawn += [Points(number[first], errors[first], "baseline")] if first.any() else []
+        marks = [int(i) for i in reannealed.get(slot, ())]
+        drawn += [Mark(i, "" if k else "reannealing", "x") for k, i in enumerate(marks)]
+        log = bool((errors > 0.0).all())
+        panels.append(Panel(Axis("trial [-]"), Axis(table.objective, log), tuple(drawn), title))
+    if not panels:
+        return None
+    marked = " Dashed: where annealing was heated again." if any(reannealed.values()) else ""
+    return Chart(
+        "iterations",
+        "The search for parameters",
+        tuple(panels),
+        "Error of each trial in the order of the search, and the least so far of those within the "
+        f"limits. A flat end means that more trials promise little.{marked}",
+        columns=min(2, len(panels)),
+    )
+
+
+def _n_known(values: NDArray[np.float64]) -> int:
+    return int(np.isfinite(values).sum())
+
+
+def sensitivity_chart(table: TrialTable) -> Chart | None:
+    """Error of all trials over each parameter."""
+    table = table.shared()
+    table = table.some(np.isfinite(table.values))
+    panels = []
+    if len(table) < 2:
+        return None
+    for name, parameter in list(table.space.parameters.items())[:MOST_PANELS]:
+        x = on_axis(table.column(name), parameter)
+        at = int(table.values.argmin())
+        drawn = [
+            Points(x, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
+            *_marked(table, x, table.values),
+            Points(x[[at]], table.values[[at]], "best trial", marker="D"),
+        ]
+        y = Axis(table.objective, bool((table.values > 0.0).all()))
+        panels.append(Panel(parameter_axis(name, parameter), y, tuple(drawn)))
+    return Chart(
+        "sensitivity",
+        "Error over each parameter",
+        tuple(panels),
+        "Each point is a trial, its error is the mean over all training sequences. A clear valley "
+        "means that the parameter matters alone; a cloud means that others decide.",
+        columns=min(2, len(panels)),
+    )
+
+
+def cost_chart(table: TrialTable) -> Chart | None:
+    """Error over CPU time of all trials, with their Pareto front."""
+    table = table.some(np.isfinite(table.values) & np.isfinite(table.costs))
+    if len(table) < 2:
+        return None
+    front = pareto_front(np.column_stack([table.costs, table.values]))
+    drawn = (
+        Points(table.costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
+        Line(table.costs[front], table.values[front], "Pareto front", steps=True),
+        *_marked(table, table.costs, table.values),
+    )
+    log = bool((table.values > 0.0).all())
+    x, y = Axis("CPU time a scan [ms]", log=True), Axis(table.objective, log)
+    return Chart(
+        "cost",
+        "Error over cost of the trials",
+        (Panel(x, y, drawn),),
+        "Each point is a trial, in the mean over the training sequences. No trial has less of both "
+        "than those on the Pareto front.",
+    )

@@ -1,0 +1,97 @@
+import shutil
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from adaptune.archive import Archive
+from adaptune.cli import app
+from adaptune.errors import AdaptuneError
+from adaptune.metrics import cap
+from adaptune.model import ErrorModel
+from adaptune.study.oracle_runs import oracle_archive, read_oracle
+from offline.offline_study import load_study
+from offline.oracle import oracle_sets, run_oracle
+from offline.train import train
+
+N = 5
+
+
+@pytest.fixture
+def load(study_file, trained_folder, tmp_path):
+    folder = shutil.copytree(trained_folder, tmp_path / "study")
+    return lambda *overrides: load_study(study_file, overrides, folder)
+
+
+@pytest.fixture(scope="module")
+def oracle(study_file, trained_folder, tmp_path_factory):
+    """A study, and what the oracle's command printed; not to be changed."""
+    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("oracle") / "study")
+    words = [str(study_file), "--folder", str(folder), "--sets", str(N)]
+    return load_study(study_file, [], folder), CliRunner().invoke(app, ["oracle", *words])
+
+
+def test_the_sets_are_the_fixed_one_the_bank_and_others(oracle):
+    model = ErrorModel.load(oracle[0].model_path)
+    chosen = oracle_sets(model, len(model.sets))
+    assert chosen[: len(model.bank)] == model.bank
+    assert chosen[0] == model.fixed
+    complete = [t for t in model.sets if np.isfinite(model.errors[:, model.sets.column(t)]).any()]
+    assert sorted(chosen) == sorted(set(complete))
+    assert oracle_sets(model, 2) == chosen[:2]
+
+
+def test_errors_on_test_sequences_are_read(oracle):
+    study, done = oracle
+    assert done.exit_code == 0, done.output
+    model = ErrorModel.load(study.model_path)
+    found = read_oracle(study, "three", model)
+    assert set(found.trials) == set(oracle_sets(model, N))
+    assert found.trials[0] == model.fixed
+    assert found.errors.shape == (len(found.stamps), N) == (40, N)
+    # The last sub-trajectory of 3 m begins ten scans before the end.
+    assert np.isfinite(found.errors[:29]).all()
+    assert np.isnan(found.errors[31:]).all()
+    least = np.nanmean(cap(found.errors), axis=0).min()
+    assert f"{least:.3f}" in done.stdout
+    assert read_oracle(study, "one", model) is None
+
+
+def test_nothing_learns_from_it(oracle, study_file, trained_folder):
+    study, _ = oracle
+    before = ErrorModel.load(trained_folder / "model.safetensors")
+    assert "three" not in {path.name for path in (study.folder / "trials").iterdir()}
+    (study.folder / "model.safetensors").rename(study.folder / "kept.safetensors")
+    again = train(load_study(study_file, [], study.folder)).model
+    assert again.digest == before.digest
+    assert again.provenance == before.provenance
+    assert set(Archive(study.folder / "trials").sets()) == set(before.sets)
+
+
+def test_it_resumes_and_renews_what_has_changed(load, caplog):
+    study = load()
+    archive, model = oracle_archive(study), ErrorModel.load(study.model_path)
+    run_oracle(study, 3)
+    files = {n: archive.trial_path("three", n) for n in oracle_sets(model, 4)}
+    made = {n: path.stat().st_mtime_ns for n, path in files.items() if path.exists()}
+    assert len(made) == 3
+    removed = next(iter(made))
+    files[removed].unlink()
+    run_oracle(study, 4)
+    now = {n: path.stat().st_mtime_ns for n, path in files.items()}
+    assert [now[n] == made.get(n) for n in files] == [n in made and n != removed for n in files]
+    # The same recording seen in another way.
+    other = load("sequences.three.stop=3")
+    assert read_oracle(other, "three", model) is None
+    assert "run with another sequence.stop; run `adaptune oracle` again" in caplog.text
+    (row,) = run_oracle(other, 2)
+    assert row["sets"] == 2
+    assert len(read_oracle(other, "three", model).stamps) < 40
+    assert not files[oracle_sets(model, 4)[3]].exists()
+
+
+def test_a_test_sequence_without_reference_cannot_be_judged(load):
+    with pytest.raises(AdaptuneError, match="name at least one sequence with a reference"):
+        run_oracle(load("sequences.three.reference=none"))
+    with pytest.raises(AdaptuneError, match="name at least one sequence with a reference"):
+        run_oracle(load("test=[]"))

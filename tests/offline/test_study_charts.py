@@ -1,0 +1,135 @@
+import json
+
+import drawn
+import numpy as np
+import pytest
+from made_trials import write_trials
+
+from adaptune.archive import Archive
+from adaptune.errors import AdaptuneError
+from offline.campaign import run_batches
+from offline.offline_study import load_study
+from offline.study_charts import (
+    charts_of_trials,
+    charts_of_validation,
+    reannealings,
+    sequence_groups,
+)
+
+COURSES = """\
+odometry: {name: gicp}
+courses:
+  a: {scenes: [cave]}
+  b: {scenes: [cave, cave]}
+  c: {scenes: [street, open]}
+  d: {scenes: [open, street]}
+training: [a, b, c, d]
+"""
+BOTH = """\
+odometry: [{name: gicp}, {name: ndt}]
+courses: {a: {scenes: [cave]}}
+training: [a]
+"""
+
+
+def error(_, parameters):
+    return 0.1 + abs(np.log(parameters["keyframe_interval"] / 3.0))
+
+
+@pytest.fixture
+def study(study_file, tmp_path):
+    return load_study(study_file, [], tmp_path / "study")
+
+
+def test_trials_have_their_charts(study):
+    assert charts_of_trials(study) == ([], ["No trials: run `adaptune offline`."])
+    write_trials(study, lambda _, p: p["keyframe_interval"], 20)
+    charts, notes = charts_of_trials(study)
+    assert [chart.key for chart in charts] == [
+        "iterations",
+        "importance",
+        "parameter-density",
+        "parameter-density-by-group",
+        "sensitivity",
+        "parameter-scatter",
+    ]
+    assert [note.split(":")[0] for note in notes] == ["No costs of trials"]
+    # The most important one comes first.
+    assert charts[-1].panels[0].x.label == "keyframe_interval"
+
+
+def test_few_trials_say_what_is_missing(study):
+    write_trials(study, error, 3)
+    charts, notes = charts_of_trials(study)
+    assert {"iterations", "sensitivity", "parameter-scatter"} == {chart.key for chart in charts}
+    assert len(notes) == 3
+
+
+def test_each_of_several_odometries_has_a_scatter(tmp_path):
+    (tmp_path / "both.yaml").write_text(BOTH, "utf-8")
+    study = load_study(tmp_path / "both.yaml", [], tmp_path / "study")
+    write_trials(study, lambda _, p: p.get("keyframe_interval", 1.0), 40)
+    charts, notes = charts_of_trials(study)
+    assert any(note.startswith("No costs") for note in notes)
+    keys = [chart.key for chart in charts]
+    assert keys.count("parameter-scatter-gicp") == keys.count("parameter-scatter-ndt") == 1
+    assert len(set(keys)) == len(keys)
+    importance = charts[keys.index("importance")]
+    assert {panel.title for panel in importance.panels} <= {"gicp", "ndt"}
+
+
+def test_courses_of_the_same_scenes_are_one_group(tmp_path):
+    (tmp_path / "courses.yaml").write_text(COURSES, "utf-8")
+    study = load_study(tmp_path / "courses.yaml", [], tmp_path / "study")
+    groups = {"cave": ["a", "b"], "open, street": ["c", "d"]}
+    assert sequence_groups(study, study.training) == ("scene", groups)
+    # Each of another kind is alone.
+    assert sequence_groups(study, ["a", "c"]) == ("sequence", {"a": ["a"], "c": ["c"]})
+
+
+def annealing(study_file, folder, **given):
+    settings = {"reanneal_fixed": 6, "chains": 1}
+    overrides = [f"offline.sampler_settings={json.dumps(settings)}", "offline.sampler=annealing"]
+    given = {"trials": 28, "initial": 1, "batch": 4} | given
+    overrides += [f"offline.{key}={value}" for key, value in given.items()]
+    study = load_study(study_file, overrides, folder)
+    folder.mkdir()
+    run_batches(study, Archive(folder / "trials"), drawn.Drawn(error))
+    return study
+
+
+def test_reannealing_is_marked_at_the_trials_after_which_it_happened(study_file, tmp_path):
+    # The baseline begins the chain; every sixth step heats it.
+    assert reannealings(annealing(study_file, tmp_path / "shared")) == {0: [6, 12, 18, 24]}
+    own = annealing(study_file, tmp_path / "own", sets="own", trials=16)
+    assert reannealings(own) == {1: [6, 12], 2: [6, 12]}
+    marks = [d for d in charts_of_trials(own).charts[0].panels[0].drawn if hasattr(d, "at")]
+    assert [mark.at for mark in marks] == [6, 12]
+
+
+def test_other_samplers_have_no_reannealing(study):
+    write_trials(study, error, 4)
+    assert reannealings(study) == {}
+
+
+def test_validation_is_read_or_missed(study):
+    assert charts_of_validation(study) == ([], ["No validation: run `adaptune validate`."])
+    study.folder.mkdir()
+    row = {"recording": "one", "fixed [%]": 0.5}
+    rows = [row | {"stretch": i, "paired": 0.8 + 0.01 * i} for i in range(4)]
+    (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
+    charts, notes = charts_of_validation(study)
+    assert [chart.key for chart in charts] == ["stretches"]
+    assert notes == ["No costs of banks and modes: they were not measured."]
+    costs = [{"what": "set", "name": "0", "ms a scan": 1.0, "ratio": None}]
+    costs += [{"what": "set", "name": str(i), "ms a scan": 1.0 + i, "ratio": 1.0} for i in (1, 2)]
+    (study.folder / "costs.json").write_text(json.dumps(costs), "utf-8")
+    assert [c.key for c in charts_of_validation(study).charts] == ["stretches", "frontier"]
+
+
+@pytest.mark.parametrize("text", ["[{", "{}x", '{"a": 1}', '[{"a": 1}]', "[1]"])
+def test_a_damaged_validation_is_named(study, text):
+    (study.folder).mkdir(exist_ok=True)
+    (study.folder / "stretches.json").write_text(text, "utf-8")
+    with pytest.raises(AdaptuneError, match=r"stretches\.json: is damaged .*adaptune validate"):
+        charts_of_validation(study)

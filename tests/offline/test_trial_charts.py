@@ -1,0 +1,143 @@
+import numpy as np
+import pytest
+from made_trials import SPACE, made_table
+
+from adaptune.archive import OF_SLOT, Summary
+from adaptune.charts.chart import Bars, Line, Mark, Points
+from offline.config import OfflineConfig
+from offline.trial_charts import (
+    best_tenth,
+    cost_chart,
+    density_by_group_chart,
+    density_chart,
+    iteration_chart,
+    kernel_density,
+    scatter_chart,
+    sensitivity_chart,
+)
+from offline.trial_table import trial_table
+
+
+def error(name, parameters):
+    """Small distances do well on `one`, large ones on `two`."""
+    best = 2.0 if name == "one" else 8.0
+    return 0.5 + abs(np.log(parameters["distance"] / best))
+
+
+def of_kind(panel, kind, name=None):
+    return [d for d in panel.drawn if isinstance(d, kind) and (name is None or d.name == name)]
+
+
+def test_the_best_tenth_is_the_best_tenth():
+    values = np.random.default_rng(0).permutation(40).astype(float)
+    values[:5] = np.nan, np.inf, np.nan, 50.0, 60.0
+    best = best_tenth(values)
+    assert best.sum() == 4  # of 38
+    assert values[best].max() < values[np.isfinite(values) & ~best].min()
+    assert not best_tenth(np.full(3, np.nan)).any()
+
+
+def test_densities_integrate_to_one_and_peak_where_the_best_are():
+    table = made_table(lambda _, p: abs(np.log(p["distance"] / 3.0)), n=200)
+    panels = density_chart(table).panels
+    assert [panel.x.label for panel in panels] == ["distance", "points", "kernel"]
+    distance, points, kernel = panels
+    assert distance.x.log
+    assert not points.x.log
+    every, best = of_kind(distance, Line)
+    assert [every.name, best.name] == ["all trials", "best tenth (20)"]
+    for line in (every, best):
+        unit = np.log(line.x) / np.log(10.0)
+        assert np.trapezoid(line.y, unit) == pytest.approx(1.0, abs=0.02)
+    assert best.x[np.argmax(best.y)] == pytest.approx(3.0, rel=0.1)
+    assert max(best.y) > 3.0 * max(every.y)
+    for bars in of_kind(kernel, Bars):
+        assert sum(bars.heights) == pytest.approx(100.0)
+
+
+def test_density_does_not_leak_beyond_the_bounds():
+    at = np.linspace(0.0, 1.0, 201)
+    even = kernel_density(np.linspace(0.0, 1.0, 400), at)
+    np.testing.assert_allclose(even, 1.0, atol=0.05)
+    assert not len(kernel_density(np.full(9, 0.3), at))
+
+
+def test_groups_of_sequences_have_their_own_best():
+    chart = density_by_group_chart(made_table(error, 200), {"near": ["one"], "far": ["two"]})
+    near, far = of_kind(chart.panels[0], Line)
+    assert near.x[np.argmax(near.y)] == pytest.approx(2.0, rel=0.15)
+    assert far.x[np.argmax(far.y)] == pytest.approx(8.0, rel=0.15)
+    assert density_by_group_chart(made_table(error, 200), {"near": ["one"]}) is None
+
+
+def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
+    table = made_table(error, fixed=3)
+    chart = scatter_chart(table, ["distance", "points"], ["one", "two"])
+    assert [panel.title for panel in chart.panels] == ["one", "two", "mean over all sequences"]
+    for panel, values in zip(
+        chart.panels, [*table.by_sequence.values(), table.values], strict=True
+    ):
+        (best,) = of_kind(panel, Points, "best trial here")
+        assert best.x[0] == table.column("distance")[int(np.argmin(values))]
+        (fixed,) = of_kind(panel, Points, "fixed")
+        assert list(fixed.x) == [table.column("distance")[3]]
+        (trials,) = of_kind(panel, Points, "trial")
+        assert trials.log_colour
+        assert min(trials.colour) == values.min()
+    assert scatter_chart(table, ["distance"], ["one"]) is None
+
+
+def test_iterations_show_the_best_so_far_and_reannealing():
+    table = made_table(error, fixed=3)
+    (panel,) = iteration_chart(table, {0: [7, 20]}).panels
+    (line,) = of_kind(panel, Line)
+    np.testing.assert_array_equal(line.y, np.minimum.accumulate(table.values))
+    assert [(mark.at, mark.words, mark.axis) for mark in of_kind(panel, Mark)] == [
+        (7, "reannealing", "x"),
+        (20, "", "x"),
+    ]
+
+
+def test_a_trial_beyond_a_limit_is_no_best():
+    config = OfflineConfig.model_validate({"limits": {"ms_per_scan": {"max": 5.0}}})
+    runs = {
+        i: Summary(SPACE.baseline | {"points": i + 1}, 1.0 - 0.1 * i, 0, 0, 9.0 if i == 2 else 1.0)
+        for i in range(4)
+    }
+    (panel,) = iteration_chart(trial_table(config, SPACE, {"one": runs}), {}).panels
+    np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
+
+
+def test_each_search_of_its_own_has_a_panel():
+    table = made_table(error, 10)
+    runs = {
+        name: {0: Summary(SPACE.baseline, 1.0, 0, 0, 1.0)}
+        | {
+            OF_SLOT * slot + i: Summary(own, error(name, own), 0, 0, 1.0)
+            for i, own in enumerate(table.sets[1:], start=1)
+        }
+        for slot, name in ((1, "one"), (2, "two"))
+    }
+    own = trial_table(OfflineConfig(), SPACE, runs)
+    one, two = iteration_chart(own, {2: [4]}).panels
+    assert (one.title, two.title) == ("one alone", "two alone")
+    assert list(of_kind(one, Line)[0].x) == list(range(1, 10))
+    assert [mark.at for mark in of_kind(two, Mark)] == [4]
+    # They were not run on all sequences.
+    assert density_chart(own) is None
+    assert cost_chart(own) is None
+
+
+def test_sensitivity_and_cost_show_all_trials():
+    table = made_table(error)
+    assert len(sensitivity_chart(table).panels) == 3
+    (panel,) = cost_chart(table).panels
+    (front,) = of_kind(panel, Line)
+    values = np.column_stack([table.costs, table.values])
+    for x, y in zip(front.x, front.y, strict=True):
+        assert not ((values <= [x, y]).all(axis=1) & (values < [x, y]).any(axis=1)).any()
+    assert cost_chart(table.some(table.numbers < 1)) is None
+
+
+def test_too_few_trials_have_no_density():
+    assert density_chart(made_table(error, 7)) is None

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+
+from adaptune.charts.chart import Band, Line, Points
+from offline.expected_loss import figures
+from offline.pictures import CANCELLING
+from offline.validation_charts import MOST_NAMED, frontier_chart, stretch_chart
+
+
+def stretches(n_recordings=2, n=6):
+    rng = np.random.default_rng(0)
+    return [
+        {
+            "recording": f"drive_{r}",
+            "stretch": i,
+            "fixed [%]": 0.5,
+            "one set": 1.0,
+            "paired": float(np.exp(rng.normal(-0.2, 0.1))),
+        }
+        for r in range(n_recordings)
+        for i in range(n)
+    ]
+
+
+def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
+    rows = stretches()
+    (panel,) = stretch_chart(rows).panels  # one set is the fixed set
+    points = [d for d in panel.drawn if isinstance(d, Points)]
+    assert [p.name for p in points] == ["drive_0", "drive_1"]
+    ranks = np.concatenate([p.x for p in points])
+    ratios = np.concatenate([p.y for p in points])
+    np.testing.assert_array_equal(np.argsort(ranks), np.argsort(ratios))
+    of = figures(np.log([r["paired"] for r in rows]), [r["recording"] for r in rows])
+    (band,) = (d for d in panel.drawn if isinstance(d, Band))
+    assert (band.low[0], band.high[0]) == (of.low, of.high)
+    mean = next(d for d in panel.drawn if isinstance(d, Line))
+    assert mean.y[0] == pytest.approx(np.exp(np.log(ratios).mean()))
+    assert panel.title == f"paired: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
+
+
+def test_many_recordings_are_not_named():
+    (panel,) = stretch_chart(stretches(MOST_NAMED + 1, 2)).panels
+    (points,) = (d for d in panel.drawn if isinstance(d, Points))
+    assert len(points.x) == 2 * (MOST_NAMED + 1)
+    assert set(points.texts) == {f"drive_{r}" for r in range(MOST_NAMED + 1)}
+    assert stretch_chart([]) is None
+
+
+def test_the_frontier_marks_modes_and_banks():
+    rows = [
+        {"what": what, "name": name, "ms a scan": ms, "ratio": ratio}
+        for what, name, ms, ratio in (
+            ("set", "0", 3.0, 1.5),
+            ("set", "1", 4.0, 1.0),
+            ("set", "2", 5.0, 20.0),
+            ("set", "3", np.nan, 0.1),
+            (CANCELLING, "2", 8.0, 0.9),
+            (CANCELLING, "3", 12.0, 0.8),
+            ("baseline", "baseline", 3.0, 1.5),
+            ("fixed", "fixed", 4.0, 1.0),
+        )
+    ]
+    chart = frontier_chart(rows, budget=10.0)
+    (panel,) = chart.panels
+    named = {d.name: d for d in panel.drawn if isinstance(d, Points)}
+    assert list(named) == ["set", "bank of 2, 3, ... members", "baseline", "fixed"]
+    front = next(d for d in panel.drawn if isinstance(d, Line))
+    assert (list(front.x), list(front.y)) == ([3.0, 4.0], [1.5, 1.0])
+    assert panel.y.limits == pytest.approx((0.72, 5.0))
+    assert [m.at for m in panel.drawn if not hasattr(m, "name")] == [10.0, 1.0]
+    assert frontier_chart([]) is None
