@@ -1,266 +1,146 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from rich.table import Table
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 from adaptune import report
 from adaptune.drawing import LINES
-from adaptune.geometry import invert
 from adaptune.model import ErrorModel
-from adaptune.study.driven import RIVALS, named
-from adaptune.study.inputs import check_model
+from adaptune.study.driven import EQUAL_COST, RIVAL_WORDS, RIVALS
+from adaptune.study.oracle_runs import read_oracle
 from adaptune.study.study import Study
-from adaptune.trajectory import Trajectory
-from online.modes import BASELINE, UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
-from online.replay_picture import Track, draw_replays
-from online.run_replays import shared_identity
-from online.statistics import (
-    ALL,
-    ERROR_FACTOR,
-    ESTIMATED,
-    LOST,
-    REFERENCE,
-    ComparisonRow,
-    Reference,
-    compare_modes,
-    pooled,
-)
-from online.stored_reference import check_reference
-from online.stored_replays import ReplaySummary, StoredReplay, StoredReplayError
+from online.compared_modes import compared_modes
+from online.comparison_row import ComparisonRow
+from online.comparison_tables import tables
+from online.hindsight import oracle_rows
+from online.modes import UNTRAINED, ReplaySetup
+from online.pooled_rows import pooled, ratio_to, with_gaps
+from online.remarks import remarks
+from online.replay_picture import draw_replays, drawn_modes
+from online.stale_replays import check_replays
+from online.statistics import JudgedModes, Repeats, compare_modes
+from online.stored_replays import StoredReplay, read_repeats
+from online.tracks import reference_of, seen_from, track_of
+from online.verdict import CONTROLS
 
 
-def compare(study: Study) -> list[ComparisonRow]:
+class ComparedReplays(NamedTuple):
+    """What `compare` has found."""
+
+    # A row for every sequence and mode; over several sequences, a row for every mode follows.
+    rows: list[ComparisonRow]
+    words: list[str]  # sentences: what was gained, and what must be known to trust it
+
+
+def compare(study: Study) -> ComparedReplays:
     """Compare the replays that were made, and write tables and pictures.
 
-    The untrained bank is compared with the other modes if it was replayed on all test sequences,
-    and with the baseline alone if only these two were replayed.
+    A mode is compared if it was replayed on all sequences that are compared, see
+    `online.compared_modes.compared_modes`. The untrained bank is compared with the baseline alone
+    if only these two were replayed.
 
     Parameters
     ----------
     study
-        The study; its folder receives ``comparison.csv``, ``comparison.json`` and a picture (PNG
-        and SVG) for every sequence in ``comparison``.
-
-    Returns
-    -------
-    list of ComparisonRow
-        A row for every sequence and mode, and a row for every mode over all sequences.
+        The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, the
+        tables as Markdown (``tables.md``) and LaTeX (``tables.tex``), and a picture (PNG and SVG)
+        for every sequence.
 
     Raises
     ------
     StoredReplayError
-        If a replay is missing, damaged, or of another recording or configuration.
+        If that of the fixed set is missing, or one is damaged, or of another recording or
+        configuration.
     """
-    setup = ReplaySetup.of(study)
-    names, modes = _replayed(study, setup)
-    model = _check_replays(study, setup, names, modes)
-    rows: list[ComparisonRow] = []
+    setup, compared = ReplaySetup.of(study), compared_modes(study)
+    names, modes = compared.sequences, compared.modes
+    model = check_replays(study, setup, names, modes)
+    judged: list[JudgedModes] = []
+    oracles: list[ComparisonRow] = []
     for name in names:
         folder = study.folder / "replays" / name
-        replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
-        reference = _reference(study, name)
-        rows += compare_modes(name, _with_rivals(replays, model), reference)
+        replays = {mode: read_repeats(folder / mode) for mode in modes}
+        reference = reference_of(study, name)
+        every = _with_twins(replays, model, compared.twins)
+        of_modes = compare_modes(name, every, reference)
+        judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
+        oracle = None if model is None else read_oracle(study, name, model)
+        if oracle is not None and model is not None:
+            period = study.config.online.period
+            oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
         draw_replays(
             study.folder / "comparison" / f"{name}.png",
             f"{study.name}: {name}",
             study.config.sub_trajectory,
-            {mode: _track(replay, reference, model) for mode, replay in replays.items()},
-            None if reference.trajectory is None else _seen_from(reference.trajectory),
+            {mode: track_of(replays[mode][0], reference, model) for mode in drawn_modes(modes)},
+            None if reference.trajectory is None else seen_from(reference.trajectory),
             setup.odometry.space.logarithmic,
             reference.estimated,
         )
-    if len({row.sequence for row in rows if row.rte is not None}) > 1:
-        rows += pooled(rows)
-    report.write_rows(study.folder / "comparison", "comparison", [row.columns() for row in rows])
-    return rows
+    twins = compared.twins
+    rows = [replace(row, twin=twins.get(row.mode, "")) for row in _rows(judged, oracles)]
+    folder = study.folder / "comparison"
+    report.write_rows(folder, "comparison", [row.columns() for row in rows])
+    made = tables(rows, study.config.sub_trajectory)
+    words = [*remarks(rows), *_equal_cost(model), *compared.words(study)]
+    words += _missing_repeats(judged, study.config.online.repeats)
+    report.write_tables(folder, study.name, made, words)
+    return ComparedReplays(rows, words)
 
 
-def _reference(study: Study, name: str) -> Reference:
-    """What judges the replays of a sequence.
-
-    An estimated one is computed with odometries of its own, never with the members of a bank.
-    """
-    folder, stored = study.folder / "replays" / name, study.sequences.estimate(name)
-    return Reference.read(folder, study.config.sub_trajectory, stored)
+def _equal_cost(model: ErrorModel | None) -> list[str]:
+    """That the fixed set is its own rival, if it is."""
+    if model is None or model.rivals.get(EQUAL_COST) != model.fixed:
+        return []
+    return [f"In training, {RIVAL_WORDS[EQUAL_COST]} than what is driven is the fixed set itself."]
 
 
-def _replayed(study: Study, setup: ReplaySetup) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The sequences and the modes to compare, in the order in which lines lie on each other."""
-
-    def any_of(names: Sequence[str], modes: Collection[str]) -> bool:
-        folders = (study.folder / "replays" / name / mode for name in names for mode in modes)
-        return any((folder / "replay.json").exists() for folder in folders)
-
-    names, without_model = study.config.test, sequences_without_model(study)
-    rivals = [rival for rival in RIVALS if all(any_of([name], [rival]) for name in names)]
-    modes = (BASELINE, *rivals, "fixed", *setup.rules)
-    of_model = [mode for mode in modes if mode not in WITHOUT_MODEL]
-    if not any_of(names, of_model) and any_of(without_model, [UNTRAINED]):
-        return without_model, WITHOUT_MODEL
-    if not names:
-        raise StoredReplayError("test: name at least one sequence to compare on")
-    if all(any_of([name], [UNTRAINED]) for name in names):
-        return names, tuple(sorted({*modes, UNTRAINED}, key=list(LINES).index))
-    return names, modes
+def _missing_repeats(judged: Sequence[JudgedModes], repeats: int) -> list[str]:
+    """Which replays were repeated less often than the study says."""
+    few = [
+        f"{row.mode} on {one.name} {row.repeats}"
+        for one in judged
+        for row in one.rows
+        if row.repeats < repeats
+    ]
+    what = f"Replayed less often than {repeats} times (`adaptune online` goes on)"
+    return [f"{what}: {', '.join(few)}."] if few else []
 
 
-def tables(rows: Sequence[ComparisonRow], length: float) -> list[Table]:
-    """The rows for the terminal: errors over `length` metres, and, if known, those of evo."""
-    several = rows[-1].sequence == ALL
-    caption = (
-        "Intervals of 95 %: block bootstrap over time, if the sequence is long enough; seed 0."
-    )
-    if several:
-        caption += " `all`: mean RTE, and geometric mean of the ratios."
-    unknown = set()
-    if all(row.estimated is None for row in rows):
-        unknown.add(ESTIMATED)
+def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+    """The rows of each sequence, and if there are several, those over all."""
+    rows = [row for one in judged for row in one.rows]
+    known = [one for one in judged if one.rows[0].rte is not None]
+    if not known:
+        return rows
+    if len(judged) > 1:
+        last = pooled(judged, oracles)
     else:
-        caption += " Estimated: by the odometry itself while driving, without the reference."
-    if not any(row.lost_seconds for row in rows):
-        unknown.add(LOST)
-    if all(row.reference == "given" for row in rows):
-        unknown.add(REFERENCE)
-    judged = any(row.reference == "estimated" for row in rows)
-    if judged:
-        caption += (
-            f" The error of an estimated reference pulls ratios towards 1, or hides what a mode "
-            f"has in common with it; intervals allow for {ERROR_FACTOR:g} times its estimate."
-        )
-    columns = [{k: v for k, v in row.columns().items() if k not in unknown} for row in rows]
-    where = " on test sequences" if rows[0].yardstick == "fixed" else ""
-    made = [report.table(f"RTE over {length:g} m{where}", columns, caption)]
-    standard = [row.standard for row in rows if row.standard]
-    if not standard:
-        return made
-    kitti = any(errors.kitti.lengths for errors in standard)
-    title = (
-        "Errors as evo and KITTI's benchmark define them" if kitti else "Errors as evo defines them"
-    )
-    caption = "APE after alignment, RPE from scan to scan: root mean squares."
-    if judged:
-        caption += " An estimated reference counts as if it were true."
-    if kitti:
-        caption += " KITTI: mean over the lengths in the last column; needs 100 m."
-    if several:
-        caption += " `all`: mean APE and RPE" + (
-            "; KITTI over the sub-trajectories of all sequences." if kitti else "."
-        )
-    return [*made, report.table(title, [row.standard_columns(kitti) for row in rows], caption)]
+        last, rows = [*with_gaps(rows, oracles), *oracles], []
+    return [*rows, *(_against(row, known, last) for row in last)]
 
 
-def _track(replay: StoredReplay, reference: Reference, model: ErrorModel | None) -> Track:
-    stamps, known = replay.trajectory.stamps, reference.trajectory
-    # The odometry's own frame begins elsewhere: both are drawn from the first common pose.
-    start = 0 if known is None else int(np.argmax(np.isin(stamps, known.stamps)))
-    return Track(
-        (stamps - stamps[0]) * 1e-9,
-        _seen_from(replay.trajectory, start),
-        reference.errors(replay.trajectory),
-        reference.errors_behind(replay.trajectory),
-        replay.restarted,
-        np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
-        replay.choices,
-        {
-            str(trial) if model is None or trial not in model.sets else named(model, trial): weights
-            for trial, weights in replay.weights.items()
-        },
-        replay.estimated,
-        replay.lost,
-    )
+def _against(
+    row: ComparisonRow, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]
+) -> ComparisonRow:
+    """Compare a mode that adapts with controls and rivals, too, on the same frames."""
+    if row.mode not in ("paired", UNTRAINED):
+        return row
+    others = [other.mode for other in rows if other.mode in (*CONTROLS, *RIVALS)]
+    return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})
 
 
-def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
-    """Positions in the plane of the sensor at a pose: x forward, y to the left."""
-    T = trajectory.T_world_sensor
-    return np.asarray((invert(T[start]) @ T)[:, :2, 3])
+def _with_twins(
+    replays: Repeats, model: ErrorModel | None, twins: Mapping[str, str]
+) -> dict[str, Sequence[StoredReplay]]:
+    """The replays by mode, also for each mode that has that of another one.
 
-
-def _check_replays(
-    study: Study, setup: ReplaySetup, names: Sequence[str], modes: Sequence[str]
-) -> ErrorModel | None:
-    """Refuse replays that are missing, or of another recording, model or configuration.
-
-    Returns
-    -------
-    ErrorModel or None
-        What the replays are of; None if its file is not there any more.
+    Of several odometries, a rival that is the fixed set has its replay.
     """
-    made = {
-        (name, mode): ReplaySummary.read(study.folder / "replays" / name / mode)
-        for name in names
-        for mode in modes
-    }
-    path, model = _model_of(study, made.values())
-    model = model and setup.pinned(model)
-    digest = "" if model is None else model.digest
-    # Both read what they are about.
-    shared = {name: shared_identity(study, name) for name in names}
-    if len({str(summary.about.real_time) for summary in made.values()}) > 1:
-        raise StoredReplayError(
-            f"{study.folder / 'replays'}: some were made in real time, and others not, or not so; "
-            f"run `adaptune online` again, with --rate or without"
-        )
-    for (name, mode), summary in made.items():
-        now, about = shared[name] | {"real_time": None}, summary.about.model_dump()
-        # What was made in real time may be compared without saying so.
-        about["real_time"] = None
-        if model is not None or mode in WITHOUT_MODEL:
-            whole = setup.identity(mode, model, digest)
-            now |= {key: whole[key] for key in ("model", "parameters")}
-            if not _is_automatic(study, whole["switching"], about["switching"]):
-                now["switching"] = whole["switching"]
-        if differing := [key for key, value in now.items() if about[key] != value]:
-            option = "" if path == study.model_path.resolve() else f" --model {path}"
-            if mode == UNTRAINED:
-                option = " --untrained"
-            raise StoredReplayError(
-                f"{study.folder / 'replays' / name / mode}: was replayed with another "
-                f"{', '.join(differing)}; run `adaptune online{option}` with this study"
-            )
-    option = " --untrained" if UNTRAINED in modes and "fixed" not in modes else ""
-    for name in names:
-        folder = study.folder / "replays" / name
-        check_reference(folder, study.sequences.reference(name), option)
-    return model
-
-
-def _with_rivals(
-    replays: Mapping[str, StoredReplay], model: ErrorModel | None
-) -> dict[str, StoredReplay]:
-    """The replays by mode; of several odometries the fixed set's for each rival that it is."""
-    if model is None or "fixed" not in replays or len(model.sets.space.baselines) == 1:
-        return dict(replays)
-    same = {mode: replays["fixed"] for mode in RIVALS if model.rivals.get(mode) == model.fixed}
+    same = {mode: replays[twin] for mode, twin in twins.items()}
+    if model is not None and "fixed" in replays and len(model.sets.space.baselines) > 1:
+        of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
+        same |= dict.fromkeys(of_fixed, replays["fixed"])
     every = {**same, **replays}
     return {mode: every[mode] for mode in LINES if mode in every}
-
-
-def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:
-    """File of the model that all replays are of, and the model if the file is still there."""
-    own = study.model_path.resolve()
-    files = {s.about.model: s.model_file for s in summaries if s.about.model and s.model_file}
-    if len(files) > 1:
-        raise StoredReplayError(
-            f"{study.folder / 'replays'}: holds replays with different models "
-            f"({' and '.join(sorted(set(files.values())))}); run `adaptune online` again"
-        )
-    path = Path(next(iter(files.values()), own))
-    if not path.exists():
-        return path, None
-    model = ErrorModel.load(path)
-    if path == own:
-        check_model(study, model.sequences, model.provenance)
-    return path, model
-
-
-def _is_automatic(study: Study, now: Any, made: Any) -> bool:
-    """Whether a replay differs only in the mechanism that this machine would choose."""
-    if study.config.online.switching.mechanism != "auto" or None in (now, made):
-        return False
-    return bool(now["mechanism"] != made["mechanism"])

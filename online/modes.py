@@ -1,4 +1,4 @@
-"""The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and untrained."""
+"""The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and those on demand."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -7,7 +7,9 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from adaptune.controls import SEED, EvenSelector, RandomSelector, random_seed
 from adaptune.cores import together
+from adaptune.drawing import LINES
 from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.model import ErrorModel
 from adaptune.odometry.bank import Bank
@@ -22,8 +24,14 @@ from adaptune.study.config import RealTimeConfig, SwitchingConfig
 from adaptune.study.driven import RIVALS, ModeError, bank_members, mechanism_of
 from adaptune.study.inputs import check_model
 from adaptune.study.study import Mechanism, Study
+from adaptune.timed_selector import AnySelector
 
 BASELINE, UNTRAINED = "baseline", "untrained"
+LEARNED, EVEN, RANDOM = "bank_learned", "even", "random"
+BANKS = ("bank", LEARNED, EVEN)
+"""The modes on demand that drive the study's bank, whatever `paired` drives."""
+SINGLES = ("one_set", RANDOM)
+"""Those that drive one set at a time."""
 WITHOUT_MODEL = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
 CATCH_UP_SCANS = 4
@@ -34,7 +42,7 @@ class Mode(NamedTuple):
     """What runs along a recording, and what chooses its parameters, if anything does."""
 
     odometry: OdometryInstance
-    selector: Selector | UntrainedSelector | None
+    selector: AnySelector | None
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class ReplaySetup:
     real_time: RealTimeConfig | None = None
     pins: Mapping[str, Any] = field(default_factory=dict)  # values that parameters have in all sets
     dwell: float = 0.0  # seconds for which a set stays at least
+    also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
 
     @property
     def cores(self) -> int:
@@ -78,15 +87,42 @@ class ReplaySetup:
             config.online.real_time,
             config.online.pin,
             config.online.dwell,
+            config.online.also,
         )
 
     def modes(self, model: ErrorModel) -> tuple[str, ...]:
-        """What is replayed with a model: baseline, rivals, fixed, and each selection rule.
+        """What is replayed with a model, in the order of `LINES`.
 
-        A rival that is the fixed set is not replayed again.
+        Baseline, rivals, fixed, each selection rule, and the modes on demand that are possible. A
+        mode whose replay is that of another one is not replayed again.
         """
         rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
-        return (BASELINE, *rivals, "fixed", *self.rules)
+        also = [m for m in self.also if self.twin(m, model) == m and not self.obstacle(m, model)]
+        modes = {BASELINE, *rivals, "fixed", *self.rules, *also}
+        return tuple(mode for mode in LINES if mode in modes)
+
+    def twin(self, mode: str, model: ErrorModel) -> str:
+        """The mode whose replay is also that of a mode on demand: usually itself."""
+        if "paired" in self.rules:
+            way = self._mechanism("paired", model)
+            if mode == "bank" and way == "bank":
+                return "paired"
+            if mode == "one_set" and way != "bank" and model.paired.adapt:
+                return "paired"
+        return mode
+
+    def obstacle(self, mode: str, model: ErrorModel) -> str:
+        """Why a mode on demand cannot be replayed; empty if it can."""
+        if self.odometry.description.whole:
+            return "a program that runs whole recordings cannot change its parameters"
+        if mode == UNTRAINED:
+            try:
+                self.untrained_sets()
+            except ModeError as error:
+                return str(error)
+        elif mode != "one_set" and len(self.switching.sets or model.bank) < 2:
+            return "the model's bank has no other member than the fixed set"
+        return ""
 
     def model(self, study: Study, path: Path) -> ErrorModel:
         """An error model, with what is pinned.
@@ -124,7 +160,8 @@ class ReplaySetup:
                 f"online.budget: {path} was fitted for another budget; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
-        if self.mechanism == "bank":
+        on_demand = {*BANKS, RANDOM}.intersection(self.also)
+        if self.mechanism == "bank" or any(not self.obstacle(m, model) for m in on_demand):
             bank_members(self.switching, model)
 
     def untrained_sets(self) -> ParameterSets:
@@ -160,14 +197,17 @@ class ReplaySetup:
             return about | {
                 "switching": {"mechanism": "bank", "members": members, "warm_up": warm_up}
             }
-        if mode not in self.rules:
+        if not self.adapts(mode):
             return about | {"parameters": self.parameters(mode, model)}
         used = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
         mechanism = self._mechanism(mode, needed(mode, model))
+        used[mechanism] |= used["bank"] if mode == RANDOM else set()
         settings = self.switching.model_dump(mode="json", include=used[mechanism])
         if mechanism != "live":
             settings["warm_up"] = self.warm_up._asdict()
-        if mechanism != "bank":
+        if mode == RANDOM:
+            settings["seed"] = SEED
+        elif mechanism != "bank":
             settings |= {"switch_cost": self.switch_cost} | (
                 {"dwell": self.dwell} if self.dwell else {}
             )
@@ -187,7 +227,8 @@ class ReplaySetup:
         self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
     ) -> Mode:
         """Make a new odometry, or a bank, and its selector; see `instance` and `selector`."""
-        return Mode(self.instance(mode, model, sequence), self.selector(mode, model))
+        selector = self.selector(mode, model, sequence)
+        return Mode(self.instance(mode, model, sequence), selector)
 
     def instance(
         self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
@@ -212,7 +253,7 @@ class ReplaySetup:
             members = self.untrained_sets()
             by_number = dict(zip(members.trials, members.parameters, strict=True))
             return self._bank(by_number)
-        if mode not in self.rules:
+        if not self.adapts(mode):
             return self.odometry(self.parameters(mode, model), sequence)
         model = needed(mode, model)
         mechanism = self._mechanism(mode, model)
@@ -227,37 +268,56 @@ class ReplaySetup:
         return HandOver(self.odometry, fixed, self.warm_up, scans)
 
     def selector(
-        self, mode: str, model: ErrorModel | None = None
-    ) -> Selector | UntrainedSelector | None:
-        """Make the selector of a mode; None if its parameters stay. See `start`."""
+        self,
+        mode: str,
+        model: ErrorModel | None = None,
+        sequence: str | None = None,
+        repeat: int = 1,
+    ) -> AnySelector | None:
+        """Make the selector of a mode; None if its parameters stay. See `start`.
+
+        What `random` chooses depends on the sequence, and on which repeat of a replay it is.
+        """
         if mode == UNTRAINED:
             return UntrainedSelector(self.untrained_sets(), self.sub_trajectory)
-        if mode not in self.rules:
+        if not self.adapts(mode):
             return None
         model = needed(mode, model)
+        if mode == EVEN:
+            return EvenSelector(model.sets, list(bank_members(self.switching, model)))
+        if mode == RANDOM:
+            candidates = list(bank_members(self.switching, model))
+            seed = random_seed(sequence or "", repeat)
+            return RandomSelector(model.sets, candidates, model.fixed, seed)
+        descriptors, dwell, rule = self.descriptors, self.dwell, mode
+        if mode not in self.rules:
+            model, rule = _adapting(model), "paired"
         if self._mechanism(mode, model) != "bank":
-            return Selector(model, mode, (), self.switch_cost, self.descriptors, self.dwell)
-        members = list(bank_members(self.switching, model))
-        descriptors, dwell = self.descriptors, self.dwell
-        return Selector(model, mode, members, descriptors=descriptors, dwell=dwell)
+            return Selector(model, rule, (), self.switch_cost, descriptors, dwell)
+        members, measures = list(bank_members(self.switching, model)), mode != LEARNED
+        return Selector(
+            model, rule, members, descriptors=descriptors, dwell=dwell, measures=measures
+        )
 
     def adapts(self, mode: str) -> bool:
         """Whether a mode has a selector."""
-        return mode == UNTRAINED or mode in self.rules
+        return mode in (UNTRAINED, *self.rules, *BANKS, *SINGLES)
 
     def fixed(self, mode: str, model: ErrorModel) -> int:
         """Trial number of the set that a mode begins with."""
-        if mode in self.rules and self._mechanism(mode, model) == "bank":
+        if mode == UNTRAINED:
+            return self.untrained_sets().trials[0]
+        if self.adapts(mode) and self._mechanism(mode, model) == "bank":
             return next(iter(bank_members(self.switching, model)))
         return model.fixed
 
     def core_ms(self, mode: str, model: ErrorModel | None) -> float:
         """Milliseconds that a scan keeps the busiest core at work; NaN if that was not measured."""
-        if model is None or model.costs is None:
+        if mode == UNTRAINED or model is None or model.costs is None:
             return np.nan
         if mode == BASELINE:
             return model.costs.alone(0)
-        if mode not in self.rules:
+        if not self.adapts(mode):
             return model.costs.alone(model.rivals.get(mode, model.fixed))
         if self._mechanism(mode, model) != "bank":
             return max(model.costs.adaptive([trial]) for trial in model.sets)
@@ -271,7 +331,22 @@ class ReplaySetup:
         return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores, rate)
 
     def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:
-        return mechanism_of(mode, model, self.mechanism, self.odometry.description.live)
+        if mode in BANKS:
+            return "bank"
+        mechanism = self.mechanism
+        if mode in SINGLES and mechanism == "bank":
+            mechanism = "live"
+        return mechanism_of(mode, model, mechanism, self.odometry.description.live)
+
+
+def _adapting(model: ErrorModel) -> ErrorModel:
+    """The model with settings that adapt, also where the fixed set has less expected loss."""
+    adapt = {"adapt": True}
+    return replace(
+        model,
+        paired=model.paired.model_copy(update=adapt),
+        bank_settings=model.bank_settings.model_copy(update=adapt),
+    )
 
 
 def needed(mode: str, model: ErrorModel | None) -> ErrorModel:

@@ -2,41 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 
-from adaptune.study.driven import RIVAL_WORDS, RIVALS
-from online.statistics import ALL, ComparisonRow
+from adaptune.study.driven import BEST_DEFAULT, RIVAL_WORDS
+from online.comparison_row import ALL, ComparisonRow
+from online.verdict import verdict
 
-NO_DIFFERENCE = 0.01
-"""Share of the yardstick's error by which others may differ without it being told."""
+_WHOLE = 0.95
+"""Share of the longest replay's scans that a whole replay has at least."""
 
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
-    """In words: the mean errors, which modes differ, and what the health check did."""
-    said = []
-    # The last rows are those over all sequences.
+    """In words: what was gained, and what must be known to trust it."""
+    rows = [row for row in rows if not row.twin]
     last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
-    if all(row.rte is not None for row in last.values()):
-        found = ", ".join(f"{mode} {row.rte:.3f} %" for mode, row in last.items())
-        said.append(f"Mean RTE of {_where(rows[-1])}: {found}.")
-    if "fixed" in last and "baseline" in last and (verdict := _of_baseline(last["baseline"])):
-        said.append(verdict)
-    single = ("baseline", "fixed", *RIVALS)
-    adaptive = [row for mode, row in last.items() if mode not in single]
-    if differing := [row for row in adaptive if _counts(row)]:
-        each = (
-            f"`{row.mode}` is {'better' if row.ratio < 1.0 else 'worse'}, with {_times(row)}"
-            for row in differing
-            if row.ratio is not None
-        )
-        other = _YARDSTICKS[rows[-1].yardstick]
-        said.append(f"Compared with the {other}, {', and '.join(each)} its error.")
-    if unknown := [f"`{row.mode}`" for row in adaptive if _is_unknown(row)]:
-        said.append(
-            f"{rows[-1].sequence} is too short for intervals: whether {' or '.join(unknown)} "
-            f"differs from the {_YARDSTICKS[rows[-1].yardstick]} is not known."
-        )
     return (
-        said
-        + _against_rivals(last)
+        verdict(rows)
+        + _against_best_default(last)
+        + _lengths(rows)
         + _judges(rows)
         + _estimates(rows)
         + _losses(rows)
@@ -45,21 +26,43 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     )
 
 
-_YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
-"""What a mode that others are compared with is called in a sentence."""
-
-
-def _against_rivals(last: Mapping[str, ComparisonRow]) -> list[str]:
-    """How `paired` compares with its rivals, in error and in cost."""
-    paired = last.get("paired")
-    if paired is None or paired.ratio is None or paired.cpu_ms is None:
+def _against_best_default(last: Mapping[str, ComparisonRow]) -> list[str]:
+    """How `paired` compares with the best odometry as it comes, in error and in cost."""
+    paired, row = last.get("paired"), last.get(BEST_DEFAULT)
+    if paired is None or row is None or not paired.ratio or not row.ratio:
         return []
+    cost = ""
+    if paired.cpu_ms is not None and row.cpu_ms is not None:
+        cost = f", at {paired.cpu_ms:.1f} ms of CPU time a scan against {row.cpu_ms:.1f}"
     return [
-        f"Compared with {RIVAL_WORDS[rival]}, `paired` has {paired.ratio / row.ratio:.2f} times "
-        f"its error, at {paired.cpu_ms:.1f} ms of CPU time a scan against {row.cpu_ms:.1f}."
-        for rival in RIVALS
-        if (row := last.get(rival)) is not None and row.ratio and row.cpu_ms is not None
+        f"Compared with {RIVAL_WORDS[BEST_DEFAULT]}, `paired` has {paired.ratio / row.ratio:.2f} "
+        f"times its error{cost}."
     ]
+
+
+def _lengths(rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence about every sequence whose replays have different lengths."""
+    said = []
+    for name in dict.fromkeys(row.sequence for row in rows if row.sequence != ALL):
+        scans = {row.mode: row.scans for row in rows if row.sequence == name and row.scans}
+        if short := short_replays(scans):
+            said.append(of_lengths(name, scans, short))
+    return said
+
+
+def short_replays(scans: Mapping[str, int]) -> list[str]:
+    """The modes whose replays of a sequence are shorter than the longest, given their scans."""
+    # In real time, some scans are dropped.
+    return [mode for mode, n in scans.items() if n < _WHOLE * max(scans.values())]
+
+
+def of_lengths(name: str, scans: Mapping[str, int], short: Sequence[str]) -> str:
+    """A sentence about the replays of a sequence of which some are short, given their scans."""
+    listed = ", ".join(f"{mode} {scans[mode]}" for mode in short)
+    return (
+        f"On {name} the replays have different lengths ({listed} of {max(scans.values())} scans); "
+        f"errors are compared where all have scans. Run `adaptune online --again`."
+    )
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -107,12 +110,18 @@ def _called(row: ComparisonRow) -> str:
 
 
 def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every replay that was lost for a while."""
-    return [
-        f"On {row.sequence} `{row.mode}` was lost for {row.lost_seconds:.1f} s."
-        for row in rows
-        if row.lost_seconds and row.sequence != ALL
-    ]
+    """A sentence about every mode that was lost for a while."""
+    said = []
+    for mode in dict.fromkeys(row.mode for row in rows):
+        lost = {
+            row.sequence: row.lost_seconds
+            for row in rows
+            if row.mode == mode and row.lost_seconds and row.sequence != ALL
+        }
+        if lost:
+            on = ", ".join(f"{name} ({seconds:.1f} s)" for name, seconds in lost.items())
+            said.append(f"`{mode}` was lost for {sum(lost.values()):.1f} s: on {on}.")
+    return said
 
 
 def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -140,49 +149,6 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
         rate = timed[0][1]["rate"]
         said.append(f"Replayed at {rate:g} times the recorded rate: nothing came too late.")
     return said
-
-
-def _counts(row: ComparisonRow) -> bool:
-    """Whether a mode differs from the yardstick by what counts, as far as it is known."""
-    if row.ratio is None or abs(row.ratio - 1.0) < NO_DIFFERENCE or _is_unknown(row):
-        return False
-    low, high = row.ratio_interval or (row.ratio, row.ratio)
-    return not low <= 1.0 <= high
-
-
-def _is_unknown(row: ComparisonRow) -> bool:
-    """Whether a mode may differ from the yardstick, and nobody can tell."""
-    if row.ratio is None or row.ratio_interval is not None or row.sequence == ALL:
-        return False
-    return abs(row.ratio - 1.0) >= NO_DIFFERENCE
-
-
-def _times(row: ComparisonRow) -> str:
-    ends = row.ratio_interval
-    interval = "" if ends is None else f" (95 % interval {ends[0]:.2f}-{ends[1]:.2f})"
-    return f"{row.ratio:.2f} times{interval}"
-
-
-def _where(row: ComparisonRow) -> str:
-    return "all sequences" if row.sequence == ALL else row.sequence
-
-
-def _of_baseline(row: ComparisonRow) -> str | None:
-    if row.ratio is None:
-        return None
-    has = f"on {_where(row)} the baseline has {_times(row)}"
-    if _is_unknown(row):
-        return (
-            f"{row.sequence} is too short to tell whether the fixed set is better than the "
-            f"baseline: {has} the fixed set's error, with no interval."
-        )
-    if not _counts(row):
-        return (
-            f"There is no difference that counts between the baseline and the fixed set here: "
-            f"{has} the fixed set's error."
-        )
-    better, other = ("baseline", "fixed set") if row.ratio < 1.0 else ("fixed set", "baseline")
-    return f"The {better} is better than the {other} here: {has} the fixed set's error."
 
 
 def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.drawing import LINES, OTHERS, as_png_and_svg, log_scale, picture, plain
+from adaptune.study.config import ALSO
 
 _HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---")
 _MARKS = 60
@@ -17,6 +18,8 @@ _MARKS = 60
 _MARGIN = 0.5
 """By how much of its extent the picture may reach beyond the reference."""
 _ESTIMATE = OTHERS[4]
+FEW = 3
+"""Modes on demand that are drawn; where there are more, none is."""
 
 
 class Track(NamedTuple):
@@ -58,6 +61,12 @@ class Track(NamedTuple):
             if not marked or self.seconds[i] - self.seconds[marked[-1]] > apart:
                 marked.append(i)
         return marked
+
+
+def drawn_modes(modes: Sequence[str]) -> list[str]:
+    """Those of some modes that a picture shows, so that it can be read."""
+    on_demand = [mode for mode in modes if mode in ALSO and mode != "untrained"]
+    return [mode for mode in modes if len(on_demand) <= FEW or mode not in on_demand]
 
 
 def draw_replays(
@@ -102,7 +111,7 @@ def draw_replays(
         if np.isfinite(track.estimated[:, 0]).any() or track.lost.any():
             known = partial(_draw_estimated, mode=mode, track=track, length=length, true=true)
             panels.append((1.6, known))
-        if track.weights:
+        if track.weights and mode != "even":
             panels.append((1.2, partial(_draw_weights, mode=mode, track=track)))
     heights = [height for height, _ in panels]
     with picture(as_png_and_svg(path), 14.0, max(5.0, 1.4 + 1.5 * sum(heights))) as figure:
@@ -199,7 +208,7 @@ def _draw_estimated(axes: Any, mode: str, track: Track, length: float, true: str
     """What a bank has estimated of its own error, what `true` names, and when it was lost."""
     estimated, low, high = track.estimated.T
     if np.isfinite(track.errors_behind).any():
-        wide = LINES[mode] | {"lw": 3.6}  # seen where the estimate lies on it
+        wide = LINES[mode] | {"lw": 3.6, "ls": "-"}  # seen where the estimate lies on it
         axes.plot(track.seconds, track.errors_behind, **wide, label=true)
     # A logarithmic axis has no zero.
     low = np.maximum(low, 0.1 * estimated)

@@ -15,7 +15,6 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
-from adaptune.live.untrained import UntrainedSelector
 from adaptune.model import ErrorModel
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.tracker import RegisteredScan
@@ -29,6 +28,7 @@ from adaptune.space import nearest
 from adaptune.study.config import RealTimeConfig
 from adaptune.study.driven import ModeError
 from adaptune.study.study import Study
+from adaptune.timed_selector import AnySelector
 from online.drive_log import DriveLog
 from online.live_scans import CLOUD, IMU, LiveScans
 from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, needed
@@ -84,7 +84,8 @@ class RobotDrive:
     def __init__(self, study: Study, mode: str, model_path: Path | None):
         config = study.config
         real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
-        setup = replace(ReplaySetup.of(study), real_time=real_time)
+        # What is only compared with is for replays.
+        setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
         self._study, self._mode, self._setup, self._settings = study, mode, setup, real_time
         self._ros = config.online.ros
         self._model = None if model_path is None else setup.model(study, model_path)
@@ -271,7 +272,7 @@ def _like(study: Study) -> SequenceConfig:
 
 def _selector(
     setup: ReplaySetup, mode: str, model: ErrorModel | None, steers: bool
-) -> Selector | UntrainedSelector | None:
+) -> AnySelector | None:
     """Make the selector; a node that is steered has one set at a time."""
     if not steers:
         return setup.selector(mode, model)

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from adaptune.cores import release_memory
 from adaptune.descriptor.base import DescriptorError
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
@@ -21,7 +22,13 @@ from online.real_time import replay_in_real_time
 from online.replay import Look, Progressed, Replay, Watch, replay
 from online.selector_process import SelectorProcess
 from online.stored_reference import is_reference_of, write_reference
-from online.stored_replays import ReplayIdentity, StoredReplay, other_keys, write_replay
+from online.stored_replays import (
+    ReplayIdentity,
+    StoredReplay,
+    other_keys,
+    repeat_folder,
+    write_replay,
+)
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -43,12 +50,13 @@ def run_replays(
     progress: Progress = lambda *_: None,
     look: Look | None = None,
 ) -> int:
-    """Replay every test sequence in every mode, unless that was done before.
+    """Replay every test sequence in every mode, as often as asked, unless that was done before.
 
     Parameters
     ----------
     study
-        The study; ``replays/<sequence>/<mode>`` in its folder receives the results.
+        The study; ``replays/<sequence>/<mode>`` in its folder receives the results, and
+        ``repeat_2`` in it, and so on, those of repeats.
     model_path
         The error model.
     again
@@ -73,6 +81,11 @@ def run_replays(
     model = setup.model(study, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
+    for mode in setup.also:
+        if (twin := setup.twin(mode, model)) != mode:
+            _log.info("%s is not replayed again: %s drives the same", mode, twin)
+        elif why := setup.obstacle(mode, model):
+            _log.warning("%s is not replayed: %s", mode, why)
     of = _Modes(setup, setup.modes(model), look, model, model_path)
     return _replay_all(study, study.config.test, of, again, progress)
 
@@ -99,6 +112,18 @@ def run_untrained(
     return _replay_all(study, sequences_without_model(study), modes, again, progress)
 
 
+class _Run(NamedTuple):
+    """A replay to make."""
+
+    sequence: str
+    mode: str
+    repeat: int = 1
+
+    def __str__(self) -> str:
+        again = "" if self.repeat == 1 else f", repeat {self.repeat}"
+        return f"{self.sequence}, {self.mode}{again}"
+
+
 class _Modes(NamedTuple):
     """The modes to replay, who looks on, and the model of those that need one."""
 
@@ -120,18 +145,15 @@ def _replay_all(
     refused = ensure_references(study, sequences, progress, required=False)
     for said in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", said)
-    digest = "" if modes.model is None else modes.model.digest
     made = 0
     for name in sequences:
-        shared = shared_identity(study, name)
-        about = {
-            mode: ReplayIdentity(**modes.setup.identity(mode, modes.model, digest), **shared)
-            for mode in modes.names
-        }
-        folder = study.folder / "replays" / name
-        others = {mode: other_keys(folder / mode, about[mode]) for mode in modes.names}
-        _report_changes(name, others)
-        due = {mode: about[mode] for mode, keys in others.items() if again or keys != []}
+        folder, due = study.folder / "replays" / name, dict[_Run, ReplayIdentity]()
+        for run, about in _identities(study, name, modes).items():
+            keys = other_keys(repeat_folder(folder / run.mode, run.repeat), about)
+            if keys:
+                _log.info("%s: replayed again, with another %s", run, ", ".join(keys))
+            if again or keys != []:
+                due[run] = about
         if due:
             _replay_due(study, name, due, modes, progress)
         else:
@@ -140,31 +162,47 @@ def _replay_all(
     return made
 
 
+def _identities(study: Study, name: str, modes: _Modes) -> dict[_Run, ReplayIdentity]:
+    """All replays of a sequence; each mode has its first one before any has its second."""
+    shared = shared_identity(study, name)
+    digest = "" if modes.model is None else modes.model.digest
+    about = {
+        mode: ReplayIdentity(**modes.setup.identity(mode, modes.model, digest), **shared)
+        for mode in modes.names
+    }
+    return {
+        _Run(name, mode, repeat): of.model_copy(update={"repeat": repeat})
+        for repeat in range(1, study.config.online.repeats + 1)
+        for mode, of in about.items()
+    }
+
+
 def _replay_due(
     study: Study,
     name: str,
-    due: Mapping[str, ReplayIdentity],
+    due: Mapping[_Run, ReplayIdentity],
     modes: _Modes,
     progress: Progress,
 ) -> None:
-    """Replay a sequence in some modes."""
+    """Make some replays of a sequence."""
     folder = study.folder / "replays" / name
     poses, sequence = study.sequences.reference(name), study.sequences.open(name)
-    for i, (mode, about) in enumerate(due.items()):
-        what = f"{name}, {mode}"
-        run = _in_lockstep if study.config.online.real_time is None else _in_real_time
+    for i, (run, about) in enumerate(due.items()):
+        what = str(run)
+        release_memory()
+        drive = _in_lockstep if study.config.online.real_time is None else _in_real_time
         try:
             watch = partial(_watch, progress, modes.look, what, sequence.n_messages)
-            result = run(study.config, sequence, name, modes, mode, watch)
+            result = drive(study.config, sequence, run, modes, watch)
         except DescriptorError as error:
             raise ReplayError(f"sequences.{name}: {error}") from error
         progress(what, sequence.n_messages, sequence.n_messages)
         if i == 0:
             write_reference(folder, sequence.reference(), result.trajectory, poses)
-        write_replay(folder / mode, result, about, modes.model_path)
+        write_replay(repeat_folder(folder / run.mode, run.repeat), result, about, modes.model_path)
         if modes.model is not None and result.choices:
             selections = [choice.selection for choice in result.choices]
-            warn_of_scant_evidence(what, selections, modes.setup.fixed(mode, modes.model))
+            warn_of_scant_evidence(what, selections, modes.setup.fixed(run.mode, modes.model))
 
 
 def _watch(progress: Progress, look: Look | None, what: str, n: int, at: Progressed) -> None:
@@ -184,23 +222,15 @@ def _renew_reference(study: Study, name: str, replayed: Path) -> None:
         _log.info("%s: the reference has changed; no replay depends on it", name)
 
 
-def _report_changes(name: str, others: Mapping[str, Sequence[str] | None]) -> None:
-    """Say what stored replays are made again for."""
-    for mode, keys in others.items():
-        if keys:
-            _log.info("%s, %s: replayed again, with another %s", name, mode, ", ".join(keys))
-
-
 def _in_lockstep(
     config: StudyConfig,
     sequence: Recording,
-    name: str,
+    run: _Run,
     modes: _Modes,
-    mode: str,
     watch: Watch,
 ) -> Replay:
-    odometry = modes.setup.instance(mode, modes.model, name)
-    selector = modes.setup.selector(mode, modes.model)
+    odometry = modes.setup.instance(run.mode, modes.model, run.sequence)
+    selector = modes.setup.selector(run.mode, modes.model, run.sequence, run.repeat)
     with closing(odometry):
         return replay(
             sequence,
@@ -209,7 +239,7 @@ def _in_lockstep(
             selector,
             config.online.period,
             watch,
-            f"{name}, {mode}",
+            str(run),
             None if selector is None else selector.fall_back(),
         )
 
@@ -217,18 +247,17 @@ def _in_lockstep(
 def _in_real_time(
     config: StudyConfig,
     sequence: Recording,
-    name: str,
+    run: _Run,
     modes: _Modes,
-    mode: str,
     watch: Watch,
 ) -> Replay:
     period, setup = config.online.period, modes.setup
     assert config.online.real_time is not None
-    odometry = setup.instance(mode, modes.model, name)
+    odometry = setup.instance(run.mode, modes.model, run.sequence)
     selector = None
     with closing(odometry), ExitStack() as stack:
-        if setup.adapts(mode):
-            make = partial(setup.selector, mode, modes.model)
+        if setup.adapts(run.mode):
+            make = partial(setup.selector, run.mode, modes.model, run.sequence, run.repeat)
             selector = stack.enter_context(closing(SelectorProcess(make, period)))
         return replay_in_real_time(
             sequence,
@@ -237,8 +266,8 @@ def _in_real_time(
             config.online.real_time,
             selector,
             watch,
-            f"{name}, {mode}",
-            setup.core_ms(mode, modes.model),
+            str(run),
+            setup.core_ms(run.mode, modes.model),
         )
 
 

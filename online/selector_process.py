@@ -17,13 +17,11 @@ import numpy as np
 
 from adaptune.cores import shared_cores
 from adaptune.errors import AdaptuneError
-from adaptune.live.untrained import UntrainedSelector
 from adaptune.odometry import wire
 from adaptune.odometry.base import Motions
 from adaptune.selection import Selection
-from adaptune.selector import Selector
 from adaptune.sequence.scan import Scan
-from adaptune.timed_selector import TimedSelector
+from adaptune.timed_selector import AnySelector, TimedSelector
 
 SLOTS = 4
 """Scans on their way."""
@@ -34,7 +32,7 @@ MOST_LATE = 100
 _NICE = 10
 """By how much the priority of live evidence is lower."""
 
-Make = Callable[[], Selector | UntrainedSelector | None]
+Make = Callable[[], AnySelector | None]
 """Makes the selector; it pickles."""
 
 _log = logging.getLogger(__name__)
@@ -228,7 +226,7 @@ def _run(connection: Connection, make: Make, period: float, cores: list[int]) ->
         except AdaptuneError as error:
             connection.send(str(error))
             return
-        timed: Any = TimedSelector(gentle, period)  # type: ignore[arg-type]
+        timed = TimedSelector(gentle, period)
         connection.send(gentle.fall_back())
         before = time.process_time()
         seen: dict[int, SharedMemory] = {}

@@ -3,19 +3,19 @@
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.live.squares import SECONDS
 from adaptune.metrics import (
-    KittiError,
     absolute_error,
     bootstrap,
+    height_error,
     kitti_error,
     relative_error,
     span,
@@ -24,18 +24,11 @@ from adaptune.metrics import (
 )
 from adaptune.reference.stored import StoredEstimate
 from adaptune.trajectory import Trajectory, read_tum
+from online.comparison_row import ComparisonRow, Interval, StandardErrors
 from online.stored_replays import ReplaySummary, StoredReplay
 
-ALL = "all"
-"""In place of a sequence, all of them."""
-ESTIMATED, LOST = "estimated [%]", "lost [s]"
-"""Columns of what a bank has measured of itself."""
-REFERENCE = "reference"
-"""Column of the kind of reference."""
 ERROR_FACTOR = 1.5
 """By how much more than estimated an estimated reference may err."""
-Interval = tuple[float, float] | None
-"""Ends of a 95 % interval, where it is known."""
 
 
 class Reference(NamedTuple):
@@ -110,117 +103,35 @@ class Reference(NamedTuple):
         if np.isfinite(T_ref_sensor[:, 0, 0]).sum() < 2:
             return None
         ape, rpe = absolute_error(T_ref_sensor, T), relative_error(T_ref_sensor, T)
-        return StandardErrors(ape, rpe, kitti_error(T_ref_sensor, T))
+        height = height_error(T_ref_sensor, T, self.length)
+        return StandardErrors(ape, rpe, kitti_error(T_ref_sensor, T), height)
 
 
-class StandardErrors(NamedTuple):
-    """Errors of a trajectory as evo and KITTI's benchmark define them."""
+class JudgedModes(NamedTuple):
+    """The modes on a sequence, judged by its reference."""
 
-    ape: float  # metres, after alignment
-    rpe: float  # metres, from scan to scan
-    kitti: KittiError
+    name: str  # of the sequence
+    rows: list[ComparisonRow]  # one a mode
+    # Sub-trajectory RTE in percent by mode, each of shape (n,), at the same scans; the mean over
+    # the repeats. NaN where it is unknown.
+    errors: Mapping[str, NDArray[np.float64]]
+    block: int  # frames of a sub-trajectory
+    recording: str = ""  # that it is a part of; itself if empty
 
-    @classmethod
-    def pooled(cls, errors: "Sequence[StandardErrors]") -> "StandardErrors | None":
-        """Means over sequences; KITTI's error over the sub-trajectories of all of them."""
-        if not errors:
-            return None
-        ape, rpe, kitti = zip(*errors, strict=True)
-        return cls(float(np.mean(ape)), float(np.mean(rpe)), KittiError.pooled(kitti))
+    def pair(self, mode: str, other: str | None = None) -> NDArray[np.float64]:
+        """Errors of a mode and of another one, by default the yardstick, of shape (2, n).
 
-
-@dataclass(frozen=True)
-class ComparisonRow:
-    """A mode on a sequence, or over all sequences."""
-
-    sequence: str
-    mode: str
-    rte: float | None  # mean sub-trajectory RTE in percent; None where the reference is unknown
-    ratio: float | None  # to that of the yardstick
-    restarts: int  # by the health check
-    switches: int  # changes of the parameters
-    poor_scans: int  # too poor to register
-    rte_interval: Interval = None
-    ratio_interval: Interval = None
-    median: float | None = None  # of the sub-trajectory RTE, percent
-    standard: StandardErrors | None = None
-    blocks: int | None = None  # independent pieces of the recording
-    x_real_time: float | None = None  # speed of the odometry
-    first_restart: float | None = None  # seconds from the start
-    unhealthy: tuple[str, ...] = ()  # what the health check found
-    yardstick: str = "fixed"  # the mode that others are compared with
-    # Percent: the mean of the odometry's own error, measured while driving and without reference.
-    estimated: float | None = None
-    estimated_interval: Interval = None
-    lost_seconds: float = 0.0  # how long the bank was lost
-    reference: str = "given"  # `given`, `estimated` or `none`
-    reference_error: float | None = None  # percent, of an estimated one
-    cpu_ms: float | None = None  # milliseconds of CPU time a scan
-    cores: float | None = None  # that this takes at the sensor's rate
-    memory_mb: float | None = None  # most megabytes of all processes
-    real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
-
-    def columns(self) -> dict[str, Any]:
-        """The row of a table; columns that begin with an underscore are for files only."""
-        rte_low, rte_high = self.rte_interval or (None, None)
-        low, high = self.ratio_interval or (None, None)
-        estimated_low, estimated_high = self.estimated_interval or (None, None)
-        return {
-            "sequence": self.sequence,
-            "mode": self.mode,
-            "RTE [%]": self.rte,
-            f"vs {self.yardstick}": self.ratio,
-            "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
-            ESTIMATED: self.estimated,
-            LOST: self.lost_seconds,
-            "restarts": self.restarts,
-            "switches": self.switches,
-            "ms a scan": self.cpu_ms,
-            "cores": self.cores,
-            "memory [MB]": self.memory_mb,
-            REFERENCE: self.reference,
-            "_reference_error": self.reference_error,
-            "_poor_scans": self.poor_scans,
-            "_x_real_time": self.x_real_time,
-            "_rte_low": rte_low,
-            "_rte_high": rte_high,
-            "_ratio_low": low,
-            "_ratio_high": high,
-            "_blocks": self.blocks,
-            "_median": self.median,
-            "_estimated_low": estimated_low,
-            "_estimated_high": estimated_high,
-            **{f"_{key}": value for key, value in self._standard().items()},
-            **{f"_{key}": value for key, value in (self.real_time or {}).items()},
-        }
-
-    def _standard(self) -> dict[str, Any]:
-        keys = ("ape_m", "rpe_m", "kitti_percent", "kitti_deg_per_m", "kitti_lengths_m")
-        if self.standard is None:
-            return dict.fromkeys(keys)
-        ape, rpe, kitti = self.standard
-        if not kitti.lengths:
-            return dict.fromkeys(keys) | {"ape_m": ape, "rpe_m": rpe}
-        lengths = " ".join(f"{length:g}" for length in kitti.lengths)
-        return dict(zip(keys, (ape, rpe, kitti.translation, kitti.rotation, lengths), strict=True))
-
-    def standard_columns(self, kitti: bool = True) -> dict[str, Any]:
-        """The row of a table of the errors that other tools give, with KITTI's or without."""
-        ape, rpe, percent, degrees, listed = self._standard().values()
-        of_evo = {"sequence": self.sequence, "mode": self.mode, "APE [m]": ape, "RPE [m]": rpe}
-        if not kitti:
-            return of_evo
-        lengths = (listed or "").split()
-        return of_evo | {
-            "KITTI [%]": percent,
-            "[deg/100 m]": None if degrees is None else 100.0 * degrees,
-            "over [m]": "-".join(dict.fromkeys([*lengths[:1], *lengths[-1:]])) or None,
-        }
+        They are those of the frames at which both are known.
+        """
+        both = np.stack([self.errors[mode], self.errors[other or self.rows[0].yardstick]])
+        return both[:, np.isfinite(both).all(axis=0)]
 
 
-def compare_modes(
-    name: str, replays: Mapping[str, StoredReplay], reference: Reference
-) -> list[ComparisonRow]:
+Repeats = Mapping[str, Sequence[StoredReplay]]
+"""By mode the replays of a sequence, one or more."""
+
+
+def compare_modes(name: str, replays: Repeats, reference: Reference) -> JudgedModes:
     """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`.
 
     Parameters
@@ -228,66 +139,88 @@ def compare_modes(
     name
         Of the sequence.
     replays
-        By mode.
+        By mode, each with its repeats.
     reference
         Of the sequence.
     """
-    errors = _errors(replays, reference)
     yardstick = "fixed" if "fixed" in replays else "baseline"
-    block = reference.block
-    rows = []
-    for mode, replay in replays.items():
-        known = np.isfinite(errors[mode]) & np.isfinite(errors[yardstick])
-        mine, others = errors[mode][known], errors[yardstick][known]
-        summary = replay.summary
-        intervals = bootstrap(mine, others, block) if len(mine) else None
-        if intervals is not None and reference.error is not None:
-            judge = ERROR_FACTOR * reference.error
-            intervals = allowing_for(*intervals, float(others.mean()), judge)
-        rte_interval, ratio_interval = intervals or (None, None)
-        rte = float(mine.mean()) if len(mine) else None
-        estimated, estimated_interval = _estimated(replay)
-        rows.append(
-            ComparisonRow(
-                name,
-                mode,
-                rte,
-                None if rte is None else rte / max(float(others.mean()), 1e-12),
-                summary.restarts,
-                _switches(replay),
-                summary.poor_scans,
-                rte_interval,
-                ratio_interval,
-                float(np.median(mine)) if len(mine) else None,
-                reference.standard(replay.trajectory),
-                len(mine) // block,
-                round(summary.duration_s / replay.seconds, 2) if replay.seconds else None,
-                _first_restart(replay),
-                tuple(summary.unhealthy),
-                yardstick,
-                estimated,
-                estimated_interval,
-                summary.lost_seconds,
-                reference.kind,
-                reference.error,
-                summary.cpu_ms,
-                _cores(summary),
-                summary.memory_mb,
-                summary.real_time,
-            )
-        )
-    return rows
+    empty = [
+        ComparisonRow(name, mode, None, None, 0, 0, 0, yardstick=yardstick) for mode in replays
+    ]
+    judged = JudgedModes(name, empty, _errors(replays, reference), reference.block)
+    rows = (_measured(row, replays[row.mode], reference) for row in empty)
+    return judged._replace(rows=[_with_errors(row, judged) for row in rows])
 
 
-def _errors(
-    replays: Mapping[str, StoredReplay], reference: Reference
-) -> dict[str, NDArray[np.float64]]:
-    """Percent by mode, each of shape (n,): at the scans that no mode has dropped."""
-    common = reduce(np.intersect1d, [replay.trajectory.stamps for replay in replays.values()])
+def _measured(
+    row: ComparisonRow, repeats: Sequence[StoredReplay], reference: Reference
+) -> ComparisonRow:
+    """Fill in what was measured while driving, and the errors of each whole trajectory."""
+    summaries = [repeat.summary for repeat in repeats]
+    first = min((t for r in repeats if (t := _first_restart(r)) is not None), default=None)
+    speeds = [
+        s.duration_s / r.seconds for s, r in zip(summaries, repeats, strict=True) if r.seconds
+    ]
+    estimated, interval = _estimated(repeats)
+    known = [errors for r in repeats if (errors := reference.standard(r.trajectory)) is not None]
+    return replace(
+        row,
+        restarts=sum(summary.restarts for summary in summaries),
+        switches=sum(map(_switches, repeats)),
+        poor_scans=sum(summary.poor_scans for summary in summaries),
+        standard=StandardErrors.pooled(known),
+        x_real_time=round(float(np.mean(speeds)), 2) if speeds else None,
+        first_restart=first,
+        unhealthy=tuple(dict.fromkeys(found for s in summaries for found in s.unhealthy)),
+        estimated=estimated,
+        estimated_interval=interval,
+        lost_seconds=sum(summary.lost_seconds for summary in summaries),
+        reference=reference.kind,
+        reference_error=reference.error,
+        cpu_ms=mean_of([summary.cpu_ms for summary in summaries]),
+        cores=mean_of(list(map(_cores, summaries))),
+        memory_mb=max((s.memory_mb for s in summaries if s.memory_mb is not None), default=None),
+        real_time=summaries[0].real_time,
+        repeats=len(repeats),
+        scans=min(len(repeat.trajectory) for repeat in repeats),
+    )
+
+
+def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
+    """Fill in errors and intervals, where something is known."""
+    mine, others = judged.pair(row.mode)
+    if not len(mine):
+        return row
+    intervals = bootstrap(mine, others, judged.block)
+    if intervals is not None and row.reference_error is not None:
+        judge = ERROR_FACTOR * row.reference_error
+        intervals = allowing_for(*intervals, float(others.mean()), judge)
+    rte_interval, ratio_interval = intervals or (None, None)
+    return replace(
+        row,
+        rte=float(mine.mean()),
+        ratio=float(mine.mean()) / max(float(others.mean()), 1e-12),
+        rte_interval=rte_interval,
+        ratio_interval=ratio_interval,
+        median=float(np.median(mine)),
+        blocks=len(mine) // judged.block,
+    )
+
+
+def _errors(replays: Repeats, reference: Reference) -> dict[str, NDArray[np.float64]]:
+    """Percent by mode, each of shape (n,): at the scans that no replay has dropped."""
+    trajectories = {mode: [r.trajectory for r in repeats] for mode, repeats in replays.items()}
+    common = reduce(np.intersect1d, [t.stamps for of in trajectories.values() for t in of])
     return {
-        mode: reference.errors(replay.trajectory)[np.isin(replay.trajectory.stamps, common)]
-        for mode, replay in replays.items()
+        mode: np.mean([reference.errors(t)[np.isin(t.stamps, common)] for t in of], axis=0)
+        for mode, of in trajectories.items()
     }
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """Mean of those that are known."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _cores(summary: ReplaySummary) -> float | None:
@@ -332,16 +265,17 @@ def allowing_for(
     return (true(rte_low), math.hypot(rte_high, error)), interval
 
 
-def _estimated(replay: StoredReplay) -> tuple[float | None, Interval]:
+def _estimated(repeats: Sequence[StoredReplay]) -> tuple[float | None, Interval]:
     """Mean of the estimated errors, and of the ends of their intervals.
 
     The interval is right if all estimates err together, and else too wide. There is none where less
     than half of the recording was estimated: the rest may be of another kind.
     """
-    known = replay.estimated[np.isfinite(replay.estimated[:, 0])]
+    estimates = np.concatenate([repeat.estimated for repeat in repeats])
+    known = estimates[np.isfinite(estimates[:, 0])]
     if not len(known):
         return None, None
-    if 2 * len(known) < len(replay.estimated):
+    if 2 * len(known) < len(estimates):
         return float(known[:, 0].mean()), None
     mean, low, high = known.mean(axis=0).tolist()
     return mean, (low, high) if np.isfinite([low, high]).all() else None
@@ -358,40 +292,3 @@ def _switches(replay: StoredReplay) -> int:
         return 0
     values = zip(*replay.choices.values(), strict=True)
     return sum(a != b for a, b in itertools.pairwise(values))
-
-
-def pooled(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
-    """For every mode the mean errors over all sequences, and the geometric mean of the ratios."""
-    made = []
-    for mode in dict.fromkeys(row.mode for row in rows):
-        mine = [row for row in rows if row.mode == mode and row.rte is not None]
-        ratios = [row.ratio for row in mine if row.ratio is not None]
-        estimated = [row.estimated for row in mine if row.estimated is not None]
-        made.append(
-            ComparisonRow(
-                ALL,
-                mode,
-                float(np.mean([row.rte for row in mine if row.rte is not None])),
-                float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12))))),
-                sum(row.restarts for row in mine),
-                sum(row.switches for row in mine),
-                sum(row.poor_scans for row in mine),
-                standard=StandardErrors.pooled([row.standard for row in mine if row.standard]),
-                yardstick=mine[0].yardstick,
-                estimated=float(np.mean(estimated)) if estimated else None,
-                lost_seconds=sum(row.lost_seconds for row in mine),
-                reference=" and ".join(sorted({row.reference for row in mine})),
-                cpu_ms=_mean([row.cpu_ms for row in mine]),
-                cores=_mean([row.cores for row in mine]),
-                memory_mb=max(
-                    (m for row in mine if (m := row.memory_mb) is not None), default=None
-                ),
-            )
-        )
-    return made
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Mean of those that are known."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None

@@ -47,6 +47,7 @@ class ReplayIdentity(BaseModel):
     sequence: dict[str, Any]
     course: dict[str, Any] | None
     recording: list[str]  # hashes of the recording's files
+    repeat: int = 1  # which of several replays of the same
 
 
 class ReplaySummary(BaseModel):
@@ -85,6 +86,36 @@ class ReplaySummary(BaseModel):
             return cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
             raise damaged(path, error) from error
+
+
+def repeat_folder(folder: Path, repeat: int) -> Path:
+    """Folder of a repeat of the replay in `folder`, which is the first."""
+    return folder if repeat == 1 else folder / f"repeat_{repeat}"
+
+
+def read_repeats(folder: Path) -> list["StoredReplay"]:
+    """A mode's replay on a sequence, and its repeats in order.
+
+    What was repeated of something else, such as another model, does not count.
+
+    Parameters
+    ----------
+    folder
+        Of the mode, which holds the first.
+
+    Raises
+    ------
+    StoredReplayError
+        If the first one is missing, or one of them is damaged.
+    """
+    replays = [StoredReplay.read(folder)]
+    about = replays[0].summary.about
+    while True:
+        repeat = len(replays) + 1
+        of, identity = repeat_folder(folder, repeat), about.model_copy(update={"repeat": repeat})
+        if other_keys(of, identity) != []:
+            return replays
+        replays.append(StoredReplay.read(of))
 
 
 def other_keys(folder: Path, about: ReplayIdentity) -> list[str] | None:
@@ -346,6 +377,8 @@ def read_columns(path: Path) -> dict[str, list[str]]:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
         raise damaged(path, error) from error
+    if any(None in row or None in row.values() for row in rows):
+        raise damaged(path, ValueError("rows of other lengths than its header"))
     return {key: [row[key] for row in rows] for key in (rows[0] if rows else {})}
 
 

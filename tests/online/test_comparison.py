@@ -1,7 +1,6 @@
 import csv
 import json
 import math
-import re
 import shutil
 from dataclasses import replace
 
@@ -11,17 +10,16 @@ import pytest
 from pictures import texts
 
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import KittiError
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.selection import Selection
 from adaptune.study.driven import ModeError, bank_members
 from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.offline_study import load_study
-from online.comparison import compare, tables
+from online.comparison import compare
+from online.comparison_row import ComparisonRow
 from online.remarks import remarks
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
-from online.statistics import ComparisonRow, StandardErrors
 from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
@@ -46,7 +44,7 @@ def own(replayed, study_file, tmp_path):
 
 
 def test_rows_and_files(replayed):
-    rows = compare(replayed)
+    rows = compare(replayed).rows
     assert [(row.sequence, row.mode) for row in rows] == [("three", mode) for mode in MODES]
     of = {row.mode: row for row in rows}
     assert of["fixed"].ratio == 1.0
@@ -117,7 +115,7 @@ def test_an_odometry_that_is_not_live_adapts_too(own, study_file, mechanism):
     path = own.folder / "unpaying.safetensors"
     replace(model, bank_settings=BankSettings(adapt=False)).save(path)
     assert run_replays(study, path) == 4
-    row = next(row for row in compare(study) if row.mode == "paired")
+    row = next(row for row in compare(study).rows if row.mode == "paired")
     assert row.rte < 3.0
     folder = study.folder / "replays/three/paired"
     about = {
@@ -159,7 +157,7 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     # The published rule chooses among its members.
     with (folder / "paper/selections.csv").open() as file:
         assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.bank)
-    assert next(row.rte for row in compare(study) if row.mode == "paired") < 3.0
+    assert next(row.rte for row in compare(study).rows if row.mode == "paired") < 3.0
     said = set(texts(study.folder / "comparison/three.png"))
     assert {f"trial {n}" for n in model.bank} | {"weight [%]"} <= said
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
@@ -212,11 +210,11 @@ def test_replays_are_made_once(replayed, study_file):
 def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_file):
     study = load_study(study_file, ["sequences.three.reference=none"], trained.folder)
     run_replays(study, trained.folder / "model.safetensors")
-    rows = compare(study)
+    rows = compare(study).rows
     assert [row.rte for row in rows] == [None] * 4
     assert not (study.folder / "replays/three/reference.tum").exists()
     run_replays(trained, trained.folder / "model.safetensors")
-    assert compare(trained)[0].rte is not None
+    assert compare(trained).rows[0].rte is not None
 
 
 def test_a_written_reference_is_that_of_the_scans(replayed):
@@ -235,7 +233,7 @@ def test_rows_over_several_sequences(replayed, study_file, tmp_path):
         replayed.folder,
     )
     run_replays(study, replayed.folder / "model.safetensors")
-    rows = compare(study)
+    rows = compare(study).rows
     assert [row.sequence for row in rows] == ["three"] * 4 + ["four"] * 4 + ["all"] * 4
     a, b, all_ = rows[3], rows[7], rows[11]
     assert all_.rte == pytest.approx((a.rte + b.rte) / 2)
@@ -325,55 +323,6 @@ def rows_of(sequence="a", **ratios):
     ]
 
 
-@pytest.mark.parametrize(
-    ("ratio", "interval", "words"),
-    [
-        (
-            0.5,
-            (0.4, 0.6),
-            "The baseline is better than the fixed set here: on a the baseline ",
-        ),
-        (0.5, None, "a is too short to tell .*: on a the baseline has 0.50 times the fixed set's"),
-        (
-            1.25,
-            (1.1, 1.4),
-            "The fixed set is better .* 1.25 times \\(95 % interval 1.10-1.40\\) the",
-        ),
-        (0.996, None, "There is no difference that counts .* 1.00 times the fixed set's error"),
-        (
-            0.7,
-            (0.4, 1.2),
-            "There is no difference that counts .* 0.70 times \\(95 % interval 0.40-1",
-        ),
-    ],
-)
-def test_baseline_and_fixed_set_are_compared_in_words(ratio, interval, words):
-    baseline, *others = rows_of(baseline=ratio, paired=1.005)
-    mean, said = remarks([replace(baseline, ratio_interval=interval), *others])
-    assert mean.startswith("Mean RTE of a: baseline ")
-    assert re.match(words, said)
-
-
-def test_modes_that_adapt_are_told_where_they_differ():
-    rows = [
-        replace(row, ratio_interval=(0.9 * row.ratio, 1.1 * row.ratio))
-        for row in rows_of(baseline=0.5, paired=0.4, paper=2.0)
-    ]
-    said = "Compared with the fixed set, `paired` is better, with 0.40 times, and `paper` is worse"
-    said = said.replace("times,", "times (95 % interval 0.36-0.44),")
-    assert remarks(rows)[2] == f"{said}, with 2.00 times (95 % interval 1.80-2.20) its error."
-    short = remarks(rows_of(baseline=1.0, paired=0.4, paper=1.0))
-    assert short[-1] == (
-        "a is too short for intervals: whether `paired` differs from the fixed set is not known."
-    )
-    # All sequences together decide.
-    pooled = rows_of("all", baseline=1.5, paired=1.0)
-    mean, verdict = remarks([*rows, *pooled])
-    assert mean.startswith("Mean RTE of all sequences: baseline 1.500 %")
-    assert verdict.startswith("The fixed set is better than the baseline here: on all sequences ")
-    assert remarks([replace(row, rte=None, ratio=None) for row in rows]) == []
-
-
 def test_restarts_are_told_with_their_reason():
     baseline, fixed = rows_of(baseline=1.0)
     once = {"restarts": 1, "first_restart": 10.12, "unhealthy": ("max_acceleration",)}
@@ -385,6 +334,17 @@ def test_restarts_are_told_with_their_reason():
         "On a the health check restarted baseline 3 times, first at 10.1 s (max_speed, "
         "max_turn_rate); fixed at 10.1 s (max_acceleration)."
     )
+
+
+def test_replays_of_different_lengths_are_told_and_compared_where_both_have_scans(own):
+    folder = own.folder / "replays/three/paper"
+    for name, n in {"trajectory.tum": 30, "frames.csv": 31}.items():  # the latter has a header
+        lines = (folder / name).read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(lines[:n]))
+    rows = compare(own).rows
+    (said,) = [said for said in remarks(rows) if "lengths" in said]
+    assert said.startswith("On three the replays have different lengths (paper 30 of 40 scans)")
+    assert [row.mode for row in rows if row.rte is not None] == MODES
 
 
 def test_restarts_and_speed_are_those_of_the_stored_replay(own):
@@ -401,7 +361,7 @@ def test_restarts_and_speed_are_those_of_the_stored_replay(own):
     # Reading took long.
     summary |= {"restarts": 2, "unhealthy": {"max_speed": 2}, "replay_s": 1000.0}
     (folder / "replay.json").write_text(json.dumps(summary))
-    found = compare(own)
+    found = compare(own).rows
     row = next(row for row in found if row.mode == "paired")
     assert row.x_real_time == pytest.approx(3.9 / 0.4, abs=0.01)
     assert remarks(found)[-1] == (
@@ -412,20 +372,9 @@ def test_restarts_and_speed_are_those_of_the_stored_replay(own):
         compare(own)
 
 
-def test_unknown_cells_are_empty_and_kittis_are_left_out(replayed):
-    rows = compare(replayed)
-    text = (replayed.folder / "comparison/comparison.csv").read_text()
-    assert "nan" not in text
-    of_rte, standard = tables(rows, 3.0)
-    assert [str(column.header) for column in standard.columns] == [
-        "sequence",
-        "mode",
-        "APE [m]",
-        "RPE [m]",
-    ]
-    assert "KITTI" not in f"{standard.title} {standard.caption}"
-    assert "all" not in f"{of_rte.caption} {standard.caption}".replace("`all`", "all").split()
-    known = StandardErrors(1.0, 0.1, KittiError(0.5, 0.01, (100.0,)))
-    _, standard = tables([*rows, replace(rows[0], sequence="all", standard=known)], 3.0)
-    assert "over [m]" in [str(column.header) for column in standard.columns]
-    assert "KITTI over the sub-trajectories" in str(standard.caption)
+def test_unknown_cells_are_empty(replayed):
+    compare(replayed)
+    folder = replayed.folder / "comparison"
+    assert "nan" not in (folder / "comparison.csv").read_text()
+    assert (folder / "tables.md").read_text().startswith("# study\n\n- ")
+    assert r"\label{tab:study-1}" in (folder / "tables.tex").read_text()

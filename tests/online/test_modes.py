@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from random_models import random_model
 
+from adaptune.model import BankSettings, PairedSettings
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.isolation import Limits
 from adaptune.odometry.registry import odometry_class
-from adaptune.study.config import SwitchingConfig
+from adaptune.space import ParameterSpace
+from adaptune.study.config import ALSO, SwitchingConfig
 from adaptune.study.driven import ModeError
 from online.modes import ReplaySetup
 
@@ -85,3 +87,51 @@ def test_what_is_pinned_has_its_value_in_all_sets():
     members = gicp.untrained_sets().parameters
     assert {of["keyframe_interval"] for of in members} == {2.5}
     assert len({of["max_correspondence_distance"] for of in members}) == len(members)
+
+
+def test_a_mode_on_demand_that_is_another_one_is_not_replayed_again():
+    model = random_model()
+    asked = replace(setup(), also=("one_set", "bank", "even", "random"))
+    demand = ("bank", "even", "random")
+    # One set at a time is what `paired` drives.
+    assert asked.modes(model) == ("baseline", "fixed", "paired", *demand, "paper")
+    fixed = replace(model, paired=PairedSettings(adapt=False))
+    assert asked.modes(fixed)[3:5] == ("one_set", "bank")
+    with_bank = replace(asked, mechanism="bank")
+    assert with_bank.modes(model)[3:6] == ("one_set", "even", "random")
+    assert with_bank.twin("bank", model) == "paired"
+    unpaying = replace(fixed, bank_settings=BankSettings(adapt=False))
+    assert with_bank.modes(unpaying)[3:5] == ("one_set", "bank")
+    # Without `paired`, nothing is.
+    alone = replace(asked, rules=("paper",))
+    assert alone.modes(model) == ("baseline", "fixed", "one_set", *demand, "paper")
+    assert all(alone.identity(mode, model, "of it")["model"] == "of it" for mode in demand)
+    assert alone.identity("random", model)["switching"]["seed"] == 0
+
+
+def test_a_bank_of_one_member_is_not_compared_with():
+    model = replace(random_model(), bank=[4], vectors=np.zeros((50, 1, 3), np.float32))
+    asked = replace(setup(), also=("one_set", "bank", "even", "random", "untrained"))
+    assert asked.modes(replace(model, paired=PairedSettings(adapt=False)))[3:] == (
+        *("untrained", "one_set", "paper"),
+    )
+    assert "no other member" in asked.obstacle("even", model)
+
+
+@pytest.mark.parametrize("mechanism", ["bank", "live", "hand_over"])
+def test_modes_on_demand_have_their_mechanisms_whatever_the_study_has(mechanism):
+    model = random_model()
+    asked = replace(setup(), mechanism=mechanism, also=("one_set", "random", "bank_learned"))
+    single = "hand_over" if mechanism == "hand_over" else "live"
+    of = {mode: asked.identity(mode, model, "of it")["switching"] for mode in asked.also}
+    assert [of[mode]["mechanism"] for mode in asked.also] == [single, single, "bank"]
+    assert ("warm_up" in of["random"]) == (single == "hand_over")
+    assert ("switch_cost" in of["one_set"], "switch_cost" in of["random"]) == (True, False)
+
+
+def test_a_program_that_runs_whole_recordings_has_none():
+    whole = {"command": ["sh", "{input}", "{output}"]}
+    program = OdometryFactory("command", whole, ParameterSpace({}), Limits())
+    asked = replace(setup(), odometry=program, rules=(), also=ALSO)
+    assert asked.modes(random_model()) == ("baseline", "fixed")
+    assert "whole recordings" in asked.obstacle("even", random_model())

@@ -77,7 +77,9 @@ def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
 def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
     """Also by a study that does not say that they were, and where scans were dropped."""
     asks = load_study(study_file, ["online.rules=[paired]", TWO_CORES], study.folder)
-    assert "Replayed at 5 times the recorded rate: nothing came too late." in remarks(compare(asks))
+    assert "Replayed at 5 times the recorded rate: nothing came too late." in remarks(
+        compare(asks).rows
+    )
     fixed = study.folder / "replays/three/fixed"
     said = json.loads((fixed / "replay.json").read_text())
     said["real_time"] |= {"dropped_scans": 1, "missed_selections": 2}
@@ -86,7 +88,7 @@ def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
         lines = (fixed / name).read_text().splitlines(keepends=True)
         # One of the last twenty scans.
         (fixed / name).write_text("".join(lines[:-20] + lines[-19:]))
-    rows = compare(asks)
+    rows = compare(asks).rows
     assert [row.mode for row in rows] == ["baseline", "fixed", "paired"]
     assert {row.real_time["rate"] for row in rows} == {5.0}
     (found,) = [text for text in remarks(rows) if "too late" in text]

@@ -14,7 +14,9 @@ from offline.offline_study import load_study
 from offline.train import train
 from offline.validate import validate
 from online.comparison import compare
+from online.replay_charts import charts_of_replays
 from online.run_replays import run_replays
+from online.stale_replays import current_modes
 from online.stored_replays import StoredReplayError
 from online.switch_cost import measure_switching
 
@@ -77,7 +79,7 @@ def test_a_test_recording_that_was_replaced(load, caplog):
 
 def test_another_reference_replays_nothing(load, caplog):
     study = load()
-    before = {row.mode: row.rte for row in compare(study)}
+    before = {row.mode: row.rte for row in compare(study).rows}
     path = study.folder.parent / "three.tum"
     truth = study.sequences.open("three").reference()
     T = truth.T_world_sensor.copy()
@@ -87,7 +89,7 @@ def test_another_reference_replays_nothing(load, caplog):
         compare(study)
     assert run(study) == 0
     assert "three: the reference has changed; no replay depends on it" in caplog.text
-    after = {row.mode: row.rte for row in compare(study)}
+    after = {row.mode: row.rte for row in compare(study).rows}
     assert all(abs(after[mode] - before[mode]) > 1.0 for mode in before)
     shifted = load("sequences.three.clock_offset=0.05")
     with pytest.raises(StoredReplayError, match="another reference"):
@@ -156,6 +158,69 @@ def test_replays_with_two_models_are_not_compared(load):
     both = load("online.rules=[paired, paper]")
     with pytest.raises(StoredReplayError, match=r"different models .*run `adaptune online` again"):
         compare(both)
+
+
+def test_what_is_refused_is_told_and_not_drawn(load):
+    study = load()
+    assert current_modes(study, "three") == (("baseline", "fixed", "paired"), ())
+    assert current_modes(study, "one") == ((), ())
+    # What is left of a mode that the study does not have any more is not looked at.
+    folder = study.folder / "replays/three"
+    shutil.copytree(folder / "paired", folder / "paper")
+    assert "paper" not in current_modes(study, "three").modes
+    other = load("online.switching.mechanism=hand_over", "online.switching.warm_up=3")
+    modes, refused = current_modes(other, "three")
+    assert modes == ("baseline", "fixed")
+    with pytest.raises(StoredReplayError) as caught:
+        compare(other)
+    assert refused == (f"{caught.value}.",)
+    charts, notes = charts_of_replays(other, "three")
+    assert refused[0] in notes
+    lines = {line.name for panel in charts[0].panels for line in panel.drawn}
+    assert {"baseline", "fixed"} <= lines
+    assert "paired" not in lines
+
+
+def test_all_that_is_refused_for_one_reason_is_told_at_once(load):
+    study = load()
+    change(study.folder.parent / "three.bag")
+    charts, (said,) = charts_of_replays(study, "three")
+    assert not charts
+    assert said == (
+        f"{study.folder / 'replays/three'}: baseline, fixed, paired were replayed with another "
+        f"recording; run `adaptune online` with this study."
+    )
+
+
+def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load):
+    study = load("online.also=[even]")
+    run(study)
+    path = study.folder / "replays/three/even/replay.json"
+    stored = json.loads(path.read_text())
+    stored["about"]["model"] = "another"
+    path.write_text(json.dumps(stored))
+    with pytest.raises(StoredReplayError, match="different models"):
+        compare(study)
+    modes, (said,) = current_modes(study, "three")
+    assert modes == ("baseline", "fixed", "paired")
+    assert "three/even: was replayed with another model; run `adaptune online`" in said
+    study.model_path.unlink()
+    with pytest.raises(StoredReplayError, match="different models"):
+        charts_of_replays(study, "three")
+
+
+def test_replays_of_another_rate_or_reference_are_not_drawn(load):
+    study = load()
+    path = study.folder / "replays/three/paired/replay.json"
+    before = path.read_text()
+    stored = json.loads(before)
+    stored["about"]["real_time"] = {"rate": 1.0}
+    path.write_text(json.dumps(stored))
+    with pytest.raises(StoredReplayError, match="some were made in real time"):
+        charts_of_replays(study, "three")
+    path.write_text(before)
+    with pytest.raises(StoredReplayError, match="judged by another reference"):
+        charts_of_replays(load("sequences.three.clock_offset=0.05"), "three")
 
 
 def test_other_ways_to_switch_are_not_compared(load):

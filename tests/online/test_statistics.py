@@ -5,7 +5,9 @@ import pytest
 
 from adaptune.metrics import KittiError, kitti_error
 from adaptune.trajectory import Trajectory, read_kitti
-from online.statistics import ComparisonRow, Reference, StandardErrors, pooled
+from online.comparison_row import ComparisonRow, StandardErrors
+from online.pooled_rows import pooled
+from online.statistics import JudgedModes, Reference
 
 
 def trajectory(T, first=0):
@@ -16,6 +18,11 @@ def straight(n, step=1.0):
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, 0, 3] = step * np.arange(n)
     return T
+
+
+def over_all(rows):
+    """The row of the only mode over all sequences."""
+    return pooled([JudgedModes(r.sequence, [r], {r.mode: np.ones(30)}, 3) for r in rows])[0]
 
 
 def row(sequence, standard, mode="fixed"):
@@ -90,13 +97,13 @@ def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
     assert len({part.n for part in parts}) == 3  # the mean of the means is another
     short = KittiError(np.nan, np.nan, ())
     rows = [row(f"s{i}", StandardErrors(1.0 + i, 0.1, k)) for i, k in enumerate([*parts, short])]
-    (found,) = pooled([*rows, row("blind", None)])
+    found = over_all([*rows, row("blind", None)])
     assert found.standard.ape == pytest.approx(2.5)
     assert found.standard.rpe == pytest.approx(0.1)
     assert found.standard.kitti[:2] == pytest.approx(want[:2])
     assert found.standard.kitti[2:] == want[2:]
-    assert pooled([row("a", None)])[0].standard is None
-    assert np.isnan(pooled([row("a", StandardErrors(1.0, 0.1, short))])[0].standard.kitti[0])
+    assert over_all([row("a", None)]).standard is None
+    assert np.isnan(over_all([row("a", StandardErrors(1.0, 0.1, short))]).standard.kitti[0])
 
 
 def test_what_a_mode_costs_is_in_its_columns():
@@ -109,8 +116,8 @@ def test_what_a_mode_costs_is_in_its_columns():
         replace(row(name, None), cpu_ms=ms, cores=cores, memory_mb=mb)
         for name, (ms, cores, mb) in zip("ab", costs, strict=True)
     ]
-    (of_all,) = pooled(rows)
+    of_all = over_all(rows)
     assert of_all.cpu_ms == pytest.approx(15.0)
     assert of_all.cores == pytest.approx(0.2)
     assert of_all.memory_mb == 400.0
-    assert pooled([row("a", None), row("b", None)])[0].cpu_ms is None
+    assert over_all([row("a", None), row("b", None)]).cpu_ms is None

@@ -1,0 +1,213 @@
+"""Modes on demand, repeats of replays, and what is compared where some are missing."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+
+import drives
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from adaptune.cli import app
+from adaptune.model import BankSettings, ErrorModel, PairedSettings
+from adaptune.study.config import ALSO
+from offline.offline_study import load_study
+from online.compared_modes import compared_modes
+from online.comparison import compare
+from online.run_replays import run_replays, run_untrained
+from online.stored_replays import StoredReplayError, read_repeats, repeat_folder
+
+EVERY = [
+    *("baseline", "fixed", "paired", "untrained", "one_set", "bank", "bank_learned"),
+    *("even", "random", "paper"),
+]
+
+
+@pytest.fixture(scope="module")
+def load(study_file, trained_folder, tmp_path_factory):
+    """Loads a study whose model knows a better set, and keeps the fixed one all the same."""
+    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("on_demand") / "study")
+    path = folder / "model.safetensors"
+    model, off = ErrorModel.load(path), {"adapt": False}
+    errors = model.errors.copy()
+    errors[:, model.sets.column(model.bank[1])] *= 0.1
+    settings = {"paired": PairedSettings(**off), "bank_settings": BankSettings(**off)}
+    replace(model, errors=errors, **settings).save(path)
+    return lambda *overrides, at=folder: load_study(study_file, overrides, at)
+
+
+@pytest.fixture(scope="module")
+def replayed(load):
+    study = load("online.also=all")
+    assert run_replays(study, study.model_path) == len(EVERY)
+    return study
+
+
+@pytest.fixture
+def own(replayed, load, tmp_path):
+    """Loads a copy of `replayed` that a test may change."""
+    folder = shutil.copytree(replayed.folder, tmp_path / "study")
+    return lambda *overrides: load(*overrides, at=folder)
+
+
+def selections(study, mode, sequence="three"):
+    path = study.folder / "replays" / sequence / mode / "selections.csv"
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def about(study, mode, sequence="three"):
+    path = study.folder / "replays" / sequence / mode / "replay.json"
+    return json.loads(path.read_text())["about"]
+
+
+def test_all_are_compared_in_the_order_of_their_lines(replayed):
+    rows = compare(replayed).rows
+    assert [row.mode for row in rows] == EVERY
+    assert {row.yardstick for row in rows} == {"fixed"}
+    assert compared_modes(replayed).words(replayed) == []
+
+
+def test_they_do_what_their_names_say(replayed):
+    model = ErrorModel.load(replayed.model_path)
+    # The study keeps the fixed set; these modes adapt all the same.
+    assert {int(row["trial"]) for row in selections(replayed, "paired")} == {model.fixed}
+    chosen = {int(row["trial"]) for row in selections(replayed, "one_set")}
+    assert model.bank[1] in chosen
+    assert about(replayed, "one_set")["switching"]["mechanism"] == "live"
+    for mode in ("bank", "bank_learned"):
+        weights = {row["weights"] for row in selections(replayed, mode)}
+        assert not any(f"{model.fixed}:1.000" in text for text in weights)
+        assert about(replayed, mode)["switching"]["mechanism"] == "bank"
+
+    def estimated(mode):
+        return [float(row["estimated_error_percent"]) for row in selections(replayed, mode)]
+
+    assert np.isfinite(estimated("bank")).any()
+    assert not np.isfinite(estimated("bank_learned")).any()
+    share = f"{1 / len(model.bank):.3f}"
+    even = " ".join(f"{member}:{share}" for member in model.bank)
+    assert {row["weights"] for row in selections(replayed, "even")} == {even}
+    drawn = [int(row["trial"]) for row in selections(replayed, "random")]
+    assert set(drawn) <= set(model.bank)
+    assert set(drawn) != {model.fixed}
+    assert about(replayed, "random")["switching"]["mechanism"] == "live"
+
+
+def test_they_are_made_once_and_again_for_another_model(own):
+    study = own("online.also=all")
+    before = selections(study, "random")
+    assert run_replays(study, study.model_path) == 0
+    shutil.rmtree(study.folder / "replays/three/random")
+    assert run_replays(study, study.model_path) == 1
+    assert [r["trial"] for r in selections(study, "random")] == [r["trial"] for r in before]
+    # Without being asked for, they are compared if they are there, and renewed by a command.
+    other = replace(ErrorModel.load(study.model_path), paired=PairedSettings(threshold=-0.2))
+    other.save(study.model_path)
+    plain = own()
+    assert run_replays(plain, plain.model_path) == 2
+    with pytest.raises(StoredReplayError, match=r"different models .* --thorough` again"):
+        compare(plain)
+    assert run_replays(study, study.model_path) == 4
+    compared = compare(plain)
+    rows = {row.mode: row for row in compared.rows}
+    # Now `paired` is one set at a time, too. Programs find both, readers one.
+    assert rows["one_set"].rte == rows["paired"].rte
+    assert {row.mode: row.twin for row in compared.rows if row.twin} == {"one_set": "paired"}
+    (same,) = compared_modes(plain).words(plain)
+    assert same == "`one_set` is what `paired` drives here: it has the same numbers, shown once."
+    assert [said for said in compared.words if "`one_set`" in said] == [same]
+    with (folder := plain.folder / "comparison").joinpath("comparison.csv").open() as file:
+        assert {row["mode"]: row["twin"] for row in csv.DictReader(file)}["one_set"] == "paired"
+    assert "| one_set |" not in (folder / "tables.md").read_text("utf-8")
+
+
+def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
+    bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
+    four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
+    both = own("test=[three, four]", four, "online.also=[even]")
+    run_replays(both, both.model_path)
+    shutil.rmtree(both.folder / "replays/four/paper")
+    shutil.rmtree(both.folder / "replays/three/baseline")
+    assert {row.mode for row in compare(both).rows} == {"fixed", "paired", "even"}
+    said = compared_modes(both).words(both)
+    assert said == [
+        "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
+        "missing.",
+        "`untrained` and `one_set` and `bank` and `bank_learned` and `random` and `paper` are not "
+        "compared: there is no replay on four; `adaptune online --untrained` or `adaptune online "
+        "--thorough` or `adaptune online` makes what is missing.",
+    ]
+    shutil.rmtree(both.folder / "replays/four/fixed")
+    run_untrained(both)
+    assert {(row.mode, row.yardstick) for row in compare(both).rows} == {
+        ("baseline", "baseline"),
+        ("untrained", "baseline"),
+    }
+    (said,) = compared_modes(both).words(both)
+    assert said.startswith("`fixed` is not compared: there is no replay on four; `adaptune online`")
+    shutil.rmtree(both.folder / "replays/four/untrained")
+    compared = compared_modes(both)
+    assert (compared.sequences, compared.unfinished) == (("three",), ("four",))
+    assert "Not compared, for want of replays: four; `adaptune online` makes them." in (
+        compare(both).words
+    )
+    shutil.rmtree(both.folder / "replays/three/fixed")
+    with pytest.raises(StoredReplayError, match=r"three/fixed: there is no replay; run"):
+        compare(both)
+
+
+def test_every_mode_is_repeated_and_random_sets_differ(own):
+    study = own("online.also=[random]", "online.repeats=3")
+    kept = study.folder / "replays/three"
+    assert run_replays(study, study.model_path) == 10
+    assert run_replays(study, study.model_path) == 0
+    first, *others = (selections(study, f"random{of}") for of in ("", "/repeat_2", "/repeat_3"))
+    for other in others:
+        assert [row["trial"] for row in other] != [row["trial"] for row in first]
+    paired = read_repeats(kept / "paired")
+    assert [replay.summary.about.repeat for replay in paired] == [1, 2, 3]
+    for replay in paired[1:]:
+        np.testing.assert_array_equal(
+            replay.trajectory.T_world_sensor, paired[0].trajectory.T_world_sensor
+        )
+    assert [len(read_repeats(kept / mode)) for mode in ("random", "even")] == [3, 1]
+    # What is left of an interrupted run is made again, and nothing else.
+    (repeat_folder(kept / "random", 2) / "frames.csv").unlink()
+    assert len(read_repeats(kept / "random")) == 1
+    assert run_replays(study, study.model_path) == 1
+    shutil.rmtree(kept / "fixed/repeat_3")
+    (said,) = (said for said in compare(study).words if said.startswith("Replayed less often"))
+    assert said.startswith("Replayed less often than 3 times (`adaptune online` goes on): ")
+    assert "fixed on three 2" in said
+    assert "random" not in said
+    # Repeats of something else do not count.
+    other = own("online.period=2", "online.rules=[paired]")
+    run_replays(other, other.model_path)
+    assert len(read_repeats(kept / "paired")) == 1
+    with pytest.raises(StoredReplayError, match="there is no replay"):
+        read_repeats(kept / "nothing")
+
+
+def test_the_command_line(own, study_file):
+    folder = own().folder
+    words = [str(study_file), "--folder", str(folder)]
+    done = CliRunner().invoke(app, ["online", *words, "--thorough"])
+    assert done.exit_code == 0, done.output
+    assert f"All {len(EVERY)} replays were there already" in done.stdout
+    assert "-o online.also=all" in done.stdout.splitlines()[-1]
+    shutil.rmtree(folder / "replays/three/paper")
+    done = CliRunner().invoke(app, ["compare", *words])
+    assert done.exit_code == 0, done.output
+    assert "`paper` is not compared: there is no replay on any sequence" in done.stdout
+    for given in (["--thorough", "--untrained"], ["--thorough", "--ros"]):
+        done = CliRunner().invoke(app, ["online", *words, *given])
+        assert done.exit_code == 2
+        assert "--thorough is for replays with a model" in done.stderr
+    for value, words_ in (("[even, even]", "a mode is named twice"), ("[odd]", "not 'odd'")):
+        done = CliRunner().invoke(app, ["online", *words, "-o", f"online.also={value}"])
+        assert done.exit_code == 2
+        assert words_ in done.stderr
+    assert set(ALSO) < set(EVERY)

@@ -1,0 +1,180 @@
+from dataclasses import replace
+
+import pytest
+
+from online.comparison_row import ALL, ORACLES, ComparisonRow, Ratio
+from online.verdict import verdict
+
+
+def rows_of(sequence=ALL, **ratios):
+    """Rows of modes with an interval of 3 % on both sides."""
+    return [
+        ComparisonRow(
+            sequence, mode, ratio, ratio, 0, 3, 0, ratio_interval=(0.97 * ratio, 1.03 * ratio)
+        )
+        if mode != "fixed"
+        else ComparisonRow(sequence, mode, 1.0, 1.0, 0, 0, 0, cpu_ms=5.0)
+        for mode, ratio in ({"baseline": 1.5, "fixed": 1.0} | ratios).items()
+    ]
+
+
+def every(n=12, **ratios):
+    return [row for i in range(n) for row in rows_of(f"s{i}", **ratios)] + rows_of(**ratios)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "first", "last"),
+    [
+        (0.7, "Adapting gained 30 % on 12 test sequences: `paired` has 0.70 times the fixed set's "
+              "error (95 % interval 0.68 to 0.72).", "What to do: drive `paired`."),
+        (1.3, "Adapting lost 30 % on 12 test sequences", "What to do: drive the fixed set; no"),
+        (1.004, "Adapting changed nothing that counts on 12", "What to do: drive the fixed set; n"),
+    ],
+)  # fmt: skip
+def test_the_first_sentence_says_what_was_gained_and_the_last_what_to_do(ratio, first, last):
+    said = verdict(every(paired=ratio))
+    assert said[0].startswith(first)
+    assert said[-1].startswith(last)
+
+
+def test_a_ratio_near_1_with_a_wide_interval_is_open():
+    wide = [replace(row, ratio_interval=(0.6, 1.7)) for row in rows_of(paired=0.98)]
+    said = verdict([*every(paired=0.98)[:-3], *wide])
+    assert said[-1].startswith("What to do: replay more test sequences; until they decide, drive")
+    assert said[0].startswith("Whether adapting gains is open, on 12 test sequences")
+    assert any(s.startswith("Whether tuning gains is open, on 12 test sequences") for s in said)
+
+
+def test_with_few_sequences_the_interval_speaks_of_these_alone():
+    few = [row for i in range(3) for row in rows_of(f"s{i}", paired=0.7)] + rows_of(paired=0.7)
+    assert verdict(few)[0].endswith("The interval speaks of these recordings alone.")
+    assert verdict(rows_of("a", paired=0.7))[0].endswith("these recordings alone.")
+    assert "alone" not in verdict(every(paired=0.7))[0]
+
+
+@pytest.mark.parametrize(
+    ("ratios", "advice"),
+    [
+        ({"baseline": 0.7, "paired": 1.3}, "What to do: drive `baseline`."),
+        ({"equal_cost": 0.6, "paired": 0.8}, "What to do: drive the best set that costs no more."),
+        ({"even": 0.5, "paired": 0.8}, "What to do: drive `paired`."),
+        ({"baseline": 1.4}, "What to do: drive the fixed set; nothing is surely better."),
+    ],
+)
+def test_the_advice_is_the_best_that_is_surely_better(ratios, advice):
+    assert verdict(every(**ratios))[-1] == advice
+
+
+def test_without_a_mode_that_adapts_tuning_is_the_result():
+    said = verdict(every(baseline=1.25))
+    assert said[0].startswith("Tuning alone gained 20 % of the baseline's error")
+    assert len(said) == 2
+
+
+@pytest.mark.parametrize("ratio", [0.4, 1.0, 1.6])
+def test_without_an_interval_nothing_is_claimed(ratio):
+    few = every(3, paired=ratio, paper=1.3 * ratio, even=1.1)
+    against = {"even": Ratio(0.9)}
+    said = verdict([replace(row, ratio_interval=None, against=against) for row in few])
+    unknown = "nothing can be said of how sure"
+    assert said[0] == (
+        f"Whether adapting gains is not known, on 3 test sequences: `paired` has {ratio:.2f} times "
+        f"the fixed set's error (no interval); {unknown} that is."
+    )
+    assert any(s.startswith("Whether choosing adds to that is not known") for s in said)
+    assert (
+        f"`paper` has {1.3 * ratio:.2f} times the fixed set's error (no interval); {unknown}"
+        in (s.removesuffix(" that is.") for s in said)
+    )
+    assert said[-2].startswith("Whether tuning gains is not known, on 3 test sequences: ")
+    assert said[-1] == (
+        f"What to do: replay 6 test recordings or more, or longer ones (at least 10 "
+        f"sub-trajectories each); without, {unknown} this is. Until then, drive the fixed set."
+    )
+    assert not any("surely differ" in s or "open" in s for s in said)
+
+
+def test_modes_without_an_interval_are_not_told_as_sure_where_nothing_was_adapted():
+    rows = rows_of("a", paired=1.0, bank=0.8)
+    kept = [replace(row, switches=0, ratio_interval=None) for row in rows[:-1]]
+    assert verdict([*kept, replace(rows[-1], ratio_interval=None)])[-1].startswith(
+        "What to do: replay 6 test recordings or more, or longer ones"
+    )
+    sure = verdict([kept[1], kept[2]])
+    assert sure[-1] == "What to do: drive the fixed set; nothing is surely better."
+
+
+def test_a_mode_that_surely_does_not_differ_is_told_from_one_that_may():
+    said = verdict(every(paired=0.7, paper=1.004))
+    assert any(s.startswith("`paper` changed nothing that counts: 1.00 times") for s in said)
+    wide = [
+        replace(row, ratio_interval=(0.6, 1.7)) if row.mode == "paper" else row
+        for row in every(paired=0.7, paper=1.004)
+    ]
+    assert any(s.startswith("`paper` does not surely differ: 1.00 times") for s in verdict(wide))
+
+
+def test_what_kept_the_fixed_set_did_not_adapt():
+    rows = [replace(row, switches=0, ratio_interval=None) for row in every(paired=1.0)]
+    said = verdict(rows)
+    assert said[0] == (
+        "Nothing was adapted, nothing gained: `paired` kept the fixed set on 12 test sequences."
+    )
+    assert said[-1].startswith("What to do: ")
+
+
+def test_losses_costs_controls_and_rivals_are_told():
+    rows = every(paired=0.7, paper=1.4, equal_cost=0.875, random=1.8, even=1.02)
+    sure = {
+        "better": 11,
+        "worse": 1,
+        "surely_better": 9,
+        "surely_worse": 1,
+        "worst_tenth": 1.25,
+        "gap_closed": 0.4,
+        "cpu_ms": 20.0,
+        "stretches": 24,
+        "against": {"even": Ratio(0.69, (0.6, 0.8)), "equal_cost": Ratio(0.8, (0.7, 0.9))},
+    }
+    rows = [replace(r, **sure) if (r.sequence, r.mode) == (ALL, "paired") else r for r in rows]
+    rows = [replace(r, ratio=1.2) if (r.sequence, r.mode) == ("s3", "paired") else r for r in rows]
+    said = verdict(rows)
+    for sentence in (
+        "It has less error on 11 of 12 sequences, more on 1 (s3); surely better on 9, surely worse "
+        "on 1.",
+        "In the worst tenth of 24 stretches it has 1.25 times the fixed set's error.",
+        "It gains 40 % of what the best set of each sequence would gain in hindsight.",
+        "It takes 20.0 ms of CPU time a scan: 4.0 times what the fixed set takes.",
+        "`paired` has 0.80 times the error of the best set that costs no more (95 % interval 0.70 "
+        "to 0.90).",
+        "Choosing added to that: `paired` has 0.69 times the error of `even` (95 % interval 0.60 "
+        "to 0.80).",
+        "`paper` is worse: 1.40 times the fixed set's error (95 % interval 1.36 to 1.44).",
+        "What to do: drive `paired`, and look at where it is worse (pictures).",
+    ):
+        assert sentence in said
+    assert any(
+        s.startswith("Switching at random among the members") and "1.80 times" in s for s in said
+    )
+    assert any(s.startswith("The study's bank with even weights has 1.02 times") for s in said)
+    assert any(s.startswith("Tuning alone gained 33 % of the baseline's error") for s in said)
+
+
+def test_without_a_model_the_untrained_bank_is_compared_with_the_baseline():
+    rows = [
+        replace(row, yardstick="baseline")
+        for row in every(untrained=0.8)
+        if row.mode in ("baseline", "untrained")
+    ]
+    said = verdict([replace(r, ratio=1.0) if r.mode == "baseline" else r for r in rows])
+    assert said[0].startswith(
+        "Adapting gained 20 % on 12 test sequences: `untrained` has 0.80 times"
+    )
+    assert "the baseline's error" in said[0]
+
+
+def test_nothing_is_said_where_nothing_is_known():
+    rows = [replace(row, rte=None, ratio=None) for row in rows_of("a", paired=0.5)]
+    assert verdict(rows) == ["No test sequence has a reference: nobody can say what was gained."]
+    oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
+    assert not any(ORACLES[0] in said for said in verdict([*every(paired=0.7), oracle]))
