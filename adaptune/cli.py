@@ -6,7 +6,15 @@ from typing import Annotated, Any
 import typer
 
 from adaptune import tools
-from adaptune.commands import driving, importing, learning, looking, referencing, training
+from adaptune.commands import (
+    driving,
+    importing,
+    learning,
+    looking,
+    referencing,
+    reporting,
+    training,
+)
 from adaptune.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -31,7 +39,9 @@ app = typer.Typer(
         "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
         "    adaptune switching configs/demo.yaml   # what a switch costs\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
+        "    adaptune oracle   configs/demo.yaml    # what was there to gain, in hindsight?\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
+        "    adaptune report   configs/demo.yaml    # all of it as a page to look at\n\n"
         "    adaptune record   configs/demo.yaml    # replays to look at in Rerun or Foxglove"
     ),
 )
@@ -42,9 +52,9 @@ app.add_typer(models, name="model")
 for _command in (
     *(tools.inspect, tools.cache, tools.serve),
     *(training.simulate, referencing.reference),
-    *(training.offline, learning.learn, training.trials, training.validate),
+    *(training.offline, learning.learn, training.trials, training.validate, training.oracle),
     *(driving.online, driving.switching, driving.compare, looking.record),
-    importing.import_rustle,
+    *(reporting.report, importing.import_rustle),
 ):
     app.command()(_command)
 

@@ -12,6 +12,8 @@ RESAMPLES = 2000
 """Resamples of a bootstrap."""
 MIN_BLOCKS = 10
 """Least number of blocks of a recording: with fewer, an interval means nothing."""
+WORST = 0.1
+"""Share of the stretches that are the worst."""
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
@@ -108,6 +110,19 @@ def sub_trajectory_vectors(
         failures = np.cumsum(restarted)
         vectors[starts[failures[ends] > failures[starts]]] = np.inf
     return vectors
+
+
+def height_error(T_ref_sensor: Poses, T_odom_sensor: Poses, length: float) -> float:
+    """Mean drift in height over the sub-trajectories of `length` metres, in percent of it.
+
+    Height is along the z axis of the reference's frame. NaN where no sub-trajectory is whole.
+    """
+    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length)
+    known = np.isfinite(vectors).all(axis=1)
+    if not known.any():
+        return np.nan
+    heights = np.einsum("ij,ij->i", T_ref_sensor[known, 2, :3], vectors[known])
+    return float(np.abs(heights).mean())
 
 
 class KittiError(NamedTuple):
@@ -224,18 +239,53 @@ def bootstrap(
     tuple, or None
         The ends of both intervals; None with fewer than `MIN_BLOCKS` blocks.
     """
-    n = len(errors)
-    if n < MIN_BLOCKS * block:
+    if len(errors) < MIN_BLOCKS * block:
         return None
-    n_blocks = -(-n // block)
-    starts = np.random.default_rng(seed).integers(0, n - block + 1, (RESAMPLES, n_blocks))
-    means = []
-    for values in (errors, fixed):
-        sums = np.concatenate([[0.0], np.cumsum(values)])
-        means.append((sums[starts + block] - sums[starts]).sum(axis=1) / (n_blocks * block))
+    means = resampled_means(np.stack([errors, fixed]), block, np.random.default_rng(seed))
     ratios = means[0] / np.maximum(means[1], 1e-12)
     (low, high), (ratio_low, ratio_high) = np.percentile([means[0], ratios], [2.5, 97.5], axis=1).T
     return (float(low), float(high)), (float(ratio_low), float(ratio_high))
+
+
+def resampled_means(
+    values: NDArray[np.float64], block: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Means of the resamples of a moving-block bootstrap.
+
+    Parameters
+    ----------
+    values
+        Of shape (k, n): k values of each frame, which are drawn together.
+    block
+        Frames drawn together, n at most.
+    rng
+        Draws them.
+
+    Returns
+    -------
+    ndarray of shape (k, RESAMPLES)
+    """
+    n = values.shape[1]
+    n_blocks = -(-n // block)
+    starts = rng.integers(0, n - block + 1, (RESAMPLES, n_blocks))
+    sums = np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
+    means = (sums[:, starts + block] - sums[:, starts]).sum(axis=2) / (n_blocks * block)
+    return np.asarray(means)
+
+
+def worst_tenth(logs: NDArray[np.float64]) -> float:
+    """Mean logarithm over the worst tenth of the stretches, over one stretch at least.
+
+    It is the conditional value at risk: where a tenth is no whole number, a stretch counts in part.
+
+    Parameters
+    ----------
+    logs
+        Logarithms of the ratio to the fixed set's error, a number for each stretch.
+    """
+    share = max(1.0, WORST * len(logs))
+    counts = np.clip(share - np.arange(len(logs)), 0.0, 1.0)
+    return float(np.sort(logs)[::-1] @ counts / share)
 
 
 def span(T_ref_sensor: Poses, length: float) -> int:

@@ -2,19 +2,37 @@
 
 import csv
 import io
+import itertools
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import rich.box
+from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
 from adaptune.files import write_text
 
 _FEW, _MANY = 0.1, 10.0
+
+
+class Listing(NamedTuple):
+    """Rows of equal keys, with what they are about.
+
+    Keys that start with an underscore are for files only. ``group: name`` stands below a heading
+    that it shares with its neighbours where there is room for it.
+    """
+
+    title: str
+    rows: Sequence[Mapping[str, Any]]
+    caption: str = ""
+    # The least number of each row is set in bold, in each group of columns, or that of the columns
+    # that are named. Rows with a true ``_in_hindsight`` do not count.
+    least: Literal["row"] | tuple[str, ...] = ()
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
@@ -38,17 +56,117 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
     for i, row in enumerate(rows):
         if i and grouped and rows[i - 1][keys[0]] != row[keys[0]]:
             made.add_row()
-        made.add_row(*(Text(_cell(row[key])) for key in keys))
+        made.add_row(*(Text(cell_text(row[key])) for key in keys))
     return made
 
 
-def _cell(value: Any) -> str:
+def cell_text(value: Any) -> str:
+    """A value as it stands in a table; "-" for one that is missing."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return "-"
     if isinstance(value, float):
         digits = 1 if abs(value) >= _MANY else 3 if abs(value) >= _FEW or not value else 4
         return f"{value:.{digits}f}"
     return str(value)
+
+
+def markdown(listing: Listing) -> str:
+    """The table in Markdown, with its title and caption."""
+    keys, cells = _printed(listing)
+    lines = [list(keys)]
+    lines.append([":--" if i == 0 else "--:" for i in range(len(keys))])
+    lines += [[f"**{text}**" if bold else text for text, bold in row] for row in cells]
+    body = "\n".join(
+        f"| {' | '.join(t.replace('|', chr(92) + '|') for t in line)} |" for line in lines
+    )
+    parts = [f"**{listing.title}**", body, listing.caption]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def latex(listing: Listing, label: str) -> str:
+    """The table as a LaTeX float with rules of booktabs.
+
+    Parameters
+    ----------
+    listing
+        The table.
+    label
+        Follows ``tab:`` in its label.
+    """
+    keys, cells = _printed(listing)
+    groups, names = zip(*(key.rpartition(": ")[::2] for key in keys), strict=True)
+    lines = []
+    if any(groups):
+        spans = [(group, len(list(same))) for group, same in itertools.groupby(groups)]
+        ends = list(itertools.accumulate(n for _, n in spans))
+        heads = (f"\\multicolumn{{{n}}}{{c}}{{{_escaped(group)}}}" for group, n in spans)
+        rules = (
+            f"\\cmidrule(lr){{{end - n + 1}-{end}}}"
+            for (group, n), end in zip(spans, ends, strict=True)
+            if group
+        )
+        lines += [" & ".join(heads) + r" \\", " ".join(rules)]
+    lines += [" & ".join(map(_escaped, names)) + r" \\", r"\midrule"]
+    for row in cells:
+        texts = [rf"\textbf{{{_escaped(text)}}}" if bold else _escaped(text) for text, bold in row]
+        lines.append(" & ".join(texts) + r" \\")
+    return "\n".join(
+        [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{_escaped(listing.title)}. {_escaped(listing.caption)}}}".replace(
+                ". }", "}"
+            ),
+            rf"\label{{tab:{label}}}",
+            rf"\begin{{tabular}}{{l{'r' * (len(keys) - 1)}}}",
+            r"\toprule",
+            *lines,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+def _printed(listing: Listing) -> tuple[list[str], list[list[tuple[str, bool]]]]:
+    """Keys that are printed, and for each row its texts and whether they are set in bold."""
+    rows = listing.rows
+    keys = [key for key in (rows[0] if rows else {}) if not key.startswith("_")]
+    numbers = np.array([[_number(row[key]) for key in keys] for row in rows], np.float64)
+    numbers[[bool(row.get("_in_hindsight")) for row in rows]] = np.nan
+    bold = np.zeros(numbers.shape, bool)
+    if listing.least == "row":
+        groups = [key.rpartition(": ")[0] for key in keys]
+        for group in dict.fromkeys(groups):
+            columns = [i for i, of in enumerate(groups) if of == group]
+            bold[:, columns] = _least(numbers[:, columns], axis=1)
+    else:
+        columns = [i for i, key in enumerate(keys) if key in listing.least]
+        bold[:, columns] = _least(numbers[:, columns], axis=0)
+    texts = [[cell_text(row[key]) for key in keys] for row in rows]
+    return keys, [list(zip(*pair, strict=True)) for pair in zip(texts, bold.tolist(), strict=True)]
+
+
+def _least(numbers: NDArray[np.float64], axis: int) -> NDArray[np.bool_]:
+    """Which numbers are the least along an axis, where there is a choice; NaN is none."""
+    known = np.isfinite(numbers)
+    least = np.where(known, numbers, np.inf).min(axis=axis, keepdims=True, initial=np.inf)
+    return np.asarray(known & (numbers == least) & (known.sum(axis=axis, keepdims=True) > 1))
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, float) else np.nan
+
+
+_SPECIAL = str.maketrans(
+    {c: rf"\{c}" for c in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+)
+
+
+def _escaped(text: str) -> str:
+    return text.translate(_SPECIAL).replace("`", "")
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -72,3 +190,26 @@ def write_rows(folder: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> No
     ]
     write_text(folder / f"{name}.csv", csv_text(finite))
     write_text(folder / f"{name}.json", json.dumps(finite, indent=2) + "\n")
+
+
+def write_tables(
+    folder: Path, name: str, listings: Sequence[Listing], words: Sequence[str] = ()
+) -> None:
+    """Write sentences and tables as ``tables.md``, and the tables as ``tables.tex``.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    name
+        What they are about; it begins the labels of the LaTeX tables.
+    listings
+        The tables.
+    words
+        Sentences that stand before them.
+    """
+    text = "\n".join([f"# {name}\n", *(f"- {said}" for said in words), ""])
+    write_text(folder / "tables.md", "\n".join([text, *map(markdown, listings)]))
+    stem = re.sub(r"[^A-Za-z0-9]+", "-", name)
+    floats = [latex(one, f"{stem}-{i + 1}") for i, one in enumerate(listings)]
+    write_text(folder / "tables.tex", "\n".join(["% Needs \\usepackage{booktabs}.", *floats]))

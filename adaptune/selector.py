@@ -65,6 +65,8 @@ class Selector:
     dwell
         Seconds for which a set stays at least, unless it does worse than predicted. The weights of
         a bank do not wait.
+    measures
+        Whether `measure` measures anything; if not, only the training counts.
 
     Attributes
     ----------
@@ -90,6 +92,7 @@ class Selector:
         switch_cost: float = 0.0,
         descriptors: Collection[str] = (),
         dwell: float = 0.0,
+        measures: bool = True,
     ):
         model.check_descriptors(descriptors)
         if members is None:
@@ -98,6 +101,7 @@ class Selector:
         self.fixed = self.members[0] if self.members else model.fixed
         self._model = model
         self._dwell = dwell * 1e9
+        self._measures = measures
         self._pca = model.pca()
         weighs = bool(self.members) and rule == "paired"
         fitted = (
@@ -196,7 +200,8 @@ class Selector:
         It takes some tens of milliseconds. Nothing depends on when it is called after `select`,
         and without it only the training counts.
         """
-        self._live.measure()
+        if self._measures:
+            self._live.measure()
 
     def fall_back(self) -> Selection:
         """What to apply where nothing can be chosen: the fixed set, of a bank with all weight."""

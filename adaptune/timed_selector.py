@@ -6,10 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from adaptune.live.untrained import UntrainedSelector
 from adaptune.odometry.base import Motions
 from adaptune.selection import Selection
-from adaptune.selector import Selector
 from adaptune.sequence.scan import Scan
 
 BACK = 10**9
@@ -30,6 +28,16 @@ class Selects(Protocol):
 
     def measure(self) -> None:
         """Measure how wrong the odometry was, for the next selections."""
+
+
+class AnySelector(Selects, Protocol):
+    """What a drive may rely on: it can begin anew, and knows what to apply where it fails."""
+
+    def reset(self) -> None:
+        """Forget all scans and selections."""
+
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen."""
 
 
 class Schedule:
@@ -69,7 +77,7 @@ class TimedSelector:
 
     Parameters
     ----------
-    selector : Selector or UntrainedSelector
+    selector : Selector, UntrainedSelector, or what has their methods
         Nothing else may use it.
     period
         Seconds between selections, by the scans' stamps.
@@ -86,7 +94,7 @@ class TimedSelector:
 
     def __init__(
         self,
-        selector: Selector | UntrainedSelector,
+        selector: AnySelector,
         period: float = 1.0,
         distance: float | None = None,
     ):

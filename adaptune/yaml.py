@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import yaml
 
@@ -124,6 +125,18 @@ class Document:
         except (ValueError, LookupError, AttributeError) as error:
             # PyYAML's constructors raise these.
             raise YamlError("a tag (!!...) does not fit its value; leave tags out") from error
+
+    @classmethod
+    def of_file(cls, path: Path) -> Self:
+        """Read a file; a YamlError that names it if it cannot be read."""
+        try:
+            return cls(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise YamlError(f"{path}: there is no such file") from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise YamlError(f"{path}: cannot be read as text ({error})") from error
+        except YamlError as error:
+            raise YamlError(f"{path}: {error}") from error
 
     def span(self, path: Sequence[str | int]) -> tuple[int, int] | None:
         """Where in the text a single value begins and ends; None if there is none."""

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,11 +11,12 @@ import typer
 
 from adaptune.commands.options import Folder, Override, StudyFile, load
 from adaptune.errors import AdaptuneError
-from adaptune.next_command import say_next, say_next_of_study, say_next_online
+from adaptune.next_command import say_next_of_study, say_next_online
 from adaptune.terminal import begin_work, console, progress, say
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
+    from online.comparison_row import ComparisonRow
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +62,9 @@ def online(
         bool,
         typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
     ] = False,
+    thorough: Annotated[
+        bool, typer.Option("--thorough", help="All modes that there are to compare with, too.")
+    ] = False,
     ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
     ros2: Annotated[
         bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")
@@ -76,20 +80,20 @@ def online(
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
 
+    With `--thorough`, it replays all modes to compare with (`online.also`): one set at a time and
+    the bank, whatever is driven, the bank without live evidence, with even weights, random sets,
+    and the untrained bank.
+
     With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
     so are scans that wait too long.
 
     With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C.
     """
-    if untrained and model is not None:
-        raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
-    if untrained and mode is not None:
-        raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
-    if wrong := [given for given in pin if "=" not in given]:
-        raise AdaptuneError(f"--pin {wrong[0]}: give a parameter and its value, KEY=VALUE")
-    override = [*override, *(f"online.pin.{given}" for given in pin)]
-    if rate is not None:
-        override = [*override, f"online.real_time.rate={rate:g}"]
+    if untrained:
+        _check_untrained(model, mode)
+    if thorough and (untrained or ros or ros2):
+        raise AdaptuneError("--thorough is for replays with a model; leave out the other option")
+    override = [*override, *_as_overrides(rate, pin, thorough=thorough)]
     loaded = load(study, override, folder)
     if ros or ros2:
         if (ros and ros2) or rate is not None:
@@ -102,6 +106,23 @@ def online(
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+
+
+def _check_untrained(model: Path | None, mode: str | None) -> None:
+    """Refuse options that contradict --untrained."""
+    if model is not None:
+        raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    if mode is not None:
+        raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
+
+
+def _as_overrides(rate: float | None, pin: Sequence[str], *, thorough: bool) -> list[str]:
+    """The options that stand for keys of the study."""
+    if wrong := [given for given in pin if "=" not in given]:
+        raise AdaptuneError(f"--pin {wrong[0]}: give a parameter and its value, KEY=VALUE")
+    given = [f"online.pin.{one}" for one in pin]
+    given += ["online.also=all"] if thorough else []
+    return given + ([] if rate is None else [f"online.real_time.rate={rate:g}"])
 
 
 @contextmanager
@@ -133,10 +154,11 @@ def _replay(
             made = run_untrained(loaded, again, show, dashboard.look)
         else:
             made = run_replays(loaded, path, again, show, dashboard.look)
+    repeats = loaded.config.online.repeats
     if untrained:
-        return made, len(sequences_without_model(loaded)) * len(WITHOUT_MODEL)
+        return made, len(sequences_without_model(loaded)) * len(WITHOUT_MODEL) * repeats
     modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
-    return made, len(loaded.config.test) * len(modes)
+    return made, len(loaded.config.test) * len(modes) * repeats
 
 
 def _drive(
@@ -196,31 +218,43 @@ def switching(
 
 
 def compare(
-    study: StudyFile,
+    studies: Annotated[
+        list[Path],
+        typer.Argument(metavar="STUDY...", help="YAML or folder of a study, or of several."),
+    ],
     override: Override = [],  # noqa: B006
     folder: Folder = None,
+    to: Annotated[
+        Path | None,
+        typer.Option(help="Of several studies, where their tables go.", file_okay=False),
+    ] = None,
 ) -> None:
-    """Compare the replays: a table, CSV, JSON, and a picture for every sequence replayed.
+    """Compare the replays: what adapting gained, in words, tables and pictures.
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
-    1, adapting is better. *estimated* is the error that a bank measured itself. Intervals come from
-    a block bootstrap over time: they hold for these recordings, not for other places. Where an
-    estimated reference judged, they include its own error.
+    1, adapting is better. Intervals come from a paired block bootstrap. With six test sequences or
+    more, they speak of other sequences like these, else of these alone. Where an estimated
+    reference judged, they include its own error.
+
+    The study's folder receives CSV, JSON, Markdown, LaTeX, and a picture of every sequence. With
+    several studies, their errors also stand side by side.
     """
-    loaded = load(study, override, folder)
+    if len(studies) == 1:
+        if to is not None:
+            raise AdaptuneError("--to is for several studies; one has its tables in its folder")
+        _compare_one(studies[0], override, folder)
+        return
+    if folder is not None:
+        raise AdaptuneError("--folder is for one study; several have their own under runs/")
+    _compare_several(studies, override, to)
+
+
+def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
     from adaptune.study.driven import MIN_RECORDINGS
     from offline.budget import TRIALS, more_trials
-    from online.comparison import compare as compare_replays
-    from online.comparison import tables
-    from online.remarks import remarks
 
-    loaded.check()
-    begin_work()
-    rows = compare_replays(loaded)
-    for table in tables(rows, loaded.config.sub_trajectory):
-        console.print(table)
-    for said in remarks(rows):
-        say(said)
+    loaded = load(study, override, folder)
+    rows = _compared(loaded)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
     if rows[0].yardstick == "baseline":
         say_next_of_study("look for better sets", "offline", study, override, folder)
@@ -235,5 +269,45 @@ def compare(
         why = "find out what adapting gains elsewhere"
         say_next_of_study(why, "offline", study, override, folder, first)
     else:
-        why = "what it has learned; docs/adapting-live.md brings it to the robot"
-        say_next(why, "model", "show", loaded.model_path)
+        say_next_of_study("all of it as a page to look at", "report", study, override, folder)
+
+
+def _compared(loaded: "OfflineStudy") -> list["ComparisonRow"]:
+    """Compare a study's replays, and print words and tables."""
+    from adaptune import report
+    from online.comparison import compare as compare_replays
+    from online.comparison_tables import tables
+
+    loaded.check()
+    begin_work()
+    rows, words = compare_replays(loaded)
+    for said in words:
+        say(said)
+    for made in tables(rows, loaded.config.sub_trajectory):
+        console.print(report.table(made.title, made.rows, made.caption))
+    return rows
+
+
+def _compare_several(studies: list[Path], override: list[str], to: Path | None) -> None:
+    from adaptune import report
+    from online.comparison_tables import side_by_side
+
+    loaded = [load(study, override, None) for study in studies]
+    if len({one.name for one in loaded}) < len(loaded):
+        raise AdaptuneError("two of the studies have the same name; rename one of the files")
+    if len(lengths := {one.config.sub_trajectory for one in loaded}) > 1:
+        found = " and ".join(f"{length:g}" for length in sorted(lengths))
+        raise AdaptuneError(
+            f"sub_trajectory: the studies have errors over {found} m, which cannot be compared"
+        )
+    rows: dict[str, list[ComparisonRow]] = {}
+    for one in loaded:
+        console.rule(one.name)
+        rows[one.name] = _compared(one)
+    console.rule("side by side")
+    made = side_by_side(rows)
+    for listing in made:
+        console.print(report.table(listing.title, listing.rows, listing.caption))
+    folder = to or loaded[0].folder.with_name("+".join(rows))
+    report.write_tables(folder, " and ".join(rows), made)
+    say(f"Tables: {folder}/")

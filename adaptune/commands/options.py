@@ -5,11 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from adaptune.errors import AdaptuneError
+
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
 
 StudyFile = Annotated[
-    Path, typer.Argument(metavar="STUDY", help="The study's YAML.", show_default=False)
+    Path,
+    typer.Argument(metavar="STUDY", help="The study's YAML, or its folder.", show_default=False),
 ]
 
 
@@ -42,7 +45,11 @@ Folder = Annotated[
 
 
 def load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStudy":
-    """Load the study of a YAML file."""
+    """Load the study of a YAML file, or of the folder of a study that has begun."""
     from offline.offline_study import load_study
 
+    if path.is_dir():
+        if not (path / "study.yaml").exists():
+            raise AdaptuneError(f"{path}: is no study's folder: there is no study.yaml in it")
+        path, folder = path / "study.yaml", folder or path
     return load_study(path, overrides, folder)

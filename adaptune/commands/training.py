@@ -11,6 +11,15 @@ from adaptune.errors import AdaptuneError
 from adaptune.next_command import say_next_of_study, say_next_of_trained, say_next_online
 from adaptune.terminal import begin_work, console, errors, progress, say
 
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run the trials on a Dask cluster, as tcp://scheduler:8786.",
+        show_default="processes of this machine",
+    ),
+]
+
 
 def simulate(
     study: StudyFile,
@@ -48,14 +57,7 @@ def offline(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Run the trials on a Dask cluster, as tcp://scheduler:8786.",
-            show_default="processes of this machine",
-        ),
-    ] = None,
+    cluster: Cluster = None,
     again: Annotated[bool, typer.Option("--again", help="Renew what has changed.")] = False,
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
@@ -91,6 +93,36 @@ def offline(
     say(driven(loaded, model).words)
     say(f"Error model: {loaded.model_path}")
     say_next_of_trained(bool(model.expected), loaded.config.test, study, override, folder)
+
+
+def oracle(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    sets: Annotated[int, typer.Option(help="Number of sets to run.", min=2)] = 16,
+    cluster: Cluster = None,
+) -> None:
+    """Run sets of the model on the test sequences, to know the best choice in hindsight.
+
+    Runs them as trials, which restart at the reference after a lost track, and keeps them apart:
+    nothing is learned from them. The sets are the fixed one, the members of the bank, and those
+    that complement each other best in training.
+    """
+    loaded = load(study, override, folder)
+    from adaptune import report
+    from offline.oracle import run_oracle
+
+    with progress() as show:
+        rows = run_oracle(loaded, sets, show, cluster)
+    console.print(
+        report.table(
+            f"RTE [%] over {loaded.config.sub_trajectory:g} m on test sequences, as trials",
+            rows,
+            "The best set is known only in hindsight: no rule can rely on it.",
+        )
+    )
+    say(f"Trials: {loaded.folder / 'oracle'}/")
+    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
 
 
 def trials(

@@ -89,10 +89,6 @@ class Command(WholeRun):
     def called(self) -> str:
         return str(self.settings.command[0])
 
-    def words(self, folder: Path) -> str:
-        with (folder / "output").open("rb") as written:
-            return hosting.last_lines(written)
-
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         here = folder / "run"
         here.mkdir()
@@ -130,6 +126,8 @@ class Command(WholeRun):
                 ended = in_time = program.wait(self._limits.seconds * n)
                 if ended is None:
                     ended = program.end()
+        with log.open("rb") as written:
+            self._words = hosting.last_lines(written)
         if ended is not None:
             self._usage = Usage(ended.cpu, ended.memory, (time.perf_counter() - begin) / n)
         if in_time is None:

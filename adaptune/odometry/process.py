@@ -57,11 +57,38 @@ class ProcessSettings(BaseSettings):
         return self
 
 
-class Process(Isolated):
-    """An odometry in a program of the user.
+class UserProgram(Isolated):
+    """An odometry in a program of the user, wherever that runs.
 
     Each instance has its own program or connection. It keeps that from start to start, and needs a
     new one only after a fault.
+    """
+
+    _fresh = False
+
+    @classmethod
+    def instance(
+        cls,
+        parameters: ParameterSet,
+        settings: Any,
+        limits: Limits,
+        read: object = None,  # noqa: ARG003
+    ) -> Self:
+        """Make an instance, as all programs of the user are made; it reads no recording."""
+        make: Any = cls
+        made: Self = make(parameters, settings, limits)
+        return made
+
+    def _receive(self) -> wire.Message | None:
+        """Wait for the answer; only the first may take longer than a scan."""
+        answer = super()._receive()
+        if self._stream is not None:
+            self._stream.limit(self._limits.seconds)
+        return answer
+
+
+class Process(UserProgram):
+    """An odometry in a program of the user on this machine.
 
     Parameters
     ----------
@@ -72,7 +99,6 @@ class Process(Isolated):
     """
 
     settings_type = ProcessSettings
-    _fresh = False
 
     def __init__(self, parameters: ParameterSet, settings: ProcessSettings, limits: Limits):
         name = settings.command[0] if settings.command else str(settings.address)
@@ -87,17 +113,6 @@ class Process(Isolated):
     def describe(settings: ProcessSettings) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json())
-
-    @classmethod
-    def instance(
-        cls,
-        parameters: ParameterSet,
-        settings: Any,
-        limits: Limits,
-        read: object = None,  # noqa: ARG003
-    ) -> Self:
-        """Make an instance, as all programs of the user are made; it reads no recording."""
-        return cls(parameters, settings, limits)
 
     def close(self) -> None:
         super().close()
@@ -139,12 +154,6 @@ class Process(Isolated):
             )
         return here
 
-    def _receive(self) -> wire.Message | None:
-        answer = super()._receive()
-        if self._socket is not None:
-            self._socket.settimeout(self._limits.seconds)
-        return answer
-
     def _verdict(self, what: str) -> str:
         """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._program is None:
@@ -156,9 +165,13 @@ class Process(Isolated):
 
 @cache
 def _describe(settings: str) -> Description:
-    program = Process({}, ProcessSettings.model_validate_json(settings), Limits())
-    program._stream = program._connect()
+    return announced_by(Process({}, ProcessSettings.model_validate_json(settings), Limits()))
+
+
+def announced_by(program: UserProgram) -> Description:
+    """What a program reports about itself; it is ended then."""
     try:
+        program._stream = program._connect()
         answer = program._ask(wire.hello(**program._hello, parameters={}))
         if answer is None:
             raise OdometryError(program.faults[-1])

@@ -67,6 +67,7 @@ class WholeRun(OdometryInstance):
     """
 
     faults: Sequence[str] = ()
+    _words = ""  # the last lines that the program wrote
 
     def __init__(
         self,
@@ -105,12 +106,8 @@ class WholeRun(OdometryInstance):
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         """Run the program, in an empty folder that is removed afterwards.
 
-        Sets `_usage`. A `TrajectoryError` or an `OdometryError` is a fault.
+        Sets `_usage` and `_words`. A `TrajectoryError` or an `OdometryError` is a fault.
         """
-
-    @abstractmethod
-    def words(self, folder: Path) -> str:
-        """The last lines that the program wrote."""
 
     def prepare(self, scan: Scan) -> NDArray[np.int64]:
         return np.array(scan.stamp, np.int64)  # nothing else is needed
@@ -162,22 +159,21 @@ class WholeRun(OdometryInstance):
                 raise
             except (TrajectoryError, OdometryError, LinkError) as error:
                 failure = str(error)
-            words = self.words(folder)
         if failure is not None:
-            self._fault(failure, words)
+            self._fault(failure)
         try:
             check_frame(T_own_sensor, given.T_ref_sensor)
         except OdometryError as error:
-            raise OdometryError(self._message(str(error), words)) from error
+            what = f"{self.called}, with {self.parameters}: {error}"
+            raise OdometryError(self._quoting(what)) from error
         return T_own_sensor
 
-    def _message(self, what: str, words: str) -> str:
-        """What went wrong, with which program, and the last lines that it wrote."""
-        message = f"{self.called}, with {self.parameters}: {what}"
-        return f"{message}: {words}" if words else message
+    def _quoting(self, what: str) -> str:
+        """What happened, and the last lines that the program wrote, if any."""
+        return f"{what}: {self._words}" if self._words else what
 
-    def _fault(self, what: str, words: str) -> None:
-        what = f"{what}: {words}" if words else what
+    def _fault(self, what: str) -> None:
+        what = self._quoting(what)
         self.faults = [*self.faults, what]
         _log.warning("%s with %s: %s", self.called, self.parameters, what)
 

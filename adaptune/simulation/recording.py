@@ -13,12 +13,20 @@ from rosbags.rosbag2 import StoragePlugin
 from adaptune import geometry
 from adaptune.drawing import as_png_and_svg
 from adaptune.files import replacing, replacing_folder
-from adaptune.sequence.export import Message, Messages, structured, write_kitti_times
+from adaptune.sequence.export import (
+    T_CAMERA_LIDAR,
+    Message,
+    Messages,
+    structured,
+    write_kitti_poses,
+    write_kitti_sequence,
+)
+from adaptune.sequence.scan import Scan
 from adaptune.simulation.course import Course, SimulationError
 from adaptune.simulation.inertial import Inertial, measure
 from adaptune.simulation.rig import IMU, POINTS, POSES
 from adaptune.simulation.simulate import Drive, SimulatedScan
-from adaptune.trajectory import Trajectory, write_kitti, write_tum
+from adaptune.trajectory import Trajectory, write_tum
 
 if TYPE_CHECKING:
     from adaptune.simulation.preview import Preview
@@ -194,25 +202,23 @@ def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> Non
         file.replace(path)
 
 
-_TR = np.array(
-    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
-"""``T_camera_lidar``: KITTI's poses are those of a camera which looks ahead, z forward."""
-
-
 def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> None:
-    """Write sequence 00: its clouds are undistorted to the scan's start, as KITTI's are."""
-    sequence = folder / "sequences" / "00"
-    (sequence / "velodyne").mkdir(parents=True)
-    T_world_lidar = []
-    for number, scan in enumerate(scans):
-        T_world_lidar.append(scan.T_world_sensor)
-        cloud = np.column_stack([undistort(drive, scan), scan.intensities / np.float32(255.0)])
-        (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.astype("<f4").tobytes())
-    T = np.array(T_world_lidar)
-    write_kitti(folder / "poses" / "00.txt", _TR @ geometry.invert(T[0]) @ T @ geometry.invert(_TR))
-    seconds = drive.seconds(drive.stamps()[:-1])
-    write_kitti_times(sequence, seconds, _TR)
+    """Write sequence 00."""
+    T_world_lidar: list[geometry.Poses] = []
+
+    def seen() -> Iterator[Scan]:
+        for scan in scans:
+            T_world_lidar.append(scan.T_world_sensor)
+            yield standing(drive, scan)
+
+    write_kitti_sequence(seen(), folder, T_camera_lidar=T_CAMERA_LIDAR)
+    write_kitti_poses(np.array(T_world_lidar), folder, T_camera_lidar=T_CAMERA_LIDAR)
+
+
+def standing(drive: Drive, scan: SimulatedScan) -> Scan:
+    """A scan as KITTI has it: undistorted to the scan's start, intensities from 0 to 1."""
+    light = scan.intensities / np.float32(255.0)
+    return Scan(scan.stamp, undistort(drive, scan), intensities=light)
 
 
 def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -207,9 +207,15 @@ class RosConfig(StrictModel):
     router: str = "127.0.0.1:7447"
 
 
+Also = Literal["one_set", "bank", "bank_learned", "even", "random", "untrained"]
+ALSO: tuple[Also, ...] = get_args(Also)
+"""Modes that are replayed only on demand, to compare with."""
+
+
 class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, switching, and what it may cost.
 
+    `also` names modes that are replayed besides, or `all`. Each mode is replayed `repeats` times.
     A set stays for `dwell` seconds at least. Parameters of `pin` have these values in all sets.
     The budget is in milliseconds of CPU time a scan, all members and live evidence together.
     Without `real_time`, a replay is as fast as it goes and always the same.
@@ -219,10 +225,24 @@ class OnlineConfig(StrictModel):
     dwell: float = Field(0.0, ge=0, le=3600)
     pin: dict[str, Value] = Field(default_factory=dict)
     rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
+    also: tuple[Also, ...] = ()
+    repeats: int = Field(1, ge=1, le=20)
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
+
+    @field_validator("also", mode="before")
+    @classmethod
+    def _all(cls, also: Any) -> Any:
+        return ALSO if also == "all" else also
+
+    @field_validator("also")
+    @classmethod
+    def _once(cls, also: tuple[Also, ...]) -> tuple[Also, ...]:
+        if len(set(also)) < len(also):
+            raise ValueError("a mode is named twice")
+        return also
 
 
 class StudyConfig(StrictModel):

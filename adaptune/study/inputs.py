@@ -147,10 +147,11 @@ def _refusal(study: Study, found: Sequence[Stale]) -> ConfigurationError:
     ]
     results += ["the model"] if study.model_path.exists() else []
     everything = any(one.odometry for one in found)
+    kept = study.folder / "replays"
     replays = [
         path
-        for path in study.folder.glob("replays/*/*/replay.json")
-        if everything or path.parent.name != "baseline"
+        for path in kept.rglob("replay.json")
+        if everything or path.relative_to(kept).parts[1] != "baseline"
     ]
     results += [f"{len(replays)} replays"] if replays else []
     return ConfigurationError(

@@ -91,13 +91,11 @@ def _read(path: Path) -> yaml.Document:
     try:
         if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
             raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
-        document = yaml.Document(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigurationError(f"{path}: there is no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
+        document = yaml.Document.of_file(path)
+    except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read as text ({error})") from error
     except yaml.YamlError as error:
-        raise ConfigurationError(f"{path}: {error}") from error
+        raise ConfigurationError(str(error)) from error
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
     return document

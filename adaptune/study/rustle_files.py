@@ -210,13 +210,9 @@ def read(path: Path) -> RustleFile:
         If it cannot be read, or is no YAML with keys.
     """
     try:
-        document = yaml.Document(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise RustleError(f"{path}: there is no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RustleError(f"{path}: cannot be read as text ({error})") from error
+        document = yaml.Document.of_file(path)
     except yaml.YamlError as error:
-        raise RustleError(f"{path}: {error}") from error
+        raise RustleError(str(error)) from error
     if not isinstance(document.data, dict):
         raise RustleError(f"{path}: this is no file of RUSTLE, which has keys and values")
     return RustleFile(path, document)

@@ -38,6 +38,17 @@ def needs_ros1() -> None:
         lacking("ros1", "there is no roscore: make services")
 
 
+def needs_browser() -> str:
+    """Skip where there is no Chromium, or nothing to drive it; otherwise its path."""
+    if importlib.util.find_spec("playwright") is None:
+        lacking("browser", "playwright is not installed: pip install 'adaptune[dev]'")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        lacking("browser", "there is no chromium: make services")
+        raise AssertionError
+    return chromium
+
+
 @cache
 def image_builder() -> Any:
     """The module docker/build.py."""

@@ -48,7 +48,6 @@ class DockerCommand(WholeRun):
     """
 
     settings_type = DockerCommandSettings
-    _words = ""
 
     @staticmethod
     def describe(settings: DockerCommandSettings) -> Description:  # noqa: ARG004
@@ -64,9 +63,6 @@ class DockerCommand(WholeRun):
     @property
     def called(self) -> str:
         return str(self.settings.image)
-
-    def words(self, folder: Path) -> str:  # noqa: ARG002
-        return self._words
 
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         shared = make_shared(folder / "shared")

@@ -6,11 +6,12 @@ import tempfile
 import time
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from pydantic import Field
 
 from adaptune import hosting
+from adaptune.files import temporary_prefix
 from adaptune.odometry import wire
 from adaptune.odometry.base import Description, OdometryError
 from adaptune.odometry.docker.engine import (
@@ -20,8 +21,9 @@ from adaptune.odometry.docker.engine import (
     default_user,
     image_digest,
 )
-from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.odometry.process import FIRST_ANSWER
+from adaptune.odometry.docker.shared_folder import remove_shared
+from adaptune.odometry.isolation import Limits
+from adaptune.odometry.process import FIRST_ANSWER, UserProgram, announced_by
 from adaptune.odometry.template import replace
 from adaptune.space import ParameterSet
 
@@ -46,7 +48,7 @@ class DockerProcessSettings(ContainerSettings):
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
-class DockerProcess(Isolated):
+class DockerProcess(UserProgram):
     """An odometry in a container, which it keeps from start to start; a new one after a fault.
 
     Parameters
@@ -58,30 +60,18 @@ class DockerProcess(Isolated):
     """
 
     settings_type = DockerProcessSettings
-    _fresh = False
 
     def __init__(self, parameters: ParameterSet, settings: DockerProcessSettings, limits: Limits):
         super().__init__(settings.image, parameters, settings, limits)
         self._hello = {"odometry": None, "settings": settings.settings}
         self._settings = settings
         self._container: Container | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: Path | None = None
 
     @staticmethod
     def describe(settings: DockerProcessSettings) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json(), image_digest(settings.image))
-
-    @classmethod
-    def instance(
-        cls,
-        parameters: ParameterSet,
-        settings: Any,
-        limits: Limits,
-        read: object = None,  # noqa: ARG003
-    ) -> Self:
-        """Make an instance, as all programs of the user are made; it reads no recording."""
-        return cls(parameters, settings, limits)
 
     def close(self) -> None:
         super().close()
@@ -89,12 +79,11 @@ class DockerProcess(Isolated):
             self._container.close()
             self._container = None
         if self._folder is not None:
-            self._folder.cleanup()
+            remove_shared(self._folder, self.name, default_user(self._settings))
             self._folder = None
 
     def _connect(self) -> wire.SocketStream:
-        self._folder = tempfile.TemporaryDirectory(prefix="adaptune-", ignore_cleanup_errors=True)
-        folder = Path(self._folder.name)
+        self._folder = folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
         folder.chmod(0o777)  # for any user of the image
         inside = f"{_FOLDER}/odometry.sock"
         self._container = Container(
@@ -128,12 +117,6 @@ class DockerProcess(Isolated):
         what = f"{self.name}: {what}"
         raise OdometryError(f"{what}: {words}" if words else what)
 
-    def _receive(self) -> wire.Message | None:
-        answer = super()._receive()
-        if self._stream is not None:
-            self._stream.limit(self._limits.seconds)
-        return answer
-
     def _verdict(self, what: str) -> str:
         """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._container is None:
@@ -158,12 +141,6 @@ class DockerProcess(Isolated):
 
 @cache
 def _describe(settings: str, digest: str) -> Description:  # noqa: ARG001 - another image, another
-    program = DockerProcess({}, DockerProcessSettings.model_validate_json(settings), Limits())
-    try:
-        program._stream = program._connect()
-        answer = program._ask(wire.hello(**program._hello, parameters={}))
-        if answer is None:
-            raise OdometryError(program.faults[-1])
-        return wire.announced(answer)
-    finally:
-        program.close()
+    return announced_by(
+        DockerProcess({}, DockerProcessSettings.model_validate_json(settings), Limits())
+    )

@@ -228,7 +228,7 @@ class Container:
 
     Raises
     ------
-    EngineError
+    OdometryError
         If it cannot be started.
     """
 

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from adaptune.odometry.docker.trial_log import costs, kept_log
 from adaptune.odometry.program_input import ProgramInput
 from adaptune.odometry.whole_run import WholeRun
 from adaptune.ros.ros1 import Ros1
-from adaptune.sequence.pose_messages import PATH, POSES, usable
+from adaptune.sequence.pose_messages import PATH, POSES, Pose, usable
 from adaptune.trajectory import Trajectory
 
 _BETWEEN_LOOKS = 0.1
@@ -41,7 +40,7 @@ class PoseRecorder:
     def __init__(self, link: Ros1, topic: str):
         self.topic, self.store = topic, link.store
         self.received: list[tuple[str, bytes]] = []
-        self.last = self._begin = time.monotonic()
+        self.last = time.monotonic()
         self.longest_pause = 0.0
         link.record(topic, self._take)
 
@@ -54,7 +53,7 @@ class PoseRecorder:
             self.received.clear()
         self.received.append((kind, data))
 
-    def poses(self) -> list[Any]:
+    def poses(self) -> list[Pose]:
         """Poses in the order in which they came, see `adaptune.sequence.pose_messages`.
 
         Raises
@@ -67,11 +66,16 @@ class PoseRecorder:
             raise OdometryError(
                 f"{self.topic} is {kind}; odometry.settings.odometry must name poses"
             )
-        return [
-            pose
-            for kind, data in messages
-            for pose in POSES[kind](self.store.deserialize_ros1(data, kind))
-        ]
+        return [pose for kind, data in messages for pose in self._poses(kind, data)]
+
+    def newest(self) -> int:
+        """Stamp of the pose that came last; 0 if there is none."""
+        if not self.received or self.received[-1][0] not in POSES:
+            return 0
+        return max((stamp for stamp, *_ in self._poses(*self.received[-1])[-1:]), default=0)
+
+    def _poses(self, kind: str, data: bytes) -> list[Pose]:
+        return POSES[kind](self.store.deserialize_ros1(data, kind))
 
     def write(self, path: Path) -> None:
         """Write a ROS 1 bag."""
@@ -94,14 +98,9 @@ def write_poses(
 class PlayedBag(WholeRun):
     """A ROS 1 system that hears a bag, from its beginning to its end."""
 
-    _words = ""
-
     @property
     def called(self) -> str:
         return str(self.settings.image)
-
-    def words(self, folder: Path) -> str:  # noqa: ARG002
-        return self._words
 
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         self._seconds: dict[str, float] = {}
@@ -177,9 +176,8 @@ class PlayedBag(WholeRun):
 
     def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
         """Whether the pose of the last scan is there, or nothing came for a while."""
-        newest = max((stamp for stamp, *_ in _last_pose(recorder)), default=0)
         # Stamps of a clock of its own say nothing.
-        if last <= newest < last + 10**9:
+        if last <= recorder.newest() < last + 10**9:
             return True
         pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
         return bool(time.monotonic() - max(recorder.last, over) > pause)
@@ -305,15 +303,6 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> float:
     off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
     steady = np.abs(off - np.median(off)) < max(5e6, 0.1 * period)
     return 0.0 if steady.mean() > _STEADY else 1e-9 * float(np.percentile(off, 95))
-
-
-def _last_pose(recorder: PoseRecorder) -> list[Any]:
-    if not recorder.received:
-        return []
-    kind, data = recorder.received[-1]
-    if kind not in POSES:
-        return []
-    return POSES[kind](recorder.store.deserialize_ros1(data, kind))[-1:]
 
 
 def _end_of(bag: Path) -> int:

@@ -27,7 +27,7 @@ class Spots:
     d: Floats
 
 
-class Line(Protocol):
+class RoadLine(Protocol):
     """The line along which a scene is built: the part of `Road` that scenes use."""
 
     def heading(self, s: Floats) -> Floats:
@@ -44,7 +44,7 @@ class Line(Protocol):
 class Tile:
     """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    line: Line  # the road
+    line: RoadLine  # the road
     index: int  # its number along the road: it begins at station ``index * TILE``
     # Stations of its ends, in metres; a leg may begin or end within it.
     start: float
@@ -79,8 +79,9 @@ class Tile:
         the road's middle, and `margin` is kept free at the ends where another scene begins.
         """
         start = self.start + margin * self.opens
-        stop = self.stop - margin * self.closes
-        n = int(self.rng.poisson(density * max(stop - start, 0.0) * 2.0 * (far - near)))
+        # The last tile of a leg may be shorter than the margin.
+        stop = max(self.stop - margin * self.closes, start)
+        n = int(self.rng.poisson(density * (stop - start) * 2.0 * (far - near)))
         s = self.rng.uniform(start, stop, n)
         d = self.rng.uniform(near, far, n) * self.rng.choice([-1.0, 1.0], n)
         return s, d

@@ -302,7 +302,7 @@ def test_the_whole_way(make):
     training = train(study)
     assert training.model.sets.space.names == ("registration.voxel", "distance")
     assert run_replays(study, study.folder / "model.safetensors") == 2
-    assert {row.mode for row in compare(study)} == {"baseline", "fixed"}
+    assert {row.mode for row in compare(study).rows} == {"baseline", "fixed"}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")
     with pytest.raises(ConfigurationError, match=r"file\.json has other content .* 2 replays\."):

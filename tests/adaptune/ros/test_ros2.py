@@ -302,26 +302,21 @@ def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path)
     other = Ros2(robot, 0)
 
     def play():
-        first, *others = (of_ros_2(local_link.cloud(stamp, xyz)) for stamp, xyz, _ in scans)
-        while not poses:  # whoever comes late sees the first scan, and once
-            cloud(first)
-            time.sleep(0.05)
-        for message in others:
-            cloud(message)
+        end = time.monotonic() + 30.0
+        for n, (stamp, xyz, _) in enumerate(scans, 1):
+            message = of_ros_2(local_link.cloud(stamp, xyz))
+            # A message may be lost on a busy machine. One that comes again is ignored.
+            while len(poses) < n and time.monotonic() < end:
+                cloud(message)
+                time.sleep(0.05)
+        drive.stop()
 
     playing = threading.Thread(target=play, daemon=True)
     playing.start()
 
-    def look(_what, _total, at):
-        if at.done == len(scans):
-            drive.stop()
-
-    found = drive.run(other, look)
+    found = drive.run(other)
     playing.join(10.0)
-    end = time.monotonic() + 10.0
-    while len(poses) < len(scans):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    assert len(poses) == len(scans)
     other.close()
     trajectory = read_tum(found.folder / "trajectory.tum")
     moved = [one.pose.pose.position.x for one in poses]

@@ -22,3 +22,9 @@ def test_odometry_survives(scene):
         T_world_sensor.append(scan.T_world_sensor)
     errors = sub_trajectory_rte(np.array(T_world_sensor), np.array(poses), 25.0)
     assert np.nanmean(errors) < 4.0
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_last_tile_of_a_scene_may_be_short(scene):
+    scan = next(simulate(Course(scenes=(scene, "cave"), length=22.0, columns=16)))
+    assert len(scan) > 100

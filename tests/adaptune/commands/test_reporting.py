@@ -1,0 +1,72 @@
+import json
+import shutil
+
+import pytest
+from commands import call
+
+from offline.offline_study import load_study
+from online.run_replays import run_replays
+
+
+@pytest.fixture(scope="module")
+def finished(study_file, trained_folder, tmp_path_factory):
+    """The folder of a study that was trained and replayed."""
+    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("run") / "study")
+    run_replays(load_study(study_file, [], folder), folder / "model.safetensors")
+    return folder
+
+
+@pytest.mark.slow
+def test_a_finished_study_has_a_page_of_everything(finished):
+    ended = call("report", finished)
+    assert ended.exit_code == 0
+    page = (finished / "report/report.html").read_text()
+    for title in ("What adapting gained", "Along three", "What was tried", "Settings"):
+        assert f"{title}</h2>" in page
+    # The first words are those of the comparison.
+    said = ended.output.splitlines()[0]
+    assert "`paired`" in said
+    assert "Not in it: No validation: run `adaptune validate`." in ended.output
+    figures = {path.stem for path in (finished / "report/figures").glob("*.svg")}
+    assert {"comparison", "three-errors"} <= figures
+    assert figures == {path.stem for path in (finished / "report/figures").glob("*.png")}
+    rows = json.loads((finished / "comparison/comparison.json").read_text())
+    assert {row["mode"] for row in rows} == {"baseline", "fixed", "paired", "paper"}
+
+
+@pytest.mark.slow
+def test_a_study_that_is_not_finished_has_one_too_that_says_what_is_missing(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "half")
+    shutil.rmtree(folder / "replays/three/fixed")
+    (folder / "model.safetensors").unlink()
+    ended = call("report", folder)
+    assert ended.exit_code == 0
+    assert "There is no error model yet: `adaptune offline` has not finished." in ended.output
+    assert "Not in it: No comparison: " in ended.output
+    assert "What was tried</h2>" in (folder / "report/report.html").read_text()
+
+
+def test_a_study_that_has_not_begun_has_nothing_to_report(study_file, tmp_path):
+    ended = call("report", study_file, "--folder", tmp_path / "none")
+    assert ended.exit_code == 2
+    words = " ".join(ended.output.split())
+    assert "there is nothing yet; run `adaptune offline" in words
+    assert "Traceback" not in ended.output
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
+    other = shutil.copytree(finished, tmp_path / "other")
+    ended = call("compare", finished, other, "--to", tmp_path / "both")
+    assert ended.exit_code == 0
+    text = (tmp_path / "both/tables.md").read_text()
+    assert "study: fixed" in text
+    assert "other: fixed" in text
+    assert (tmp_path / "both/tables.tex").exists()
+    ended = call("compare", finished, other, "--folder", tmp_path)
+    assert ended.exit_code == 2
+    ended = call("compare", finished, other, "-o", "sub_trajectory=2")
+    assert ended.exit_code == 2
+    ended = call("compare", tmp_path)
+    assert "is no study's folder" in ended.output

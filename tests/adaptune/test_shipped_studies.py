@@ -1,0 +1,31 @@
+"""The shipped studies of simulated courses: complete, and alike where they say so."""
+
+from pathlib import Path
+
+import pytest
+from needs import needs_evalio
+
+from offline.offline_study import load_study
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+THIRD_PARTY = sorted(path.stem for path in CONFIGS.glob("third_party_*.yaml"))
+
+
+def test_studies_of_third_party_odometries_differ_in_their_odometry_only() -> None:
+    texts = [(CONFIGS / f"{name}.yaml").read_text(encoding="utf-8") for name in THIRD_PARTY]
+    rests = {text[text.index("courses:") :] for text in texts}
+    assert len(THIRD_PARTY) == 4
+    assert len(rests) == 1
+
+
+@pytest.mark.parametrize("name", THIRD_PARTY)
+def test_studies_of_third_party_odometries_load(name: str, tmp_path: Path) -> None:
+    if name != "third_party_kiss_icp":
+        needs_evalio()
+    study = load_study(CONFIGS / f"{name}.yaml", folder=tmp_path)
+    assert name == f"third_party_{study.odometry.name}"
+    assert f"configs/{name}.yaml" in (CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")
+    tuned = study.config.odometry.parameters  # type: ignore[union-attr]
+    assert set(tuned or {}) <= set(study.odometry.space.parameters)
+    assert set(study.config.online.also) == {"bank", "one_set"}
+    assert study.odometry.description.live == (name == "third_party_kiss_icp")

@@ -1,0 +1,49 @@
+"""Replays that are made up, as charts need them."""
+
+import numpy as np
+
+from adaptune.charts.chart import Spans
+from online.replay_picture import Track
+from online.replayed_sequence import ModeReplay, ReplayedSequence
+
+SECONDS = np.arange(0.0, 20.0, 0.1)
+XY = np.column_stack([SECONDS, np.sin(SECONDS)])
+SCENES = Spans([0.0, 8.0, 20.0], ("cave", "open"))
+
+
+def replay(**changed):
+    """A replay of 20 s that changes its parameters twice; `changed` is of its track."""
+    track = Track(
+        seconds=SECONDS,
+        xy=XY,
+        errors=np.where(SECONDS < 15.0, 0.7 + 0.1 * np.sin(SECONDS), np.nan),
+        errors_behind=np.full(len(SECONDS), np.nan),
+        restarted=np.zeros(len(SECONDS), bool),
+        choice_seconds=np.array([0.0, 8.0, 9.0]),
+        choices={"distance": [0.7, 0.9, 0.9], "kernel": ["none", "none", "huber"]},
+        weights={},
+        estimated=np.full((3, 3), np.nan),
+        lost=np.zeros(3, bool),
+    )
+    track = track._replace(**changed)
+    m, n = len(track.choice_seconds), len(SECONDS)
+    ms = np.linspace(1.0, 9.0, n)
+    return ModeReplay(track, XY, np.full(m, np.nan), np.full(m, 5.0), ms, np.empty(0))
+
+
+def kept():
+    """A replay that keeps its parameters."""
+    fixed = {"distance": [0.7], "kernel": ["none"]}
+    one = {"choice_seconds": np.zeros(1), "choices": fixed, "lost": np.zeros(1, bool)}
+    return replay(**one, estimated=np.full((1, 3), np.nan))
+
+
+def bank(**changed):
+    """A replay of a bank."""
+    weights = {"4": [0.5, 0.2, 0.6], "17": [0.3, 0.7, 0.1], "2": [0.2, 0.1, 0.3]}
+    return replay(weights=weights, **changed)
+
+
+def sequence(**modes):
+    """The replays of a sequence by mode."""
+    return ReplayedSequence("new", 10.0, modes, SCENES, ["distance"])

@@ -1,0 +1,193 @@
+"""A page and charts with every kind of item, for tests."""
+
+import numpy as np
+
+from adaptune.charts.chart import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shares,
+    Spans,
+)
+from adaptune.charts.page import Page, PageSection
+from adaptune.report import Listing
+
+TIME = Axis("time [s]")
+RTE = Axis("RTE over the next 20 m [%]", log=True)
+
+
+def over_time() -> Chart:
+    """Lines of modes, bands, spans, shares and marks below each other, with a gap."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 240.0, 6000)
+    error = np.exp(np.cumsum(rng.normal(size=len(t))) / 40.0)
+    gap = np.where((t > 60.0) & (t < 70.0), np.nan, error)
+    scenes = Spans((0, 40, 90, 100, 180, 240), ("room", "corridor", "", "open square", "room"))
+    lines = (
+        scenes,
+        Line(t, 1.3 * error, "baseline"),
+        Line(t, error, "fixed"),
+        Line(t, gap * 0.8, "paired"),
+        Line(t, np.full(len(t), 0.5), "limit", dashed=True),
+        Mark(0.7, "goal"),
+        Mark(120.0, "door opens", "x"),
+    )
+    k = np.arange(0.0, 241.0, 20.0)
+    estimate = (
+        scenes,
+        Band(k, 0.5 + 0 * k, 1.5 + np.sin(k / 30.0), "95 % interval"),
+        Line(k, 1.0 + 0.4 * np.sin(k / 30.0), "estimated"),
+        Line(t, error, "fixed", faint=True),
+    )
+    weights = rng.dirichlet(np.ones(3), len(k)).T
+    members = Shares(k, weights, ("trial 3", "trial 17", "trial 242"))
+    steps = Line(k, rng.uniform(0.1, 1.0, len(k)), "paired", steps=True)
+    return Chart(
+        "over-time",
+        "Errors and selections over time",
+        (
+            Panel(TIME, RTE, lines, "error of the replays", height=1.6),
+            Panel(TIME, Axis("RTE, last 30 s [%]"), estimate, "its error as estimated on the way"),
+            Panel(TIME, Axis("voxel size [m]"), (steps,)),
+            Panel(TIME, Axis("weight [-]", limits=(0.0, 1.0)), (members,), "members of the bank"),
+        ),
+        "The course passes five scenes. The paired mode lost its reference for ten seconds.",
+        shared_x=True,
+    )
+
+
+def trials(n: int = 2000) -> Chart:
+    """Scatters of trials, with colours, and one with names."""
+    rng = np.random.default_rng(1)
+    cost, error = rng.lognormal(2.0, 0.5, n), rng.lognormal(0.0, 0.7, n)
+    size = np.where(rng.random(n) < 0.1, np.nan, rng.lognormal(-1.0, 1.0, n))
+    texts = [f"trial {i}: voxel_size {size[i]:.3g}" for i in range(n)]
+    points = Points(cost, error, "trials", size, "voxel size [m]", log_colour=True, texts=texts)
+    front = Line([3.0, 6.0, 20.0], [0.9, 0.3, 0.1], "Pareto front", steps=True)
+    kinds = Axis("registration", names=("point to point", "point to plane", "GICP"))
+    return Chart(
+        "trials",
+        "Trials: error over cost, and over the kind of registration",
+        (
+            Panel(Axis("time for a scan [ms]", log=True), RTE, (points, front), "all trials"),
+            Panel(
+                kinds,
+                RTE,
+                (
+                    Points([kinds.names[i % 3] for i in range(60)], error[:60], "trials"),
+                    Points([0, 1, 2], [1.0, 0.5, 0.2], "one set"),
+                    Points([0, 1, 2], [0.8, 0.4, 0.3], "fixed"),
+                ),
+                "by registration",
+            ),
+        ),
+        "Each point is a trial. Grey ones have no voxel size.",
+        columns=2,
+    )
+
+
+def comparison() -> Chart:
+    """Bars, upright and flat, with intervals."""
+    names = ("campus, morning", "campus, evening", "tunnel <b>north</b>", "forest_$x_1$")
+    x, values = np.arange(4.0), np.array([1.0, 2.0, 0.7, np.nan])
+    pairs = (
+        Bars(x - 0.2, values, "fixed", values - 0.2, values + 0.3, 0.4),
+        Bars(x + 0.2, [0.8, 1.1, 0.9, 0.4], "kiss & tell", width=0.4),
+    )
+    flat = Bars(
+        ["voxel_size", "max_range", "iterations"], [1.4, 0.8, 1.05], "ratio", base=1.0, flat=True
+    )
+    return Chart(
+        "comparison",
+        "Errors by sequence",
+        (
+            Panel(Axis("sequence", names=names), Axis("mean RTE [%]"), pairs),
+            Panel(
+                Axis("error over the fixed set's [-]"),
+                Axis("parameter", names=("voxel_size", "max_range", "iterations")),
+                (flat, Mark(1.0, "as good", "x")),
+            ),
+        ),
+        columns=2,
+    )
+
+
+def from_above() -> Chart:
+    """Trajectories on axes of equal scale."""
+    a = np.linspace(0.0, 2.0 * np.pi, 5000)
+    x, y = 40.0 * np.cos(a), 15.0 * np.sin(2.0 * a)
+    drawn = (
+        *(
+            Line(x + d, y - d, mode)
+            for mode, d in (("baseline", 2.0), ("fixed", 1.0), ("paired", 0.3))
+        ),
+        Points(x[::200], y[::200], "reference", marker="o"),
+        Points([40.0], [0.0], "start", marker="P"),
+    )
+    panel = Panel(Axis("x [m]"), Axis("y [m]"), drawn, equal=True)
+    return Chart("from-above", "Trajectories from above", (panel,))
+
+
+def empty() -> Chart:
+    """Nothing in it."""
+    drawn = (
+        Line([], [], "fixed"),
+        Points([1.0], [np.nan], "trials", [np.nan], "size [m]", log_colour=True),
+        Bars([], [], "bars"),
+        Band([], [], [], "band"),
+        Shares([], np.zeros((2, 0)), ("a", "b")),
+        Mark(1.0, "goal"),
+    )
+    panel = Panel(Axis("x [-]", log=True), Axis("y [-]", log=True), drawn)
+    return Chart("empty", "Nothing was measured", (panel,))
+
+
+def samples() -> tuple[Chart, ...]:
+    """One of each."""
+    return over_time(), trials(), comparison(), from_above(), empty()
+
+
+def sample_page() -> Page:
+    """A page of all samples, with tables, one of them wide, and names that look like HTML."""
+    rows = [
+        {
+            "sequence": f"drive_{i}" + "_with_a_long_name" * (i == 3),
+            "mode": ("fixed", "paired", "<script>alert(1)</script>")[i % 3],
+            "mean_RTE": (2.5, 10.25, None, 0.0042, float("nan"), 9.0)[i % 6],
+            "scans": 1000 - 7 * i,
+            **{f"parameter_{k}": 0.1 * k for k in range(6)},
+            "remark": "It lost its way in the tunnel, and found it again at the far end."
+            * (i == 1),
+            "_file": "only",
+        }
+        for i in range(12)
+    ]
+    return Page(
+        "Adaptive tuning of KISS-ICP & friends </title><script>alert(2)</script>",
+        "study tunnel.yaml, 12 drives, 2000 trials",
+        (
+            "The paired mode has the smallest error: 0.42 %, where the fixed set has 0.61 %.",
+            "It needs 3 % more time for a scan.",
+            "On the two drives through the forest, it is not better than the fixed set.",
+        ),
+        (
+            PageSection(
+                "Results",
+                ("Errors are means over the sub-trajectories of a drive.",),
+                charts=(comparison(), over_time()),
+                tables=(Listing("Errors by drive", rows, "Only drives with a reference."),),
+            ),
+            PageSection("Trials", charts=(trials(), from_above())),
+            PageSection(
+                "What is missing",
+                missing=("drive_7 has no reference.", "The replays of drive_9 were not run."),
+                charts=(empty(),),
+                tables=(Listing("Costs", []),),
+            ),
+        ),
+    )
