@@ -1,19 +1,30 @@
 """What tuning and adapting give on recorded data, trained on some recordings, tested on others.
 
     python benchmarks/recorded.py FOLDER [--odometries gicp ndt kiss_icp] [--sets 16] [--seed 0]
-                                         [--directions town campus_1 ...]
+                                         [--directions town campus_1 ...] [--no-reference]
+                                         [--also one_set even ...]
 
 ADAPTUNE_TEST_DATA names the folder of the recordings. Each direction and odometry is a study in
 FOLDER: a Sobol sequence of so many sets, one after the other on one core. The same command resumes.
 A row is a test sequence: the mean error of each mode in percent, its ratio to the fixed set's, and
 95 % intervals of the ratios. *untrained* is a bank that knows nothing of the study.
 
+With --no-reference, training knows no poses: it goes by references that are estimated from the
+scans. Errors are still those by the given references. street has none: an estimated one judges it.
+--also names modes on demand to replay, too (docs/validate-and-compare.md).
+
 References of town, road and city are a car's GPS and inertial unit: right to about 1 % over 25 m.
-Differences below that are no evidence there.
+Differences below that are no evidence there. hall and campus have other sensors: from one to the
+other, adapting can only be expected to do no harm.
+
+FOLDER receives recorded.csv and recorded.json: a row for every study, test sequence and mode that
+is there, also of former runs.
 """
 
 import argparse
+import json
 import os
+import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -22,17 +33,23 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import cores, yaml
+from adaptune import cores, report, yaml
 from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
+from adaptune.sequence.config import ESTIMATED
+from adaptune.sequence.part import part_name, read_part
+from adaptune.study.config import ALSO
 from offline.offline_study import OfflineStudy, load_study
 from offline.train import train
+from online.comparison_row import ComparisonRow
 from online.run_replays import run_replays, run_untrained
-from online.statistics import ComparisonRow, Reference, compare_modes
+from online.statistics import Reference, compare_modes
 from online.stored_replays import StoredReplay
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
 MODES = ("baseline", "fixed", "paired", "untrained")
-TOPICS = {"points": "/velodyne_points", "reference": "/gt_poses"}
+"""What is compared besides the modes on demand."""
+CARS = ("town", "road", "city", "street")
 # An HDL-64E turns on while the car drives: a scan is distorted by up to two metres. KISS-ICP
 # compensates by itself.
 COMPENSATING = ("kiss_icp",)
@@ -52,67 +69,119 @@ class Direction:
 DIRECTIONS = {
     "town": Direction(("town",), ("city", "road"), 25.0),
     "city_road": Direction(("city", "road"), ("town",), 25.0),
+    "town_city": Direction(("town", "city"), ("road",), 25.0),
+    "town_road": Direction(("town", "road"), ("city",), 25.0),
+    "cars": Direction(("town", "city", "road"), ("street",), 25.0),
     "campus_1": Direction(("campus: 0-50%",), ("campus: 50-100%",), 25.0),
     "campus_2": Direction(("campus: 50-100%",), ("campus: 0-50%",), 25.0),
     "hall_1": Direction(("hall: 0-50%",), ("hall: 50-100%",), 5.0),
     "hall_2": Direction(("hall: 50-100%",), ("hall: 0-50%",), 5.0),
+    "hall": Direction(("hall",), ("campus",), 10.0),
+    "campus": Direction(("campus",), ("hall",), 10.0),
 }
-"""The studies of each odometry; each recording is tuned on once and tested on once."""
+"""The studies of each odometry: recording to recording, the cars' also with one left out, the
+halves of one, and from one sensor to another."""
 
 
-def definition(direction: Direction, odometry: str, n_sets: int, seed: int) -> dict[str, object]:
-    """The study of a direction, as the data of its YAML."""
-    roles = (*direction.training, *direction.test)
-    recordings = dict.fromkeys(role.partition(":")[0] for role in roles)
+def definition(
+    direction: Direction,
+    odometry: str,
+    n_sets: int,
+    seed: int,
+    no_reference: bool = False,
+    also: Sequence[str] = (),
+) -> dict[str, object]:
+    """The study of a direction, as the data of its YAML.
+
+    With `no_reference` it trains on estimated references; those of the test sequences stay. `also`
+    are modes on demand.
+    """
+    training = [sequence(role, odometry, no_reference) for role in direction.training]
+    test = [sequence(role, odometry) for role in direction.test]
     given: dict[str, object] = {
         "odometry": {"name": odometry},
-        "sequences": {name: recording(name, odometry) for name in recordings},
-        "training": [role_of(role) for role in direction.training],
-        "test": [role_of(role) for role in direction.test],
+        "sequences": dict([*training, *test]),
+        "training": [name for name, _ in training],
+        "test": [name for name, _ in test],
         "sub_trajectory": direction.sub_trajectory,
         "offline": {"sampler": "sobol", "trials": n_sets, "seed": seed, "workers": 1},
         # All modes but `paper`, with a bank, though the benchmark is bound to one core.
-        "online": {"rules": ["paired"], "switching": {"mechanism": "bank"}},
+        "online": {
+            "rules": ["paired"],
+            "switching": {"mechanism": "bank"},
+            "also": list(also),
+        },
     }
-    return given | CAMPUS if "campus" in recordings else given
+    with_campus = any("campus" in role for role in (*direction.training, *direction.test))
+    return given | CAMPUS if with_campus else given
 
 
-def recording(name: str, odometry: str) -> dict[str, object]:
-    """The entry of a recording in a study."""
-    entry: dict[str, object] = {"bag": f"${{ADAPTUNE_TEST_DATA}}/{name}.bag", **TOPICS}
-    if name in ("town", "city", "road") and odometry not in COMPENSATING:
+def sequence(role: str, odometry: str, estimated: bool = False) -> tuple[str, dict[str, object]]:
+    """Name and entry of a recording, or a part of it, in a study."""
+    name, _, part = role.partition(": ")
+    entry: dict[str, object] = {"bag": f"${{ADAPTUNE_TEST_DATA}}/{name}.bag"}
+    entry |= {"points": "/velodyne_points"}
+    # Without poses, a reference is estimated anyway.
+    if name != "street":
+        entry["reference"] = ESTIMATED if estimated else "/gt_poses"
+    if name in CARS and odometry not in COMPENSATING:
         entry["compensate"] = "constant_velocity"
-    if name == "campus":
+    if name == "campus" and not estimated:
         entry["max_gap"] = 60.0
-    return entry
+    if part:
+        return part_name(name, read_part(part)), entry | {"part": part}
+    return name, entry
 
 
-def role_of(text: str) -> str | dict[str, str]:
-    """A sequence by its name, or a part of it as a study's YAML has it."""
-    name, _, part = text.partition(": ")
-    return {name: part} if part else name
+def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
+    """Train, replay in all modes and compare, as far as that was not done before.
 
-
-def run(study: OfflineStudy) -> list[ComparisonRow]:
-    """Train, replay in all modes and compare, as far as that was not done before."""
+    `references` is a folder of estimated references that the studies share.
+    """
+    own = study.folder / "references"
+    if references.exists():
+        shutil.copytree(references, own, dirs_exist_ok=True)
     train(study)
     run_replays(study, study.model_path)
     run_untrained(study)
+    if own.exists():
+        shutil.copytree(own, references, dirs_exist_ok=True)
     rows: list[ComparisonRow] = []
     for name in study.config.test:
         folder = study.folder / "replays" / name
-        replays = {mode: StoredReplay.read(folder / mode) for mode in MODES}
-        reference = Reference.read(folder, study.config.sub_trajectory)
-        rows += compare_modes(name, replays, reference)
+        # What `paired` does already is not replayed again.
+        also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
+        replays = {mode: [StoredReplay.read(folder / mode)] for mode in (*MODES, *also)}
+        reference = Reference.read(
+            folder, study.config.sub_trajectory, study.sequences.estimate(name)
+        )
+        rows += compare_modes(name, replays, reference).rows
     return rows
+
+
+def keep(folder: Path, about: Mapping[str, object], rows: Sequence[ComparisonRow]) -> None:
+    """Keep the rows of a study, with what it is about, for `collect`."""
+    listed = [{**about, **row.columns()} for row in rows]
+    write_text(folder / "rows.json", json.dumps(listed) + "\n")
+
+
+def collect(folder: Path) -> None:
+    """Write the rows of all studies below a folder as ``recorded.csv`` and ``.json``."""
+    found = sorted(folder.glob("*/rows.json"))
+    rows = [row for path in found for row in json.loads(path.read_text(encoding="utf-8"))]
+    keys = dict.fromkeys(key for row in rows for key in row)
+    report.write_rows(folder, "recorded", [{key: row.get(key) for key in keys} for row in rows])
 
 
 def table_lines(rows: Sequence[ComparisonRow]) -> list[str]:
     """A line for every test sequence: errors and ratios of all modes."""
     lines = []
     for name in dict.fromkeys(row.sequence for row in rows):
+        of = [row for row in rows if row.sequence == name]
         cells = [f"  {name:14}"]
-        for row in (row for row in rows if row.sequence == name):
+        if of[0].reference == ESTIMATED:
+            cells.append("by an estimated reference")
+        for row in of:
             if row.rte is None or row.ratio is None:
                 cells.append(f"{row.mode} unknown")
                 continue
@@ -144,31 +213,47 @@ def main() -> None:
     parser.add_argument("--directions", nargs="+", default=list(DIRECTIONS), choices=DIRECTIONS)
     parser.add_argument("--sets", type=int, default=16)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--no-reference", action="store_true")
+    parser.add_argument("--also", nargs="+", default=(), choices=sorted({*ALSO} - {*MODES}))
     given = parser.parse_args()
     if "ADAPTUNE_TEST_DATA" not in os.environ:
         sys.exit("ADAPTUNE_TEST_DATA does not name the folder of the recordings")
     cores.pin(os.getpid())
     given.folder.mkdir(parents=True, exist_ok=True)
     for odometry in given.odometries:
-        ratios: dict[str, list[float]] = {mode: [] for mode in MODES}
+        ratios: dict[str, list[float]] = {mode: [] for mode in (*MODES, *given.also)}
         for name in given.directions:
-            stem = f"{odometry}-{name}-{given.sets}-{given.seed}"
-            path = given.folder / f"{stem}.yaml"
-            path.write_text(
-                yaml.dump(definition(DIRECTIONS[name], odometry, given.sets, given.seed))
-            )
-            begin = time.perf_counter()
-            try:
-                rows = run(load_study(path, folder=given.folder / stem))
-            except AdaptuneError as error:
-                print(f"{odometry}, {name}: not possible: {error}", flush=True)
-                continue
-            print(f"{odometry}, tuned on {name}: {time.perf_counter() - begin:.0f} s")
-            print(*table_lines(rows), sep="\n", flush=True)
-            for row in rows:
+            for row in directed(given, odometry, name):
                 if row.ratio is not None:
                     ratios[row.mode].append(row.ratio)
         print(f"{odometry}, ratios to the fixed set:", *summary(ratios), sep="\n", flush=True)
+    collect(given.folder)
+
+
+def directed(given: argparse.Namespace, odometry: str, name: str) -> list[ComparisonRow]:
+    """Run the study of a direction, print and keep what it gave; no rows if it is not possible."""
+    about = {"odometry": odometry, "tuned_on": name, "sets": given.sets, "seed": given.seed}
+    stem = "-".join(map(str, about.values())) + ("-no_reference" if given.no_reference else "")
+    path, folder = given.folder / f"{stem}.yaml", given.folder / stem
+    defined = definition(
+        DIRECTIONS[name],
+        odometry,
+        given.sets,
+        given.seed,
+        no_reference=given.no_reference,
+        also=given.also,
+    )
+    write_text(path, yaml.dump(defined))
+    begin = time.perf_counter()
+    try:
+        rows = run(load_study(path, folder=folder), given.folder / "references")
+    except AdaptuneError as error:
+        print(f"{odometry}, {name}: not possible: {error}", flush=True)
+        return []
+    print(f"{odometry}, tuned on {name}: {time.perf_counter() - begin:.0f} s")
+    print(*table_lines(rows), sep="\n", flush=True)
+    keep(folder, about | {"trained_by": ESTIMATED if given.no_reference else "given"}, rows)
+    return rows
 
 
 if __name__ == "__main__":
