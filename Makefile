@@ -12,7 +12,7 @@ help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests"
 	@echo "make quick   run linters and the fast tests, in about a minute"
-	@echo "make services  install what pip cannot bring: ROS 1 and Docker (Debian 12)"
+	@echo "make services  install what pip cannot bring: ROS 1, Docker, Chromium (Debian 12)"
 	@echo "make reference-image  build the image of a ROS 1 odometry that tests run"
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
@@ -42,7 +42,7 @@ pytest: $(VENV)/.installed
 services:
 	$(SUDO) apt-get update
 	DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install --yes --no-install-recommends \
-		ros-core python3-rospy python3-dynamic-reconfigure debootstrap \
+		ros-core python3-rospy python3-dynamic-reconfigure debootstrap chromium \
 		$(if $(shell command -v dockerd),,docker.io)
 	$(SUDO) docker info >/dev/null 2>&1 || $(SUDO) service docker start \
 		|| $(SUDO) sh -c 'setsid dockerd >/var/log/docker.log 2>&1 </dev/null &'
