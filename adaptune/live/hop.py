@@ -92,6 +92,10 @@ class HopCloud:
         self._motion = T_previous_current, seconds
         self._cloud: Any = None
 
+    def moved(self, T_current_next: Poses, seconds: float) -> None:
+        """Learn the motion to the next scan; it counts if the scan was not needed before."""
+        self._motion = T_current_next, seconds
+
     @property
     def prepared(self) -> Any:
         """Cloud with covariances, and its tree; None if there are too few points."""

@@ -139,6 +139,9 @@ class LiveEvidence:
             way = invert(last.T_odom_sensor[0]) @ self._T_odom_sensor[0]
             self._metres = last.metres + float(np.linalg.norm(way[:3, 3]))
         seconds = 0.0 if self._newest is None else (before - self._newest.stamp) * 1e-9
+        if self._newest is not None and finite[0]:
+            # This, not the motion before it, is how the sensor moved while it took the last scan.
+            self._newest.cloud.moved(T[0], seconds)
         self._newest = _Anchor(
             before,
             self._metres,

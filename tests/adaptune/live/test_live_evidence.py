@@ -27,11 +27,22 @@ def exact(start, end, guesses):  # noqa: ARG001 - as `register`
     return Hop(moved(STEP * (end.number - start.number)), np.eye(3))
 
 
+def smeared(i):
+    """A scan of a sensor that moves on while it takes it, also the first one."""
+    points = scan(i).points
+    times = np.linspace(0.0, 0.1, len(points), dtype=np.float32)
+    behind = np.outer(times / 0.1 * STEP, [1.0, 0.0, 0.0]).astype(np.float32)
+    return Scan(i * 10**8, points - behind, times=times)
+
+
 class Numbered:
     """In place of a cloud."""
 
     def __init__(self, scan, T_previous_current, seconds):  # noqa: ARG002 - as `HopCloud`
         self.number = scan.stamp // 10**8
+
+    def moved(self, T_current_next, seconds):
+        pass
 
 
 @pytest.fixture
@@ -78,6 +89,15 @@ def test_the_weights_leave_a_member_that_drifts():
     assert first > 0.6
     assert live.own_error().mean < 0.3
     assert not live.lost
+
+
+def test_the_first_scan_is_compensated_by_the_motion_after_it():
+    live = LiveEvidence()
+    for i in range(12):
+        live.observe(i * 10**8, smeared(i), Motions(moved(STEP if i > 1 else 0.0), {}))
+    found = live.measure()
+    assert (found.start, found.end) == (0, 10**9)
+    np.testing.assert_allclose(found.hop.T_start_end, moved(10.0 * STEP), atol=0.05)
 
 
 def test_a_member_in_front_is_left_too(exactly):  # noqa: ARG001
