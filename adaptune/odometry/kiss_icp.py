@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import MIN_POINTS, Odometry, RangeSettings, Registration
+from adaptune.odometry.scan_time import END, MIDDLE, AtStamp, duration_of
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 
@@ -20,6 +21,8 @@ from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 class KissScan(NamedTuple):
     """Points, their times as shares of the turn, and whether enough are in range."""
 
+    stamp: int
+    duration: int  # nanoseconds, see `duration_of`
     points: NDArray[np.float64]
     times: NDArray[np.float64]
     usable: bool
@@ -29,7 +32,8 @@ class Kiss(Odometry):
     """KISS-ICP (Vizzo et al., RA-L 2023).
 
     A change of parameters between scans rebuilds the parts that use them, and the new local map
-    keeps the points of the old one. With `deskew`, poses belong to the scans' ends.
+    keeps the points of the old one. With `deskew`, its poses belong to the scans' ends; they are
+    carried back to the stamps.
     """
 
     space = ParameterSpace.of(
@@ -88,21 +92,36 @@ class Kiss(Odometry):
             first, last = float(scan.times.min()), float(scan.times.max())
             if last > first:
                 times = (scan.times.astype(np.float64) - first) / (last - first)
-        return KissScan(points, times, n_in_range >= MIN_POINTS)
+        usable = n_in_range >= MIN_POINTS
+        return KissScan(scan.stamp, duration_of(scan), points, times, usable)
 
     def start(
         self, prepared: KissScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        self._kiss = KissICP(self._config())
-        self._kiss.last_delta = np.eye(4) if T_previous_current is None else T_previous_current
+        self._kiss = kiss = KissICP(self._config())
+        kiss.last_delta = np.eye(4) if T_previous_current is None else T_previous_current
+        self._at_stamp = AtStamp(END if self.settings.deskew else MIDDLE)
+        self._T_odom_sensor = T_odom_sensor
+        taken = prepared.stamp, prepared.duration
+        T_odom_then = self._at_stamp.begin(*taken, T_odom_sensor, kiss.last_delta)
         # The first scan is registered to an empty map, which leaves it where it is predicted.
-        self._kiss.last_pose = T_odom_sensor @ np.linalg.inv(self._kiss.last_delta)
-        self.register(prepared)
+        kiss.last_pose = T_odom_then @ np.linalg.inv(kiss.last_delta)
+        self._advance(prepared)
 
     def register(self, prepared: KissScan) -> Registration:
         kiss = self._kiss
+        if not self._advance(prepared):
+            self._T_odom_sensor = self._T_odom_sensor @ kiss.last_delta
+            return Registration(self._T_odom_sensor, registered=False)
+        taken = prepared.stamp, prepared.duration
+        self._T_odom_sensor = self._at_stamp(*taken, kiss.last_pose)
+        return Registration(self._T_odom_sensor)
+
+    def _advance(self, prepared: KissScan) -> bool:
+        """Go on to the next pose; False if the scan has too few points to be registered."""
+        kiss = self._kiss
         if not prepared.usable:
             kiss.last_pose = kiss.last_pose @ kiss.last_delta
-            return Registration(kiss.last_pose, registered=False)
+            return False
         kiss.register_frame(prepared.points, prepared.times)
-        return Registration(kiss.last_pose)
+        return True

@@ -7,6 +7,7 @@ import numpy as np
 
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.odometry.base import Odometry, Registration
+from adaptune.odometry.scan_time import START, AtStamp
 
 NO_IMU = "{} needs an IMU, and the scans do not bring along what one measured"
 
@@ -15,8 +16,12 @@ class OwnFrameOdometry(Odometry):
     """An odometry that can begin only at rest, in its own frame, and with a usable scan.
 
     The first pose that it returns places its frame. Where it returns none, the last motion goes
-    on. What `prepare` returns is `usable` or not.
+    on. What `prepare` returns is `usable` or not, and has the scan's `stamp` and `duration` in
+    nanoseconds. Poses that belong to a later moment of a scan are carried back to its stamp.
     """
+
+    _share = START
+    """Of a scan's duration, after which its pose belongs; it may be set until `_begin` returns."""
 
     @abstractmethod
     def _begin(self, prepared: Any) -> None:
@@ -49,11 +54,17 @@ class OwnFrameOdometry(Odometry):
             if not prepared.usable:
                 return False
             self._begin(prepared)
+            self._at_stamp = AtStamp(self._share)
             self._begun = True
         T_own_sensor = self._process(prepared)
         if T_own_sensor is None:
             return False
+        taken = prepared.stamp, prepared.duration
         if self._T_odom_own is None:
-            self._T_odom_own = self._T_odom_sensor @ invert(T_own_sensor)
-        self._T_odom_sensor = self._T_odom_own @ T_own_sensor
+            T_odom_then = self._at_stamp.begin(
+                *taken, self._T_odom_sensor, self._T_previous_current
+            )
+            self._T_odom_own = T_odom_then @ invert(T_own_sensor)
+            return True
+        self._T_odom_sensor = self._at_stamp(*taken, self._T_odom_own @ T_own_sensor)
         return True

@@ -21,6 +21,7 @@ from adaptune.odometry.base import (
     import_extra,
 )
 from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
+from adaptune.odometry.scan_time import END
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
@@ -52,6 +53,16 @@ class RkoLioScan(NamedTuple):
     imu: Imu
 
     @property
+    def stamp(self) -> int:
+        """The scan's stamp, as late as the others are."""
+        return self.begin
+
+    @property
+    def duration(self) -> int:
+        """Nanoseconds from the first point to the last."""
+        return self.end - self.begin
+
+    @property
     def nbytes(self) -> int:
         """Memory, in bytes; a whole number takes 32 and its place in the list 8."""
         return 256 + self.points.nbytes + 40 * len(self.stamps) + self.imu.nbytes
@@ -70,9 +81,10 @@ class RkoLio(OwnFrameOdometry):
     """RKO-LIO (Malladi et al., RA-L 2026).
 
     It reads its parameters when it begins, and begins at rest. It assumes that its first frame is
-    level: the adapter turns that frame so that the mean of the first accelerations points up. Its
-    pose belongs to a scan's end.
+    level: the adapter turns that frame so that the mean of the first accelerations points up.
     """
+
+    _share = END
 
     space = ParameterSpace.of(
         voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True),
@@ -109,7 +121,7 @@ class RkoLio(OwnFrameOdometry):
             setattr(config, name, float(value))
         config.min_range, config.max_range = self.settings.min_range, self.settings.max_range
         config.double_downsample = self.settings.double_downsample
-        config.deskew = self.settings.deskew and prepared.end > prepared.begin
+        config.deskew = self.settings.deskew and prepared.duration > 0
         config.max_num_threads = 1
         self._lio = bindings._LIO(config)
         T_sensor_imu = prepared.imu.T_sensor_imu

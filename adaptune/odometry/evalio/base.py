@@ -18,6 +18,7 @@ from adaptune.odometry.base import (
 from adaptune.odometry.evalio import point_layout
 from adaptune.odometry.evalio.point_layout import EvalioScan, evalio_modules, to_evalio
 from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
+from adaptune.odometry.scan_time import END, MIDDLE, duration_of
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet, Value, nearest
@@ -64,9 +65,9 @@ with contextlib.suppress(OdometryError):
 class Pipeline(OwnFrameOdometry):
     """A pipeline of evalio (Potokar and Kaess).
 
-    Pipelines read their parameters only when they begin, and begin at rest. The pose belongs to
-    the start or the end of the scan, whichever the pipeline deskews to. Pipelines with an IMU give
-    poses of the IMU, which become the LiDAR's here.
+    Pipelines read their parameters only when they begin, and begin at rest. Those that deskew do so
+    to the scan's end; their poses are carried back to its stamp. Pipelines with an IMU give poses of
+    the IMU, which become the LiDAR's here.
 
     Attributes
     ----------
@@ -119,8 +120,8 @@ class Pipeline(OwnFrameOdometry):
             raise OdometryError(NO_IMU.format(self.pipeline))
         cropped = point_layout.crop(scan, self.settings.min_range, self.settings.max_range)
         cloud, shape = self._layout(cropped)
-        timed = cropped.times is not None and bool(np.ptp(cropped.times) if len(cropped) else 0)
-        return EvalioScan(scan.stamp, cloud, shape, len(cropped) >= MIN_POINTS, timed, scan.imu)
+        usable, duration = len(cropped) >= MIN_POINTS, duration_of(cropped)
+        return EvalioScan(scan.stamp, cloud, shape, usable, duration, scan.imu)
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         """Points as `FIELDS` has them, and their numbers of rows and columns."""
@@ -131,9 +132,11 @@ class Pipeline(OwnFrameOdometry):
         self._shape = prepared.shape
         parameters = self._defaults | self.untuned | self._given
         if "deskew" in self._defaults and "deskew" not in self.settings.parameters:
-            parameters["deskew"] = self.settings.deskew and prepared.timed
+            parameters["deskew"] = self.settings.deskew and prepared.duration > 0
         # Pipelines divide by the length of the scan, and some end the process where it is 0.
         self._needs_times = bool(parameters.get("deskew"))
+        if "deskew" in parameters:
+            self._share = END if parameters["deskew"] else MIDDLE
         pipeline = pipelines.all_pipelines()[self.pipeline]()
         pipeline.set_params(parameters)
         ranges = {"min_range": self.settings.min_range, "max_range": self.settings.max_range}
@@ -151,7 +154,7 @@ class Pipeline(OwnFrameOdometry):
     def _process(self, prepared: EvalioScan) -> Poses | None:
         if self.needs_imu and prepared.imu is not None:
             self._measure(prepared.imu)
-        if not prepared.usable or (self._needs_times and not prepared.timed):
+        if not prepared.usable or (self._needs_times and not prepared.duration):
             return None
         return self._estimate(prepared)
 

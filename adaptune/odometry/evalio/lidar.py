@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from adaptune.odometry.base import OdometryError
 from adaptune.odometry.evalio.base import NO_FIELD, GridPipeline, Pipeline
+from adaptune.odometry.scan_time import MIDDLE
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 
@@ -96,9 +97,13 @@ class Loam(GridPipeline):
 
 
 class Form(GridPipeline):
-    """FORM (Potokar et al.): features, fixed-lag smoothing and sparse key scans."""
+    """FORM (Potokar et al.): features, fixed-lag smoothing and sparse key scans.
+
+    It takes scans as they are.
+    """
 
     pipeline = "form"
+    _share = MIDDLE
     untuned: ClassVar[ParameterSet] = {"num_threads": 1}
     space = ParameterSpace.of(
         max_dist_matching=Float(low=0.2, high=3.0, baseline=0.8, log=True),

@@ -89,8 +89,7 @@ class Dlio(Pipeline):
     """DLIO (Chen et al., ICRA 2023).
 
     It learns which way is down from its first measurements, and assumes small biases. Its own
-    rules of adaptation (`adaptive_params`) are off: adaptune tunes those parameters. Its pose
-    belongs to a scan's end.
+    rules of adaptation (`adaptive_params`) are off: adaptune tunes those parameters.
     """
 
     pipeline = "dlio"

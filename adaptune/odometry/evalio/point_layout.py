@@ -27,7 +27,7 @@ class EvalioScan(NamedTuple):
     cloud: NDArray[np.float32]  # of shape (n, 4) or (n, 5), see `FIELDS`; an image row by row
     shape: tuple[int, int]  # rows and columns
     usable: bool  # whether enough points are in range
-    timed: bool  # whether the points have times that differ
+    duration: int  # nanoseconds from the stamp to the last point; 0 if the times do not differ
     imu: Imu | None
 
 

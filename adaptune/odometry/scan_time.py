@@ -1,0 +1,66 @@
+"""The moment of a scan to which an odometry's pose belongs.
+
+A scan takes a while. adaptune's poses belong to its stamp, the start. An odometry that deskews gives
+the pose at the end, where its newest point was measured: while the sensor gets faster or slower,
+these are other motions. One that takes a scan as it is gives, about, the pose at its middle.
+"""
+
+import numpy as np
+
+from adaptune.geometry import Poses, invert, scale
+from adaptune.sequence.scan import Scan
+
+START, MIDDLE, END = 0.0, 0.5, 1.0
+"""Shares of a scan's duration."""
+
+
+def duration_of(scan: Scan) -> int:
+    """Nanoseconds from a scan's stamp to its last point; 0 if the points' times do not differ."""
+    if scan.times is None or not len(scan) or not np.ptp(scan.times):
+        return 0
+    return round(1e9 * float(scan.times.max()))
+
+
+class AtStamp:
+    """Carries an odometry's poses back to the stamps of scans.
+
+    Between two poses of the odometry, the velocity is taken as constant.
+
+    Parameters
+    ----------
+    share
+        Of a scan's duration, after which its pose belongs.
+    """
+
+    def __init__(self, share: float):
+        self._share = share
+        self._before: tuple[float, Poses] = 0.0, np.eye(4)
+
+    def begin(
+        self, stamp: int, duration: int, T_odom_sensor: Poses, T_previous_current: Poses
+    ) -> Poses:
+        """Begin with a scan, and return where the odometry has to believe it is.
+
+        Parameters
+        ----------
+        stamp, duration
+            Of the scan, in nanoseconds.
+        T_odom_sensor
+            Pose at the stamp.
+        T_previous_current
+            Motion from the scan before, which goes on.
+        """
+        share = self._share if duration > 0 else START
+        T_odom_then = T_odom_sensor @ scale(T_previous_current, share) if share else T_odom_sensor
+        self._before = stamp + share * duration, T_odom_then
+        return T_odom_then
+
+    def __call__(self, stamp: int, duration: int, T_odom_then: Poses) -> Poses:
+        """The pose at a scan's stamp, from the odometry's."""
+        before, T_odom_before = self._before
+        then = stamp + self._share * duration
+        self._before = then, np.array(T_odom_then)
+        if then == stamp or then <= before:
+            return T_odom_then
+        motion = scale(invert(T_odom_before) @ T_odom_then, (stamp - before) / (then - before))
+        return np.asarray(T_odom_before @ motion)
