@@ -103,7 +103,7 @@ class Kiss(Odometry):
         self._at_stamp = AtStamp(END if self.settings.deskew else MIDDLE)
         self._T_odom_sensor = T_odom_sensor
         taken = prepared.stamp, prepared.duration
-        T_odom_then = self._at_stamp.begin(*taken, T_odom_sensor, kiss.last_delta)
+        T_odom_then = self._at_stamp.begin(*taken, T_odom_sensor, T_previous_current)
         # The first scan is registered to an empty map, which leaves it where it is predicted.
         kiss.last_pose = T_odom_then @ np.linalg.inv(kiss.last_delta)
         self._advance(prepared)

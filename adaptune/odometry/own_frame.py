@@ -36,6 +36,7 @@ class OwnFrameOdometry(Odometry):
     ) -> None:
         self._T_odom_sensor = T_odom_sensor
         self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
+        self._T_known = T_previous_current
         self._T_odom_own: Poses | None = None
         self._begun = False
         self._correct(prepared)
@@ -61,9 +62,7 @@ class OwnFrameOdometry(Odometry):
             return False
         taken = prepared.stamp, prepared.duration
         if self._T_odom_own is None:
-            T_odom_then = self._at_stamp.begin(
-                *taken, self._T_odom_sensor, self._T_previous_current
-            )
+            T_odom_then = self._at_stamp.begin(*taken, self._T_odom_sensor, self._T_known)
             self._T_odom_own = T_odom_then @ invert(T_own_sensor)
             return True
         self._T_odom_sensor = self._at_stamp(*taken, self._T_odom_own @ T_own_sensor)

@@ -1,8 +1,9 @@
 """The moment of a scan to which an odometry's pose belongs.
 
-A scan takes a while. adaptune's poses belong to its stamp, the start. An odometry that deskews gives
-the pose at the end, where its newest point was measured: while the sensor gets faster or slower,
-these are other motions. One that takes a scan as it is gives, about, the pose at its middle.
+A scan takes a while. adaptune's poses belong to its stamp, the start. An odometry that deskews
+gives the pose at the end, where its newest point was measured. One that takes a scan as it is
+gives, about, the pose at its middle. While the sensor gets faster or slower, motions between those
+are not the motions between stamps.
 """
 
 import numpy as np
@@ -18,7 +19,7 @@ def duration_of(scan: Scan) -> int:
     """Nanoseconds from a scan's stamp to its last point; 0 if the points' times do not differ."""
     if scan.times is None or not len(scan) or not np.ptp(scan.times):
         return 0
-    return round(1e9 * float(scan.times.max()))
+    return scan.span
 
 
 class AtStamp:
@@ -35,9 +36,11 @@ class AtStamp:
     def __init__(self, share: float):
         self._share = share
         self._before: tuple[float, Poses] = 0.0, np.eye(4)
+        self._begun_at: int | None = None
+        self._T_odom_begun = np.eye(4)
 
     def begin(
-        self, stamp: int, duration: int, T_odom_sensor: Poses, T_previous_current: Poses
+        self, stamp: int, duration: int, T_odom_sensor: Poses, T_previous_current: Poses | None
     ) -> Poses:
         """Begin with a scan, and return where the odometry has to believe it is.
 
@@ -48,19 +51,31 @@ class AtStamp:
         T_odom_sensor
             Pose at the stamp.
         T_previous_current
-            Motion from the scan before, which goes on.
+            Motion from the scan before, which goes on. If it is None, the first motion that the
+            odometry finds is taken for that during the first scan.
         """
-        share = self._share if duration > 0 else START
-        T_odom_then = T_odom_sensor @ scale(T_previous_current, share) if share else T_odom_sensor
-        self._before = stamp + share * duration, T_odom_then
+        then, T_odom_then = stamp + self._share * duration, T_odom_sensor
+        self._T_odom_begun = np.eye(4)
+        self._begun_at = stamp if T_previous_current is None else None
+        if T_previous_current is not None and then > stamp:
+            T_odom_then = T_odom_sensor @ scale(T_previous_current, self._share)
+        self._before = then, T_odom_then
         return T_odom_then
 
     def __call__(self, stamp: int, duration: int, T_odom_then: Poses) -> Poses:
         """The pose at a scan's stamp, from the odometry's."""
         before, T_odom_before = self._before
         then = stamp + self._share * duration
-        self._before = then, np.array(T_odom_then)
+        if self._begun_at is not None:
+            if before < then:
+                moved = invert(T_odom_before) @ T_odom_then
+                missing = scale(moved, (before - self._begun_at) / (then - before))
+                self._T_odom_begun = T_odom_before @ missing @ invert(T_odom_before)
+                T_odom_before = T_odom_before @ missing
+            self._begun_at = None
+        T_odom_then = self._T_odom_begun @ T_odom_then
+        self._before = then, T_odom_then
         if then == stamp or then <= before:
             return T_odom_then
-        motion = scale(invert(T_odom_before) @ T_odom_then, (stamp - before) / (then - before))
-        return np.asarray(T_odom_before @ motion)
+        moved = invert(T_odom_before) @ T_odom_then
+        return np.asarray(T_odom_before @ scale(moved, (stamp - before) / (then - before)))

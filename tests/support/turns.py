@@ -17,8 +17,11 @@ T_SENSOR_IMU = np.array([[0.0, 1, 0, 0.3], [-1, 0, 0, -0.2], [0, 0, 1, 0.1], [0,
 
 
 @cache
-def turn(i: int, rows: int = ROWS, columns: int = COLUMNS) -> Scan:
-    """Scan `i`, distorted by the motion, with the time and the laser of every point."""
+def turn(i: int, rows: int = ROWS, columns: int = COLUMNS, gain: float = 0.0) -> Scan:
+    """Scan `i`, distorted by the motion, with the time and the laser of every point.
+
+    With a `gain` the sensor gets faster: by so many metres a scan from one to the next.
+    """
     rng = np.random.default_rng(i)
     share = np.arange(columns) / columns
     azimuth = np.pi - 2 * np.pi * (share + 0.5 / columns)
@@ -31,7 +34,7 @@ def turn(i: int, rows: int = ROWS, columns: int = COLUMNS) -> Scan:
         ),
         axis=-1,
     )
-    origin = np.broadcast_to(STEP * (i + share), (rows, columns))
+    origin = np.broadcast_to(way(i + share, gain), (rows, columns))
     distance = cast(origin, direction) + rng.normal(0.0, 0.01, (rows, columns))
     hit = distance < 60.0
     ring, _ = np.nonzero(hit)
@@ -41,6 +44,11 @@ def turn(i: int, rows: int = ROWS, columns: int = COLUMNS) -> Scan:
         np.broadcast_to(PERIOD * share, hit.shape)[hit].astype(np.float32),
         ring.astype(np.uint16),
     )
+
+
+def way(scans: NDArray[np.float64], gain: float) -> NDArray[np.float64]:
+    """Metres driven in a time, in scans."""
+    return STEP * scans + 0.5 * gain * scans**2
 
 
 def measured(i: int, rows: int = 16, columns: int = 300) -> Scan:

@@ -66,13 +66,15 @@ class Pipeline(OwnFrameOdometry):
     """A pipeline of evalio (Potokar and Kaess).
 
     Pipelines read their parameters only when they begin, and begin at rest. Those that deskew do so
-    to the scan's end; their poses are carried back to its stamp. Pipelines with an IMU give poses of
-    the IMU, which become the LiDAR's here.
+    to the scan's end; their poses are carried back to its stamp. Pipelines with an IMU give poses
+    of the IMU, which become the LiDAR's here.
 
     Attributes
     ----------
     pipeline : str
         What evalio calls it; class attribute.
+    deskews_to : float
+        Share of a scan's duration, see `adaptune.odometry.scan_time`; class attribute.
     untuned : dict
         Values that must differ from the pipeline's own defaults: one thread, no scans dropped
         when late; class attribute.
@@ -83,6 +85,7 @@ class Pipeline(OwnFrameOdometry):
     # Some end the process at unexpected scans, some share state between instances.
     clean = False
     pipeline: ClassVar[str]
+    deskews_to: ClassVar[float] = END
     untuned: ClassVar[ParameterSet] = {}
 
     def __init__(
@@ -136,7 +139,7 @@ class Pipeline(OwnFrameOdometry):
         # Pipelines divide by the length of the scan, and some end the process where it is 0.
         self._needs_times = bool(parameters.get("deskew"))
         if "deskew" in parameters:
-            self._share = END if parameters["deskew"] else MIDDLE
+            self._share = self.deskews_to if parameters["deskew"] else MIDDLE
         pipeline = pipelines.all_pipelines()[self.pipeline]()
         pipeline.set_params(parameters)
         ranges = {"min_range": self.settings.min_range, "max_range": self.settings.max_range}

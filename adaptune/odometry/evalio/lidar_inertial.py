@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from adaptune.geometry import Poses
 from adaptune.odometry.evalio.base import Pipeline, RingedPipeline
 from adaptune.odometry.evalio.point_layout import EvalioScan
+from adaptune.odometry.scan_time import MIDDLE
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
@@ -89,10 +90,12 @@ class Dlio(Pipeline):
     """DLIO (Chen et al., ICRA 2023).
 
     It learns which way is down from its first measurements, and assumes small biases. Its own
-    rules of adaptation (`adaptive_params`) are off: adaptune tunes those parameters.
+    rules of adaptation (`adaptive_params`) are off: adaptune tunes those parameters. It deskews to
+    the median time of a scan's points.
     """
 
     pipeline = "dlio"
+    deskews_to = MIDDLE
     needs_imu = True
     untuned: ClassVar[ParameterSet] = {
         "adaptive_params": False,
