@@ -1,0 +1,87 @@
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import turns
+from needs import lacking
+
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.scan_time import END, MIDDLE, START, AtStamp, duration_of
+from adaptune.sequence.scan import Scan
+
+TURN = 10**8
+
+
+def at(x):
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def carried(share, way, scans, T_previous_current=None):
+    """What comes of exact poses along x, in metres, after that share of the scans."""
+    carry = AtStamp(share)
+    first, *others = scans
+    begun = carry.begin(first * TURN, TURN, at(way(first)), T_previous_current)
+    offset = begun[0, 3] - way(first + share)
+    poses = [carry(i * TURN, TURN, at(way(i + share) + offset)) for i in others]
+    return [T[0, 3] for T in poses]
+
+
+@pytest.mark.parametrize("share", [START, MIDDLE, END])
+@pytest.mark.parametrize("known", [True, False])
+def test_at_constant_velocity_nothing_is_lost(share, known):
+    motion = at(0.3) if known else None
+    scans = (0, 1, 2, 4, 5, 9)  # some are missing
+    np.testing.assert_allclose(
+        carried(share, lambda t: 0.3 * t, scans, motion), [0.3 * i for i in scans[1:]], atol=1e-9
+    )
+
+
+def test_a_pose_at_the_end_is_that_of_the_next_stamp():
+    """Where scans follow each other without a gap, whatever the velocity."""
+    found = np.array(carried(END, lambda t: t**3, range(8), at(0.0)))
+    np.testing.assert_allclose(np.diff(found)[1:], np.diff(np.arange(1, 8) ** 3)[1:])
+
+
+def test_turns_are_carried_back_too():
+    def turned(i):
+        T = at(0.0)
+        T[:2, :2] = [[np.cos(0.1 * i), -np.sin(0.1 * i)], [np.sin(0.1 * i), np.cos(0.1 * i)]]
+        return T
+
+    carry = AtStamp(MIDDLE)
+    carry.begin(0, TURN, np.eye(4), turned(1))
+    np.testing.assert_allclose(carry(TURN, TURN, turned(1.5)), turned(1), atol=1e-9)
+
+
+def test_a_scan_without_duration_stays():
+    carry = AtStamp(END)
+    begun = carry.begin(0, 0, at(1.0), at(0.5))
+    np.testing.assert_array_equal(begun, at(1.0))
+    np.testing.assert_array_equal(carry(TURN, 0, at(1.5)), at(1.5))
+
+
+def test_how_long_a_scan_takes():
+    points = np.zeros((3, 3), np.float32)
+    times = np.array([0.0, 0.05, 0.1], np.float32)
+    assert duration_of(Scan(5, points, times=times)) == pytest.approx(TURN, abs=10)
+    # Compensated scans have one time, others none.
+    assert duration_of(Scan(5, points, times=0 * times)) == 0
+    assert duration_of(Scan(5, points)) == 0
+    assert duration_of(Scan(5, points[:0], times=times[:0])) == 0
+
+
+@pytest.mark.parametrize("name", ["kiss_icp", "genz_icp", "mad_icp", "form"])
+def test_a_motion_is_that_between_stamps_while_the_sensor_gets_faster(name):
+    if name != "kiss_icp" and find_spec("evalio") is None:
+        lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")
+    odometry, gain, n = odometry_class(name)(), 0.02, 20
+    scans = [turns.turn(i, gain=gain) for i in range(n)]
+    odometry.start(odometry.prepare(scans[0]), np.eye(4))
+    poses = [odometry.register(odometry.prepare(scan)).T_odom_sensor for scan in scans[1:]]
+    # They begin at rest, so the first scans are deskewed wrongly.
+    found = np.array(poses)[9:, 0, 3]
+    true = turns.way(np.arange(float(n)), gain)[10:]
+    # From scan 10 to 19, motions between ends are 0.18 m longer, between middles 0.09 m.
+    assert abs((found[-1] - found[0]) - (true[-1] - true[0])) < 0.04
