@@ -20,9 +20,10 @@ def is_reference_of(folder: Path, about: dict[str, Any]) -> bool:
     """Whether the reference in a folder was made from just this."""
     try:
         made: Any = json.loads((folder / "reference.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        of, known = made["about"], made["known"]
+    except (OSError, ValueError, TypeError, KeyError):
         return False
-    return bool(made["about"] == about and made["known"] == (folder / "reference.tum").exists())
+    return bool(of == about and known == (folder / "reference.tum").exists())
 
 
 def check_reference(folder: Path, about: dict[str, Any], option: str = "") -> None:

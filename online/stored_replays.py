@@ -3,7 +3,7 @@
 import csv
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -171,7 +171,7 @@ class StoredReplay:
             seconds = 1e-3 * sum(float(ms) for key in _TIMES for ms in frames[key])
         except (KeyError, ValueError) as error:
             raise damaged(folder / "frames.csv", error) from error
-        chosen = _choices(folder / "selections.csv")
+        chosen = _choices(folder / "selections.csv", summary.selections)
         if not len(chosen.stamps):
             kept = summary.about.parameters or {}
             chosen = chosen._replace(
@@ -327,8 +327,10 @@ class _Choices(NamedTuple):
     lost: NDArray[np.bool_]
 
 
-def _choices(path: Path) -> _Choices:
-    columns = read_applied(path)
+def _choices(path: Path, n: int) -> _Choices:
+    """Read the selections that were applied, `n` of them."""
+    every = read_columns(path)
+    columns = _applied(every)
     try:
         stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
         weights = _weights(columns.get("weights", []))
@@ -340,6 +342,8 @@ def _choices(path: Path) -> _Choices:
         lost = np.array([text == "1" for text in columns.get("lost", ["0"] * len(stamps))], bool)
     except (TypeError, ValueError) as error:
         raise damaged(path, error) from error
+    if sum(not why for why in _whys(every)) != n:
+        raise damaged(path, ValueError("not a row for every selection"))
     parameters: dict[str, Sequence[Any]] = {
         name: _numbers(values) for name, values in columns.items() if name not in SELECTION_COLUMNS
     }
@@ -348,12 +352,18 @@ def _choices(path: Path) -> _Choices:
 
 def read_applied(path: Path) -> dict[str, list[str]]:
     """The columns of ``selections.csv``, of what was applied; of the same scan, the last one."""
-    columns = read_columns(path)
+    return _applied(read_columns(path))
+
+
+def _applied(columns: Mapping[str, list[str]]) -> dict[str, list[str]]:
     stamps = columns.get("stamp_ns", [])
-    whys = columns.get("why_not", [""] * len(stamps))
-    rows = [i for i, why in enumerate(whys) if not why]
-    rows = list({stamps[i]: i for i in rows}.values())
+    rows = list({stamps[i]: i for i, why in enumerate(_whys(columns)) if not why}.values())
     return {name: [values[i] for i in rows] for name, values in columns.items()}
+
+
+def _whys(columns: Mapping[str, list[str]]) -> list[str]:
+    """Why each row of ``selections.csv`` was not applied; empty where it was."""
+    return columns.get("why_not", [""] * len(columns.get("stamp_ns", [])))
 
 
 def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:

@@ -286,6 +286,8 @@ def read_tum_of(study, study_file):
         ("selections.csv", "stamp_ns,weights\n1,0:a\n"),
         ("selections.csv", "stamp_ns,weights\n1,0\n"),
         ("selections.csv", "stamp_ns,weights\n1,0:0.5 1:0.5\n2,0:1\n"),
+        ("selections.csv", "nothing"),
+        ("selections.csv", "stamp_ns,why_not\n1,\n2,failed\n"),
     ],
 )
 def test_a_damaged_replay_is_named(replayed, file, text):

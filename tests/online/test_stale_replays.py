@@ -17,6 +17,7 @@ from online.comparison import compare
 from online.replay_charts import charts_of_replays
 from online.run_replays import run_replays
 from online.stale_replays import current_modes
+from online.stored_reference import check_reference
 from online.stored_replays import StoredReplayError
 from online.switch_cost import measure_switching
 
@@ -229,6 +230,13 @@ def test_other_ways_to_switch_are_not_compared(load):
         compare(other)
     assert run(other) == 1
     compare(other)
+
+
+@pytest.mark.parametrize("note", ["", "[]", "{}", '{"about": {}}'])
+def test_a_damaged_note_of_the_reference_is_no_note(tmp_path, note):
+    (tmp_path / "reference.json").write_text(note)
+    with pytest.raises(StoredReplayError, match="was judged by another reference; run `adaptune"):
+        check_reference(tmp_path, {})
 
 
 def test_a_model_that_is_older_than_the_trials(load):
