@@ -142,8 +142,8 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
         f"{replayed.name}: what was applied along the course",
         tuple(panels),
         "Parameters of each mode over time; of a bank, the shares of its members in the weighted "
-        "mean, the fixed set's first. Names above are the scenes of the course, if it is a "
-        "simulated one: what is applied should change with them.",
+        "mean, the fixed set's first (without a model, the baseline's). Names above are the scenes "
+        "of the course, if it is a simulated one: what is applied should change with them.",
         shared_x=True,
     )
 
@@ -186,8 +186,7 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         if not _changes(shares):
             continue
         shares = np.column_stack([shares, shares[:, -1]])
-        names = tuple(f"trial {trial}" for trial in track.weights)
-        drawn = (*_scenes(replayed), Shares(track.span, shares, names))
+        drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)))
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
 
@@ -217,7 +216,8 @@ def map_chart(replayed: ReplayedSequence) -> Chart | None:
         tuple(panels[:_MOST_MAPS]),
         "Each point is a scan where the sensor was, seen from its first pose; its colour is what "
         "was applied there. Of a bank, it is the share of the heaviest member other than its first "
-        "one, the fixed set. Places that look alike should have the same colour.",
+        "one, which is the fixed set, or without a model the baseline. Places that look alike "
+        "should have the same colour.",
         # A course that leads straight ahead needs the whole width, and no height.
         columns=1 if panels[0].height < 1.0 else min(2, len(panels)),
     )

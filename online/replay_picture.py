@@ -32,7 +32,7 @@ class Track(NamedTuple):
     restarted: NDArray[np.bool_]  # of shape (n,)
     choice_seconds: NDArray[np.float64]  # of shape (m,)
     choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
-    weights: Mapping[str, Sequence[float]]  # in a bank by trial instead, of shape (m,)
+    weights: Mapping[str, Sequence[float]]  # in a bank by member instead, of shape (m,)
     # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
     # interval; NaN where there is none.
     estimated: NDArray[np.float64]
@@ -234,7 +234,7 @@ def _draw_weights(axes: Any, mode: str, track: Track) -> None:
     drawn = axes.stackplot(
         track.span,
         np.column_stack([weights, weights[:, -1]]),
-        labels=[f"trial {trial}" for trial in track.weights],
+        labels=list(track.weights),
         colors=[OTHERS[i % len(OTHERS)] for i in range(len(weights))],
         step="post",
         edgecolor="black",

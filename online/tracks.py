@@ -8,6 +8,7 @@ from adaptune.model import ErrorModel
 from adaptune.study.driven import named
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
+from online.modes import UNTRAINED
 from online.replay_picture import Track
 from online.statistics import Reference
 from online.stored_replays import StoredReplay
@@ -45,13 +46,19 @@ def track_of(replay: StoredReplay, reference: Reference, model: ErrorModel | Non
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
         replay.choices,
-        {
-            str(trial) if model is None or trial not in model.sets else named(model, trial): weights
-            for trial, weights in replay.weights.items()
-        },
+        {member_of(replay, model, number): of for number, of in replay.weights.items()},
         replay.estimated,
         replay.lost,
     )
+
+
+def member_of(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
+    """What a member of a bank is called. Those of a bank without a model are no trials."""
+    if replay.summary.about.mode == UNTRAINED:
+        return f"untrained set {number}" if number else "baseline's set"
+    if model is None or number not in model.sets:
+        return f"trial {number}"
+    return f"trial {named(model, number)}"
 
 
 def seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:

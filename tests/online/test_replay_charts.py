@@ -80,7 +80,7 @@ def test_choices_last_until_the_next_one():
 
 
 def test_weights_that_never_change_are_not_drawn():
-    even = replay(weights={"4": [0.5] * 3, "17": [0.5] * 3})
+    even = replay(weights={"trial 4": [0.5] * 3, "trial 17": [0.5] * 3})
     assert choice_chart(sequence(paired=even)) is None
     assert map_chart(sequence(paired=even)) is None
 

@@ -82,7 +82,7 @@ def test_sets_of_several_odometries_leave_gaps(tmp_path):
 def test_a_bank_has_its_weights_drawn_and_no_parameters(tmp_path):
     of_bank = track(
         choices={"max_distance": [77.0, 77.0], "kernel": ["alone", "alone"]},
-        weights={"4": [0.5, 0.2], "17 (ndt)": [0.5, 0.8]},
+        weights={"trial 4": [0.5, 0.2], "trial 17 (ndt)": [0.5, 0.8]},
     )
     path, said = drawn(tmp_path, {"baseline": track(), "fixed": track(), "paired": of_bank})
     assert {"weight [%]", "trial 4", "trial 17 (ndt)"} <= set(said)
@@ -101,7 +101,7 @@ def measured(**changed):
     made = track(
         choice_seconds=seconds,
         choices={},
-        weights={"0": share, "3": 1.0 - share},
+        weights={"trial 0": share, "trial 3": 1.0 - share},
         estimated=np.column_stack([error, 0.6 * error, np.where(lost, 40.0, 1.7) * error]),
         lost=lost,
     )

@@ -19,6 +19,7 @@ from online.comparison import compare
 from online.comparison_tables import tables
 from online.modes import ReplaySetup, sequences_without_model
 from online.remarks import remarks
+from online.replayed_sequence import read_replays
 from online.run_replays import run_replays, run_untrained
 from online.stored_replays import StoredReplay, StoredReplayError
 
@@ -75,6 +76,9 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     # Until something is measured.
     assert weights[0] == "0:1.000 1:0.000 2:0.000 3:0.000"
     assert weights[-1] != weights[0]
+    # They are no trials: a trial of the same number has other parameters.
+    (bank,) = (of.track for m, of in read_replays(study, "three").modes.items() if m == MODES[1])
+    assert list(bank.weights) == ["baseline's set", *(f"untrained set {i}" for i in (1, 2, 3))]
     rows = compare(study).rows
     assert [(row.sequence, row.mode, row.rte) for row in rows] == [
         ("three", m, None) for m in MODES

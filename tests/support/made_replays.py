@@ -40,7 +40,7 @@ def kept():
 
 def bank(**changed):
     """A replay of a bank."""
-    weights = {"4": [0.5, 0.2, 0.6], "17": [0.3, 0.7, 0.1], "2": [0.2, 0.1, 0.3]}
+    weights = {"trial 4": [0.5, 0.2, 0.6], "trial 17": [0.3, 0.7, 0.1], "trial 2": [0.2, 0.1, 0.3]}
     return replay(weights=weights, **changed)
 
 
