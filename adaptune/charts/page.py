@@ -139,12 +139,17 @@ def _named(page: Page) -> dict[str, Chart]:
 
 
 def _listed(kind: str, words: Iterable[str]) -> str:
-    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in words)
+    items = "".join(f"<li>{_prose(sentence)}</li>" for sentence in words)
     return f'<ul class="{kind}">{items}</ul>' if items else ""
 
 
+def _prose(text: str) -> str:
+    """A text as HTML, with names between backticks set as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
 def _section(i: int, section: PageSection, named: Iterable[tuple[str, Chart]]) -> str:
-    words = "".join(f"<p>{escape(paragraph)}</p>\n" for paragraph in section.words)
+    words = "".join(f"<p>{_prose(paragraph)}</p>\n" for paragraph in section.words)
     missing = ""
     if section.missing:
         items = _listed("", section.missing)
@@ -176,7 +181,7 @@ def _table(table: Listing) -> str:
         f"<tr>{''.join(_cell(row[key], key in numeric) for key in keys)}</tr>\n"
         for row in table.rows
     )
-    note = f'<p class="note">{escape(table.caption)}</p>' if table.caption else ""
+    note = f'<p class="note">{_prose(table.caption)}</p>' if table.caption else ""
     title = escape(table.title)
     body = f"<table><thead><tr>{headings}</tr></thead>\n<tbody>{rows}</tbody></table>"
     # The box scrolls, and so has to be reached by the keyboard.
@@ -187,10 +192,12 @@ def _table(table: Listing) -> str:
 
 
 def _heading(key: str, number: bool) -> str:
-    words = escape(key.replace("_", " "))
+    # Long names may be broken, and stay what they are.
+    words = escape(key)
+    on_paper, on_screen = (words.replace("_", f"_{cut}") for cut in ("\u200b", "<wbr>"))
     return (
-        f'<th scope="col" aria-sort="none" data-heading="{words}"{_kind(number)}>'
-        f'<button type="button">{words}</button></th>'
+        f'<th scope="col" aria-sort="none" data-heading="{on_paper}"{_kind(number)}>'
+        f'<button type="button" aria-label="{words}"><span>{on_screen}</span></button></th>'
     )
 
 

@@ -90,8 +90,21 @@ def test_cells_are_sorted_by_whole_numbers_and_missing_ones_by_nothing():
 
 
 def test_keys_for_files_only_are_left_out(seen):
-    assert "mean RTE" in seen.texts["button"]
-    assert not any("file" in text for text in seen.texts["button"])
+    assert "mean_RTE" in headings(seen)
+    assert not any("file" in text for text in headings(seen))
+
+
+def headings(seen):
+    return [attrs["data-heading"].replace("\u200b", "") for attrs in seen.of("th")]
+
+
+def test_names_between_backticks_are_code():
+    table = Listing("C", [{"one_set": 1.0}], "Of `fixed`.")
+    sections = (PageSection("B", ("`a<b` is kept.",), ("run `adaptune online`",), (), (table,)),)
+    seen = Seen(page_text(Page("A", "", ("`paired` has less.",), sections)))
+    assert seen.texts["code"] == ["paired", "a<b", "adaptune online", "fixed"]
+    assert headings(seen) == ["one_set"]
+    assert not any("`" in text for tag in ("li", "p") for text in seen.texts[tag])
 
 
 def test_figures_lie_beside_the_page(tmp_path):
