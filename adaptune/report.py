@@ -5,6 +5,7 @@ import io
 import itertools
 import json
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -12,12 +13,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import rich.box
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from adaptune.files import write_text
 
 _FEW, _MANY = 0.1, 10.0
+_WIDEST = 10_000
+"""Letters of width that have room for any table."""
 
 
 class Listing(NamedTuple):
@@ -58,6 +62,35 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> T
             made.add_row()
         made.add_row(*(Text(cell_text(row[key])) for key in keys))
     return made
+
+
+def tables_within(listing: Listing, width: int) -> list[Table | Text]:
+    """A listing as tables of at most so many letters of width, in which no number is broken.
+
+    Where the columns have no room, they go on in a next table, below the first column again.
+    """
+    whole = table(*listing[:3])
+    if Console(width=_WIDEST).measure(whole).maximum <= width:
+        return [whole]
+    rows = listing.rows
+    headings, needed = {}, {}
+    for key in (key for key in rows[0] if not key.startswith("_")):
+        parts = re.split(r"(?<=_)|\s", key)
+        needed[key] = max(len(text) for text in (*parts, *(cell_text(row[key]) for row in rows)))
+        headings[key] = textwrap.fill(key, needed[key], break_long_words=False)
+    first, *others = headings
+    tables = [[first]]
+    for key in others:
+        # Between columns are two letters, and one at each end.
+        if sum(needed[k] + 2 for k in (*tables[-1], key)) > width and len(tables[-1]) > 1:
+            tables.append([first])
+        tables[-1].append(key)
+    titles = [listing.title, *("" for _ in tables[1:])]
+    made: list[Table | Text] = [
+        table(title, [{headings[key]: row[key] for key in keys} for row in rows])
+        for title, keys in zip(titles, tables, strict=True)
+    ]
+    return [*made, Text(listing.caption, "table.caption")] if listing.caption else made
 
 
 def cell_text(value: Any) -> str:

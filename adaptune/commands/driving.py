@@ -284,7 +284,7 @@ def _compared(loaded: "OfflineStudy") -> list["ComparisonRow"]:
     for said in words:
         say(said)
     for made in tables(rows, loaded.config.sub_trajectory):
-        console.print(report.table(made.title, made.rows, made.caption))
+        console.print(*report.tables_within(made, console.width), sep="\n")
     return rows
 
 
@@ -307,7 +307,7 @@ def _compare_several(studies: list[Path], override: list[str], to: Path | None) 
     console.rule("side by side")
     made = side_by_side(rows)
     for listing in made:
-        console.print(report.table(listing.title, listing.rows, listing.caption))
+        console.print(*report.tables_within(listing, console.width), sep="\n")
     folder = to or loaded[0].folder.with_name("+".join(rows))
     report.write_tables(folder, " and ".join(rows), made)
     say(f"Tables: {folder}/")
