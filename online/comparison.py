@@ -85,6 +85,7 @@ def compare(study: Study) -> ComparedReplays:
     made = tables(rows, study.config.sub_trajectory)
     words = [*remarks(rows), *_equal_cost(model), *compared.words(study)]
     words += _missing_repeats(judged, study.config.online.repeats)
+    words += _without_oracle(judged, oracles) if model is not None else []
     report.write_tables(folder, study.name, made, words)
     return ComparedReplays(rows, words)
 
@@ -106,6 +107,16 @@ def _missing_repeats(judged: Sequence[JudgedModes], repeats: int) -> list[str]:
     ]
     what = f"Replayed less often than {repeats} times (`adaptune online` goes on)"
     return [f"{what}: {', '.join(few)}."] if few else []
+
+
+def _without_oracle(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[str]:
+    """On which sequences the best choice in hindsight is not known."""
+    known = {row.sequence for row in oracles}
+    names = [one.name for one in judged if one.rows[0].rte is not None and one.name not in known]
+    if not names:
+        return []
+    where = "" if len(names) == len(judged) else f" on {', '.join(names)}"
+    return [f"What the best set would have gained{where} is not known; `adaptune oracle` tells."]
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

@@ -170,6 +170,7 @@ class ComparisonRow:
     def summary_columns(self) -> dict[str, Any]:
         """The row of the table of the modes, over all sequences or on the only one."""
         low, high = self.ratio_interval or (None, None)
+        driven = self.mode not in ORACLES
         return {
             "mode": self.mode,
             "RTE [%]": self.rte,
@@ -180,8 +181,8 @@ class ComparisonRow:
             GAP: None if self.gap_closed is None else f"{100.0 * self.gap_closed:.0f}",
             ESTIMATED: self.estimated,
             LOST: self.lost_seconds or None,
-            "restarts": self.restarts,
-            "switches": self.switches,
+            "restarts": self.restarts if driven else None,
+            "switches": self.switches if driven else None,
             "ms a scan": self.cpu_ms,
             "cores": self.cores,
             "memory [MB]": self.memory_mb,

@@ -92,7 +92,7 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     for row, of in zip(cells, last, strict=True):
         row["_in_hindsight"] = of.mode in ORACLES
     n = len({row.sequence for row in rows if row.rte is not None} - {ALL})
-    where = f"over {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
+    where = f"on {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
     repeats = f", {last[0].repeats} replays each" if last[0].repeats > 1 else ""
     return Listing(
         f"RTE over {length:g} m {where}{repeats}", cells, _caption(rows, cells[0]), _ERRORS
@@ -112,6 +112,11 @@ def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
         said.append("Worst tenth: that mean over the worst tenth of the stretches.")
     if "better / worse" in shown:
         said.append("Better / worse: sequences on which the error is less or more by 1 %.")
+    if any(row.mode in ORACLES for row in rows):
+        said.append(
+            "Oracles know the errors: the best set of each sequence, and of every period. Much of "
+            "the latter is chance, out of reach of any choice."
+        )
     if GAP in shown:
         said.append("Gap closed: share of what the best set of each sequence, in hindsight, gains.")
     if any(row.estimated is not None for row in rows):

@@ -147,22 +147,31 @@ def compare_modes(name: str, replays: Repeats, reference: Reference) -> JudgedMo
     empty = [
         ComparisonRow(name, mode, None, None, 0, 0, 0, yardstick=yardstick) for mode in replays
     ]
-    judged = JudgedModes(name, empty, _errors(replays, reference), reference.block)
-    rows = (_measured(row, replays[row.mode], reference) for row in empty)
+    every = [replay.trajectory.stamps for repeats in replays.values() for replay in repeats]
+    common = reduce(np.intersect1d, every)
+    judged = JudgedModes(name, empty, _errors(replays, reference, common), reference.block)
+    rows = (_measured(row, replays[row.mode], reference, common) for row in empty)
     return judged._replace(rows=[_with_errors(row, judged) for row in rows])
 
 
 def _measured(
-    row: ComparisonRow, repeats: Sequence[StoredReplay], reference: Reference
+    row: ComparisonRow,
+    repeats: Sequence[StoredReplay],
+    reference: Reference,
+    common: NDArray[np.int64],
 ) -> ComparisonRow:
-    """Fill in what was measured while driving, and the errors of each whole trajectory."""
+    """Fill in what was measured while driving, and the errors of each whole trajectory.
+
+    The latter are those of the scans with the stamps that all replays have in `common`.
+    """
     summaries = [repeat.summary for repeat in repeats]
     first = min((t for r in repeats if (t := _first_restart(r)) is not None), default=None)
     speeds = [
         s.duration_s / r.seconds for s, r in zip(summaries, repeats, strict=True) if r.seconds
     ]
     estimated, interval = _estimated(repeats)
-    known = [errors for r in repeats if (errors := reference.standard(r.trajectory)) is not None]
+    of_common = (_at(repeat.trajectory, common) for repeat in repeats)
+    known = [errors for t in of_common if (errors := reference.standard(t)) is not None]
     return replace(
         row,
         restarts=sum(summary.restarts for summary in summaries),
@@ -207,10 +216,17 @@ def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
     )
 
 
-def _errors(replays: Repeats, reference: Reference) -> dict[str, NDArray[np.float64]]:
+def _at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Trajectory:
+    """The poses at some of the stamps."""
+    kept = np.isin(trajectory.stamps, stamps)
+    return Trajectory(trajectory.stamps[kept], trajectory.T_world_sensor[kept])
+
+
+def _errors(
+    replays: Repeats, reference: Reference, common: NDArray[np.int64]
+) -> dict[str, NDArray[np.float64]]:
     """Percent by mode, each of shape (n,): at the scans that no replay has dropped."""
     trajectories = {mode: [r.trajectory for r in repeats] for mode, repeats in replays.items()}
-    common = reduce(np.intersect1d, [t.stamps for of in trajectories.values() for t in of])
     return {
         mode: np.mean([reference.errors(t)[np.isin(t.stamps, common)] for t in of], axis=0)
         for mode, of in trajectories.items()

@@ -46,6 +46,7 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
             _against(main, mode, main.against[mode]) for mode in RIVALS if mode in main.against
         ]
     said += _controls(main, last)
+    said += _nothing_to_choose(last)
     said += [_other(row) for row in adaptive if row is not main and not _is_yardstick(row)]
     return [*said, *tuned, _advice(last)]
 
@@ -162,6 +163,17 @@ def _controls(main: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[st
                 how = added[_surely(ratio)]
                 said.append(f"{how}: {_against(main, mode, ratio)}")
     return said
+
+
+def _nothing_to_choose(last: Mapping[str, ComparisonRow]) -> list[str]:
+    """That no choice of one set could gain, if that is so."""
+    best = last.get(ORACLES[0])
+    if best is None or best.ratio is None or best.ratio <= 1.0 - NO_DIFFERENCE:
+        return []
+    return [
+        "In hindsight, the best set of each sequence would gain less than 1 %: one set for all is "
+        "as good as any choice of one set for each."
+    ]
 
 
 def _other(row: ComparisonRow) -> str:

@@ -20,6 +20,7 @@ from online.comparison import compare
 from online.comparison_row import ComparisonRow
 from online.remarks import remarks
 from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
+from online.statistics import Reference
 from online.stored_replays import StoredReplay, StoredReplayError
 
 MODES = ["baseline", "fixed", "paired", "paper"]
@@ -347,6 +348,21 @@ def test_replays_of_different_lengths_are_told_and_compared_where_both_have_scan
     (said,) = [said for said in remarks(rows) if "lengths" in said]
     assert said.startswith("On three the replays have different lengths (paper 30 of 40 scans)")
     assert [row.mode for row in rows if row.rte is not None] == MODES
+    # So are the errors of whole trajectories: those of the shorter ones are less.
+    fixed = next(row for row in rows if row.mode == "fixed")
+    of_fixed = StoredReplay.read(folder.parent / "fixed").trajectory
+    judge = Reference.read(folder.parent, own.config.sub_trajectory)
+    shorter = Trajectory(of_fixed.stamps[:30], of_fixed.T_world_sensor[:30])
+    assert fixed.standard.ape == judge.standard(shorter).ape != judge.standard(of_fixed).ape
+
+
+def test_what_was_possible_in_hindsight_is_not_known_without_the_oracle(replayed, monkeypatch):
+    (said,) = (said for said in compare(replayed).words if "`adaptune oracle`" in said)
+    assert said.startswith("What the best set would have gained is not known")
+    best = ComparisonRow("three", "oracle, sequence", 0.5, 0.9, 0, 0, 0)
+    monkeypatch.setattr("online.comparison.read_oracle", lambda *_: "its trials")
+    monkeypatch.setattr("online.comparison.oracle_rows", lambda *_: [best])
+    assert not any("`adaptune oracle`" in said for said in compare(replayed).words)
 
 
 def test_restarts_and_speed_are_those_of_the_stored_replay(own):

@@ -25,7 +25,7 @@ ROWS = rows_of("a", 1.0) + rows_of("b", 3.0) + rows_of(ALL, 2.0)
 
 def test_one_table_of_the_modes_one_of_the_sequences_one_of_standard_errors():
     modes, sequences, standard = tables(ROWS, 25.0)
-    assert modes.title == "RTE over 25 m over 2 sequences"
+    assert modes.title == "RTE over 25 m on 2 sequences"
     assert [row["mode"] for row in modes.rows] == ["baseline", "fixed", "paired"]
     assert [row["RTE [%]"] for row in modes.rows] == [4.0, 2.0, 1.0]
     # Nothing was restarted, and nothing estimated.
@@ -70,7 +70,12 @@ def test_references_are_told_where_they_differ():
 
 def test_oracles_are_among_the_modes_only():
     oracle = ComparisonRow(ALL, ORACLES[0], 0.4, 0.2, 0, 0, 0)
-    modes, sequences, standard = tables([*ROWS, oracle], 25.0)
+    switching = [replace(row, switches=3, restarts=1) for row in ROWS]
+    modes, sequences, standard = tables([*switching, oracle], 25.0)
+    # It was not driven.
+    assert (modes.rows[-1]["switches"], modes.rows[-1]["restarts"]) == (None, None)
+    assert "Oracles know the errors" in modes.caption
+    assert "Oracles" not in tables(ROWS, 25.0)[0].caption
     assert modes.rows[-1]["mode"] == ORACLES[0]
     assert ORACLES[0] not in sequences.rows[0]
     assert len(standard.rows) == 3

@@ -178,3 +178,12 @@ def test_nothing_is_said_where_nothing_is_known():
     assert verdict(rows) == ["No test sequence has a reference: nobody can say what was gained."]
     oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
     assert not any(ORACLES[0] in said for said in verdict([*every(paired=0.7), oracle]))
+
+
+@pytest.mark.parametrize(("best", "told"), [(1.0, True), (0.995, True), (0.8, False)])
+def test_it_is_told_where_no_choice_of_one_set_could_gain(best, told):
+    oracle = ComparisonRow(ALL, ORACLES[0], best, best, 0, 0, 0)
+    said = verdict([*every(paired=0.9), oracle])
+    what = "In hindsight, the best set of each sequence would gain less than 1 %"
+    assert any(sentence.startswith(what) for sentence in said) == told
+    assert said[-1].startswith("What to do: ")
