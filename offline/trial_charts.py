@@ -86,15 +86,16 @@ def density_by_group_chart(
         values = np.mean([table.on(sequence) for sequence in sequences], axis=0)
         if np.isfinite(values).sum() >= FEW:
             chosen[name] = best_tenth(values)
-    if len(chosen) < 2:
+    panels = [p for p in _density_panels(table, chosen, filled=False) if p.drawn]
+    if len(chosen) < 2 or not panels:
         return None
     return Chart(
         "parameter-density-by-group",
         f"Where the best tenth of the trials lies, by {kind}",
-        tuple(_density_panels(table, chosen, filled=False)),
+        tuple(panels),
         f"As above, for the best tenth of the trials on each {kind}. Peaks that lie apart mean "
         f"that no one set is best everywhere: this is what adapting can gain from.",
-        columns=min(2, len(table.space.parameters)),
+        columns=min(2, len(panels)),
     )
 
 

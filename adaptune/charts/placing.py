@@ -28,6 +28,8 @@ _LETTER, _LINE = 7.0, 16.0
 _BAR = 78.0
 """Pixels that a colour bar takes."""
 _RIGHT = 14.0
+_LEAST = 120.0
+"""Pixels of width that a panel has at least, if there are fewer columns."""
 _MOST_LETTERS = 24  # of a name beside an axis, on a line
 _DARK, _GRID = "#333333", "#e4e4e4"
 
@@ -73,10 +75,13 @@ class _Layout:
     def __init__(self, chart: Chart, width: int) -> None:
         self._panels = chart.panels
         self._narrow = width < PRINTED
-        self._columns = 1 if self._narrow else max(1, min(chart.columns, len(chart.panels)))
         self._width = width
-        # On a telephone, panels of several columns do not lie as they did.
-        self._shared = chart.shared_x and (chart.columns <= 1 or not self._narrow)
+        wanted = max(1, min(chart.columns, len(chart.panels)))
+        self._columns = 1 if self._narrow else wanted
+        while self._columns > 1 and self._beside(self._columns)[-1] < _LEAST:
+            self._columns -= 1
+        # Panels of fewer columns do not lie as they did.
+        self._shared = chart.shared_x and self._columns == wanted
         self._rows = rows(chart, self._columns)
         self._names = [name for name in looks(chart) if name]
         self._places = self._placed()
@@ -129,10 +134,8 @@ class _Layout:
         """The place of each panel."""
         one = 280.0 if self._narrow else 340.0
         usual = one if len(self._rows) == 1 else 170.0 if self._shared else 0.8 * one
-        n = self._columns
-        before = [max(map(self._before, self._panels[c::n])) for c in range(n)]
-        after = [max(map(_after, self._panels[c::n])) for c in range(n)]
-        self._across = width = (self._width - sum(before) - sum(after)) / n
+        before, after, width = self._beside(self._columns)
+        self._across = width
         places: list[_Place] = []
         top = 0.0
         for height, panels in self._rows:
@@ -146,6 +149,12 @@ class _Layout:
             top += high + max(map(self._below, under))
         self._bottom = top
         return places
+
+    def _beside(self, n: int) -> tuple[list[float], list[float], float]:
+        """Room left and right of the panels of each of `n` columns, and how wide panels are."""
+        before = [max(map(self._before, self._panels[c::n])) for c in range(n)]
+        after = [max(map(_after, self._panels[c::n])) for c in range(n)]
+        return before, after, (self._width - sum(before) - sum(after)) / n
 
     def _before(self, panel: Panel) -> float:
         """Room for the numbers or names, and the label, left of a panel."""

@@ -68,6 +68,10 @@ def test_groups_of_sequences_have_their_own_best():
     assert near.x[np.argmax(near.y)] == pytest.approx(2.0, rel=0.15)
     assert far.x[np.argmax(far.y)] == pytest.approx(8.0, rel=0.15)
     assert density_by_group_chart(made_table(error, 200), {"near": ["one"]}) is None
+    # One trial is no density.
+    few = density_by_group_chart(made_table(error, 12), {"near": ["one"], "far": ["two"]})
+    assert all(panel.drawn for panel in few.panels)
+    assert "distance" not in [panel.x.label for panel in few.panels]
 
 
 def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_charts import comparison, empty, over_time, samples, trials
 
-from adaptune.charts.chart import Axis, Bars, Chart, Line, Panel, Spans
+from adaptune.charts.chart import Axis, Bars, Chart, Line, Panel, Points, Spans
 from adaptune.charts.placing import NARROW, PRINTED, WIDE, layout, ticks
 
 WIDTHS = (WIDE, PRINTED, NARROW)
@@ -40,6 +40,14 @@ def test_panels_lie_below_each_other_on_a_telephone():
     assert len({box[0] for box in boxes(layout(trials(), NARROW))}) == 1
     made = layout(trials(), NARROW)
     assert made["dragmode"] is False  # a finger scrolls
+
+
+def test_panels_with_colour_bars_are_not_too_narrow_on_paper():
+    coloured = Points([1.0, 2.0], [1.0, 2.0], "a", [1.0, 2.0], "error [%]")
+    panel = Panel(Axis("x"), Axis("y"), (coloured,))
+    made = {w: layout(Chart("a", "A", (panel,) * 3, columns=3), w) for w in WIDTHS}
+    columns = {w: len({round(box[0], 3) for box in boxes(of)}) for w, of in made.items()}
+    assert columns == {WIDE: 3, PRINTED: 2, NARROW: 1}
 
 
 def test_a_shared_axis_is_named_once():
