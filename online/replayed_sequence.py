@@ -14,7 +14,7 @@ from adaptune.model import ErrorModel
 from adaptune.study.study import Study
 from adaptune.trajectory import read_tum
 from online.remarks import of_lengths, short_replays
-from online.replay_picture import Track, drawn_modes
+from online.replay_picture import FEW, Track, drawn_modes
 from online.stale_replays import current_modes
 from online.statistics import Reference
 from online.stored_replays import StoredReplay, damaged, read_applied, read_columns
@@ -74,7 +74,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     if len(space.baselines) > 1 and study.model_path.exists():
         model = ErrorModel.load(study.model_path)
     current = current_modes(study, name)
-    replays = {mode: StoredReplay.read(folder / mode) for mode in drawn_modes(current.modes)}
+    drawn = drawn_modes(current.modes)
+    replays = {mode: StoredReplay.read(folder / mode) for mode in drawn}
     replays, short = _whole(name, replays)
     modes = {
         mode: _read_mode(folder / mode, replay, reference, model)
@@ -90,8 +91,15 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         scenes,
         space.logarithmic,
         reference.estimated,
-        [*current.refused, *short],
+        [*current.refused, *short, *_undrawn([m for m in current.modes if m not in drawn])],
     )
+
+
+def _undrawn(modes: Sequence[str]) -> list[str]:
+    """A sentence about modes that are left out so that charts can be read, if there are some."""
+    listed = ", ".join(f"`{mode}`" for mode in modes)
+    why = f"so that the charts can be read, which takes {FEW} modes on demand at most"
+    return [f"Not drawn are {listed}, {why}."] if modes else []
 
 
 def _whole(

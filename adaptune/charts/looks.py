@@ -1,5 +1,6 @@
 """How a chart looks, on paper and in a browser alike: colours, order, rows and what is thinned."""
 
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -243,4 +244,15 @@ def wrapped(words: str, letters: float) -> str:
     """Words on lines of at most so many letters, where they can be broken."""
     lines = words.splitlines() or [""]
     width = max(int(letters), 8)
+    lines = [re.sub(rf"\S{{{width + 1},}}", lambda long: _cut(long[0], width), s) for s in lines]
     return "\n".join(part for line in lines for part in textwrap.wrap(line, width) or [""])
+
+
+def _cut(name: str, width: int) -> str:
+    """A long name with spaces where it is best broken: after underscores, slashes and points."""
+    parts = [""]
+    for part in re.split(r"(?<=[_/.])", name):
+        if parts[-1] and len(parts[-1] + part) > width:
+            parts.append("")
+        parts[-1] += part
+    return " ".join(parts)

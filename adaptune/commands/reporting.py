@@ -67,7 +67,10 @@ def study_page(
     from online.modes import sequences_without_model
 
     makers: list[_Maker] = [_comparison]
-    names = study.config.test or sequences_without_model(study)
+    # Without a test, some may have been replayed without a model.
+    others = sequences_without_model(study)
+    replayed = [name for name in others if (study.folder / "replays" / name).exists()]
+    names = study.config.test or replayed
     makers += [partial(_along, sequence=name) for name in names]
     makers += [_search, _surroundings, _validation, _settings]
     sections: list[PageSection] = []

@@ -148,3 +148,6 @@ def test_words_are_folded_between_words_only():
     assert wrapped("a long name of something", 10) == "a long\nname of\nsomething"
     assert wrapped("two\nlines", 40) == "two\nlines"
     assert wrapped("", 40) == ""
+    assert wrapped("max_correspondence_distance [m]", 24) == "max_correspondence_\ndistance [m]"
+    assert wrapped("lio/voxel_size", 9) == "lio/\nvoxel_\nsize"
+    assert wrapped("a" * 20, 12) == "a" * 12 + "\n" + "a" * 8

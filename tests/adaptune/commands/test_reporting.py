@@ -46,6 +46,15 @@ def test_a_study_that_is_not_finished_has_one_too_that_says_what_is_missing(fini
     assert "What was tried</h2>" in (folder / "report/report.html").read_text()
 
 
+@pytest.mark.slow
+def test_without_a_test_no_replays_are_missed(study_file, trained_folder, tmp_path):
+    folder = shutil.copytree(trained_folder, tmp_path / "study")
+    ended = call("report", study_file, "--folder", folder, "-o", "test=[]")
+    assert ended.exit_code == 0
+    assert "No comparison: test: name at least one sequence" in ended.output
+    assert "No replays of" not in ended.output
+
+
 def test_a_study_that_has_not_begun_has_nothing_to_report(study_file, tmp_path):
     ended = call("report", study_file, "--folder", tmp_path / "none")
     assert ended.exit_code == 2
