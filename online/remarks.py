@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-from adaptune.study.driven import BEST_DEFAULT, RIVAL_WORDS
 from online.comparison_row import ALL, ComparisonRow
 from online.verdict import verdict
 
@@ -13,10 +12,8 @@ _WHOLE = 0.95
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """In words: what was gained, and what must be known to trust it."""
     rows = [row for row in rows if not row.twin]
-    last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
     return (
         verdict(rows)
-        + _against_best_default(last)
         + _lengths(rows)
         + _judges(rows)
         + _estimates(rows)
@@ -24,20 +21,6 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
         + _kept_up(rows)
         + _restarts(rows)
     )
-
-
-def _against_best_default(last: Mapping[str, ComparisonRow]) -> list[str]:
-    """How `paired` compares with the best odometry as it comes, in error and in cost."""
-    paired, row = last.get("paired"), last.get(BEST_DEFAULT)
-    if paired is None or row is None or not paired.ratio or not row.ratio:
-        return []
-    cost = ""
-    if paired.cpu_ms is not None and row.cpu_ms is not None:
-        cost = f", at {paired.cpu_ms:.1f} ms of CPU time a scan against {row.cpu_ms:.1f}"
-    return [
-        f"Compared with {RIVAL_WORDS[BEST_DEFAULT]}, `paired` has {paired.ratio / row.ratio:.2f} "
-        f"times its error{cost}."
-    ]
 
 
 def _lengths(rows: Sequence[ComparisonRow]) -> list[str]:

@@ -42,9 +42,11 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
         said = [f"Nothing was adapted, nothing gained: {what}"]
     else:
         said = [_gain(main, rows), *_how_surely(main, rows), *_cost(main, last[main.yardstick])]
-        said += [
-            _against(main, mode, main.against[mode]) for mode in RIVALS if mode in main.against
-        ]
+    said += [
+        _against(main, mode, main.against[mode], last.get(mode))
+        for mode in RIVALS
+        if mode in main.against
+    ]
     said += _controls(main, last)
     said += _nothing_to_choose(last)
     said += [_other(row) for row in adaptive if row is not main and not _is_yardstick(row)]
@@ -139,10 +141,15 @@ def _cost(row: ComparisonRow, yardstick: ComparisonRow) -> list[str]:
     ]
 
 
-def _against(main: ComparisonRow, mode: str, ratio: Ratio) -> str:
-    """How the mode compares with another one, on the same frames."""
-    what = RIVAL_WORDS.get(mode, f"`{mode}`")
-    return f"`{main.mode}` has {ratio.value:.2f} times the error of {what} ({_interval(ratio)})."
+def _against(
+    main: ComparisonRow, mode: str, ratio: Ratio, other: ComparisonRow | None = None
+) -> str:
+    """How the mode compares with another one, on the same frames, and in cost with a rival."""
+    what, cost = RIVAL_WORDS.get(mode, f"`{mode}`"), ""
+    if other is not None and other.cpu_ms is not None and main.cpu_ms is not None:
+        cost = f", at {main.cpu_ms:.1f} ms of CPU time a scan against {other.cpu_ms:.1f}"
+    has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what}"
+    return f"{has} ({_interval(ratio)}){cost}."
 
 
 def _controls(main: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
@@ -204,13 +211,20 @@ def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]
     return [f"Tuning alone gained {gained:.0f} % of the baseline's error: {has}."]
 
 
+def _preferred(row: ComparisonRow) -> float:
+    return _ratio(row).value * (1.0 - NEARLY * (row.mode == "paired"))
+
+
 def _advice(last: Mapping[str, ComparisonRow]) -> str:
-    """What to do: drive what is surely better than the yardstick, the best of it."""
+    """What to do: drive what is surely better than the yardstick, the best of it.
+
+    The best of several is so by chance, too: `paired` is kept if it is nearly as good.
+    """
     drivable = {m: r for m, r in last.items() if m not in (*ORACLES, *CONTROLS) and r.ratio}
     better = [row for row in drivable.values() if _surely(_ratio(row)) == "less"]
     yardstick = _YARDSTICKS[next(iter(last.values())).yardstick]
     if better:
-        best = min(better, key=lambda row: row.ratio or 1.0)
+        best = min(better, key=_preferred)
         called = RIVAL_WORDS.get(best.mode, f"`{best.mode}`")
         look = ""
         if best.worst_tenth is not None and (best.stretches or 0) >= ENOUGH_STRETCHES:

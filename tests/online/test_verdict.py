@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 
 from online.comparison_row import ALL, ORACLES, ComparisonRow, Ratio
+from online.remarks import remarks
 from online.verdict import verdict
 
 
@@ -58,6 +59,8 @@ def test_with_few_sequences_the_interval_speaks_of_these_alone():
         ({"baseline": 0.7, "paired": 1.3}, "What to do: drive `baseline`."),
         ({"equal_cost": 0.6, "paired": 0.8}, "What to do: drive the best set that costs no more."),
         ({"even": 0.5, "paired": 0.8}, "What to do: drive `paired`."),
+        ({"bank_learned": 0.78, "paired": 0.8}, "What to do: drive `paired`."),
+        ({"bank_learned": 0.7, "paired": 0.8}, "What to do: drive `bank_learned`."),
         ({"baseline": 1.4}, "What to do: drive the fixed set; nothing is surely better."),
     ],
 )
@@ -158,6 +161,21 @@ def test_losses_costs_controls_and_rivals_are_told():
     )
     assert any(s.startswith("The study's bank with even weights has 1.02 times") for s in said)
     assert any(s.startswith("Tuning alone gained 33 % of the baseline's error") for s in said)
+
+
+def test_a_rival_is_compared_once_in_error_and_cost_also_where_the_fixed_set_is_kept():
+    for paired, switches in ((0.8, 3), (1.0, 0)):
+        against = {"best_default": Ratio(paired / 1.25, (0.5, 0.9))}
+        costs = {"paired": 20.0, "best_default": 30.0}
+        rows = [
+            replace(r, cpu_ms=costs.get(r.mode), against=against, switches=switches)
+            for r in every(paired=paired, best_default=1.25)
+        ]
+        found = [said for said in remarks(rows) if "the best odometry with its own" in said]
+        assert found == [
+            f"`paired` has {paired / 1.25:.2f} times the error of the best odometry with its own "
+            f"parameters (95 % interval 0.50 to 0.90), at 20.0 ms of CPU time a scan against 30.0."
+        ]
 
 
 def test_without_a_model_the_untrained_bank_is_compared_with_the_baseline():
