@@ -423,7 +423,9 @@ def _unpacked(array: NDArray[np.uint8]) -> Any:
 
 
 def _damaged(path: Path, error: Exception) -> ArchiveError:
-    return ArchiveError(f"{path}: is damaged ({error}); remove it and run again")
+    # NumPy says how to load such a file unsafely.
+    why = "it does not hold NumPy's numbers" if "pickle" in str(error) else error
+    return ArchiveError(f"{path}: is damaged ({why}); remove it and run again")
 
 
 def _check_place(path: Path, data: Mapping[str, NDArray[Any]], place: list[Any]) -> None:
