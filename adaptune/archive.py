@@ -262,9 +262,8 @@ class Archive:
             text = path.read_text("utf-8") if path.exists() else "{}"
             slots = {str(name): int(slot) for name, slot in json.loads(text).items()}
         except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise ArchiveError(
-                f"{path}: is damaged ({error}); give the study another folder"
-            ) from error
+            why = f"{path}: is damaged ({error}); give the study another folder"
+            raise ArchiveError(why) from error
         for name in (new := [name for name in names if name not in slots]):
             slots[name] = max(slots.values(), default=0) + 1
         if new:
@@ -431,8 +430,7 @@ def _damaged(path: Path, error: Exception) -> ArchiveError:
 def _check_place(path: Path, data: Mapping[str, NDArray[Any]], place: list[Any]) -> None:
     """Refuse the file of another trial."""
     try:
-        found = _unpacked(data["place"])
-        sequence, number, whole = found
+        sequence, number, whole = found = _unpacked(data["place"])
     except (KeyError, ValueError, TypeError) as error:
         raise _damaged(path, error) from error
     if found != place:

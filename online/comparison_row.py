@@ -87,6 +87,7 @@ class ComparisonRow:
     # and the share of what the best set of each sequence would gain.
     worst_tenth: float | None = None
     stretches: int | None = None
+    recordings: int | None = None  # over all sequences, that they are of
     better: int | None = None
     worse: int | None = None
     surely_better: int | None = None

@@ -49,7 +49,8 @@ def pooled(
 
 def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
     rows = [row for one in judged for row in one.rows if row.mode == mode]
-    row = _mean_row(mode, rows)
+    recordings = len({one.recording or one.name for one in judged})
+    row = replace(_mean_row(mode, rows), recordings=recordings)
     if mode == row.yardstick:
         return row
     ends = [row.ratio_interval for row in rows if row.ratio_interval is not None]

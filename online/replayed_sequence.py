@@ -91,15 +91,15 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         scenes,
         space.logarithmic,
         reference.estimated,
-        [*current.refused, *short, *_undrawn([m for m in current.modes if m not in drawn])],
+        [*current.refused, *short, *_undrawn(name, [m for m in current.modes if m not in drawn])],
     )
 
 
-def _undrawn(modes: Sequence[str]) -> list[str]:
+def _undrawn(name: str, modes: Sequence[str]) -> list[str]:
     """A sentence about modes that are left out so that charts can be read, if there are some."""
     listed = ", ".join(f"`{mode}`" for mode in modes)
-    why = f"so that the charts can be read, which takes {FEW} modes on demand at most"
-    return [f"Not drawn are {listed}, {why}."] if modes else []
+    why = f"nobody could read charts of more than {FEW} modes on demand"
+    return [f"No lines of {listed} along {name}: {why}."] if modes else []
 
 
 def _whole(

@@ -96,7 +96,9 @@ def _surely(ratio: Ratio) -> str:
 def _gain(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
     ratio = _ratio(row)
     has, how = f"`{row.mode}` has {_times(row)}", _surely(ratio)
-    few = 1 < len(_judged(rows)) < MIN_RECORDINGS or rows[-1].sequence != ALL
+    # The parts of one recording are one.
+    n = row.recordings or len(_judged(rows))
+    few = rows[-1].sequence != ALL or n < MIN_RECORDINGS
     alone = " The interval speaks of these recordings alone." if few else ""
     if how == "unknown":
         return f"Whether adapting gains is not known, {_where(rows)}: {has}; {_UNSURE}."

@@ -62,6 +62,7 @@ def test_the_parts_of_one_recording_are_no_recordings():
     rng = np.random.default_rng(0)
     halves = [judged(f"{r}{i}", r, rng, recording=str(r)) for r in (0.5, 1.0) for i in range(4)]
     six = [judged(f"{r}{i}", r, rng, recording=f"{r}{i}") for r in (0.5, 1.0) for i in range(4)]
+    assert [paired(pooled(of)).recordings for of in (halves, six)] == [2, 8]
     of_halves, of_six = (paired(pooled(of)).ratio_interval for of in (halves, six))
     assert of_halves[1] - of_halves[0] < of_six[1] - of_six[0]
 

@@ -87,8 +87,10 @@ def test_a_replay_that_is_too_short_is_told_and_not_drawn(study, study_file, tmp
 def test_modes_that_are_too_many_to_draw_are_named(study, monkeypatch):
     monkeypatch.setattr("online.replayed_sequence.drawn_modes", lambda modes: list(modes[:2]))
     assert list(read_replays(study, "three").modes) == ["baseline", "fixed"]
-    (said,) = (said for said in charts_of_replays(study, "three").notes if "Not drawn" in said)
-    assert said.startswith("Not drawn are `paired`, `paper`, so that the charts can be read")
+    (said,) = (
+        said for said in charts_of_replays(study, "three").notes if said.startswith("No lines")
+    )
+    assert said.startswith("No lines of `paired`, `paper` along three: nobody could read charts")
 
 
 def test_scenes_of_a_part_of_a_course_are_those_of_that_part(tmp_path):

@@ -51,6 +51,9 @@ def test_with_few_sequences_the_interval_speaks_of_these_alone():
     assert verdict(few)[0].endswith("The interval speaks of these recordings alone.")
     assert verdict(rows_of("a", paired=0.7))[0].endswith("these recordings alone.")
     assert "alone" not in verdict(every(paired=0.7))[0]
+    # Twelve parts of two recordings are two.
+    of_two = [replace(row, recordings=2) for row in every(paired=0.7)]
+    assert verdict(of_two)[0].endswith("these recordings alone.")
 
 
 @pytest.mark.parametrize(
