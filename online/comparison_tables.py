@@ -30,6 +30,32 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     return made if standard is None else [*made, standard]
 
 
+_DRIVEN = {
+    "baseline": "the odometry with its own parameters",
+    "best_default": "of several odometries, the one that does best with its own parameters",
+    "equal_cost": "the best set in training that costs no more than what is driven",
+    "fixed": "the one set that is best in training",
+    "paired": "what adapts with the least expected loss in training, or the fixed set",
+    "untrained": "a bank without a model: sets around the baseline, weighed while driving",
+    "one_set": "one set at a time, chosen by how sets compare with the fixed one",
+    "bank": "several sets side by side; their mean motion, weighed by training and while driving",
+    "bank_learned": "the same bank, weighed by training alone",
+    "even": "the same bank with even weights: a control, which chooses nothing",
+    "random": "at every selection a random member of the bank: a control, which chooses nothing",
+    "paper": "the set with the least expected error, as Koide et al. (IROS 2021) choose it",
+    ORACLES[0]: "the best set of each sequence, known in hindsight only",
+    ORACLES[1]: "the best set of every period between selections, known in hindsight only",
+}
+"""What each mode drives."""
+
+
+def modes_in_words(rows: Sequence[ComparisonRow]) -> Listing:
+    """What each mode of the tables drives, for readers without the guide."""
+    modes = dict.fromkeys(row.mode for row in rows if not row.twin)
+    cells = [{"mode": mode, "what it drives": _DRIVEN[mode]} for mode in modes]
+    return Listing("What the modes are", cells)
+
+
 def side_by_side(studies: Mapping[str, Sequence[ComparisonRow]]) -> list[Listing]:
     """Errors of several studies on each sequence, and over all, as in the paper's Table II.
 

@@ -96,7 +96,7 @@ def _comparison(study: "OfflineStudy") -> "PageSection":
     from adaptune.charts.page import PageSection
     from online.comparison import compare
     from online.comparison_chart import charts_of_comparison
-    from online.comparison_tables import tables
+    from online.comparison_tables import modes_in_words, tables
 
     title = "What adapting gained"
     try:
@@ -105,7 +105,7 @@ def _comparison(study: "OfflineStudy") -> "PageSection":
         words = _so_far(study)
         return PageSection(title, tuple(words), (f"No comparison: {error}.",))
     found = charts_of_comparison(study)
-    made = tables(rows, study.config.sub_trajectory)
+    made = [*tables(rows, study.config.sub_trajectory), modes_in_words(rows)]
     return PageSection(title, tuple(said), tuple(found.notes), tuple(found.charts), tuple(made))
 
 

@@ -3,9 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from adaptune.drawing import LINES
 from adaptune.metrics import KittiError
 from online.comparison_row import ALL, ORACLES, ComparisonRow, StandardErrors
-from online.comparison_tables import side_by_side, tables
+from online.comparison_tables import modes_in_words, side_by_side, tables
 
 SHORT = KittiError(np.nan, np.nan, ())
 
@@ -66,6 +67,13 @@ def test_references_are_told_where_they_differ():
     modes, sequences, _ = tables(rows, 25.0)
     assert [row["reference"] for row in sequences.rows] == ["given", "estimated", ""]
     assert "pulls ratios towards 1" in modes.caption
+
+
+def test_every_mode_that_may_be_shown_is_put_in_words():
+    shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*LINES, *ORACLES)]
+    twin = ComparisonRow("a", "of another", 1.0, 1.0, 0, 0, 0, twin="paired")
+    made = modes_in_words([*shown, twin])
+    assert [row["mode"] for row in made.rows] == [*LINES, *ORACLES]
 
 
 def test_oracles_are_among_the_modes_only():
