@@ -56,7 +56,7 @@ def literal(words: str) -> str:
 
 def ticks(low: float, high: float) -> list[float]:
     """Values to name on a logarithmic axis whose data lie between two numbers above zero."""
-    decades = np.log10(high / low)
+    decades = np.log10(high) - np.log10(low)  # the ratio may be too large for a number
     if decades < 0.5:
         beyond = 0.1 * (high - low) or 0.2 * low
         values = MaxNLocator(5).tick_values(low - beyond, high + beyond)

@@ -110,3 +110,8 @@ def test_a_logarithmic_axis_names_some_values_but_not_many(low, decades):
     assert len(inside) >= 2
     assert len(inside) <= 16
     assert shown == sorted(set(shown))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_logarithmic_axis_may_begin_at_the_least_number():
+    assert len(ticks(1e-310, 10.0)) > 2
