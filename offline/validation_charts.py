@@ -82,7 +82,7 @@ def frontier_chart(rows: Sequence[Mapping[str, Any]], budget: float | None = Non
     known = [r for r in rows if np.isfinite([r["ms a scan"], r["ratio"]]).all()]
     if not known:
         return None
-    banks = {"bank of 2, 3, ... members": CANCELLING, "the same, thrifty": THRIFTY}
+    banks = {"bank of 2, 3, ... members": CANCELLING, "the same, by gain per cost": THRIFTY}
     others = [r for r in known if r["what"] not in POINTS and r["what"] not in banks.values()]
     drawn: list[Drawn] = []
     for what in dict.fromkeys(r["what"] for r in others):
