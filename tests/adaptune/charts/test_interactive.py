@@ -48,7 +48,7 @@ def test_each_name_is_in_the_legend_once_and_a_click_on_it_reaches_all_panels():
 def test_lines_look_as_on_paper():
     (wide,) = traces_of(from_above(), "baseline")
     assert wide["line"]["color"] == LINES["baseline"]["color"]
-    assert wide["line"]["width"] == pytest.approx(LINES["baseline"]["lw"] * 4 / 3)
+    assert wide["line"]["width"] == pytest.approx(LINES["baseline"]["lw"] * 4 / 3, abs=0.01)
     (limit,) = traces_of(over_time(), "limit")
     assert "dash" in limit["line"]
     assert "dash" not in wide["line"]
