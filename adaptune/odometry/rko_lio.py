@@ -21,7 +21,7 @@ from adaptune.odometry.base import (
     import_extra,
 )
 from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
-from adaptune.odometry.scan_time import END
+from adaptune.odometry.scan_time import END, MIDDLE
 from adaptune.sequence.imu import Imu
 from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
@@ -84,8 +84,6 @@ class RkoLio(OwnFrameOdometry):
     level: the adapter turns that frame so that the mean of the first accelerations points up.
     """
 
-    _share = END
-
     space = ParameterSpace.of(
         voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True),
         max_correspondence_distance=Float(low=0.1, high=3.0, baseline=0.5, log=True),
@@ -122,6 +120,7 @@ class RkoLio(OwnFrameOdometry):
         config.min_range, config.max_range = self.settings.min_range, self.settings.max_range
         config.double_downsample = self.settings.double_downsample
         config.deskew = self.settings.deskew and prepared.duration > 0
+        self._share = END if config.deskew else MIDDLE
         config.max_num_threads = 1
         self._lio = bindings._LIO(config)
         T_sensor_imu = prepared.imu.T_sensor_imu
