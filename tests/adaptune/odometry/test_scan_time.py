@@ -1,9 +1,7 @@
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
 import turns
-from needs import lacking
+from needs import needs_evalio
 
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.scan_time import END, MIDDLE, START, AtStamp, duration_of
@@ -74,8 +72,8 @@ def test_how_long_a_scan_takes():
 
 @pytest.mark.parametrize("name", ["kiss_icp", "genz_icp", "mad_icp", "form"])
 def test_a_motion_is_that_between_stamps_while_the_sensor_gets_faster(name):
-    if name != "kiss_icp" and find_spec("evalio") is None:
-        lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")
+    if name != "kiss_icp":
+        needs_evalio()
     odometry, gain, n = odometry_class(name)(), 0.02, 20
     scans = [turns.turn(i, gain=gain) for i in range(n)]
     odometry.start(odometry.prepare(scans[0]), np.eye(4))
