@@ -18,6 +18,16 @@ def test_studies_of_third_party_odometries_differ_in_their_odometry_only() -> No
     assert len(rests) == 1
 
 
+def test_the_study_of_all_four_has_the_same_drives(tmp_path: Path) -> None:
+    needs_evalio()
+    every, alone = (
+        load_study(CONFIGS / f"{name}.yaml", folder=tmp_path / name).config
+        for name in ("third_party", THIRD_PARTY[0])
+    )
+    assert {f"third_party_{one}" for one in every.odometries} == set(THIRD_PARTY)
+    assert (every.courses, every.test) == (alone.courses, alone.test)
+
+
 @pytest.mark.parametrize("name", THIRD_PARTY)
 def test_studies_of_third_party_odometries_load(name: str, tmp_path: Path) -> None:
     if name != "third_party_kiss_icp":
