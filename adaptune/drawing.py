@@ -14,17 +14,17 @@ from adaptune.files import replacing
 # lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
 # grey, too. Modes on demand are dashed, each in its own way.
 LINES: dict[str, dict[str, Any]] = {
-    "baseline": {"color": "#bbbbbb", "lw": 5.0},
-    "best_default": {"color": "#882255", "lw": 4.3},
-    "equal_cost": {"color": "#56c8a0", "lw": 3.6},
-    "fixed": {"color": "#0072b2", "lw": 2.8},
-    "paired": {"color": "#e69f00", "lw": 1.8},
-    "untrained": {"color": "#7b3294", "lw": 1.0},
-    "one_set": {"color": "#66ccee", "lw": 1.3, "ls": (0, (5, 3, 1, 3))},
-    "bank": {"color": "#a04000", "lw": 1.3, "ls": (0, (6, 6))},
-    "bank_learned": {"color": "#ddcc77", "lw": 1.3, "ls": (0, (4, 4))},
-    "even": {"color": "#117733", "lw": 1.3, "ls": (0, (2, 2))},
-    "random": {"color": "#dd6688", "lw": 1.3, "ls": (0, (1, 1.5))},
+    "baseline": {"color": "#bbbbbb", "lw": 10.2},
+    "best_default": {"color": "#882255", "lw": 8.4},
+    "equal_cost": {"color": "#56c8a0", "lw": 6.6},
+    "fixed": {"color": "#0072b2", "lw": 4.8},
+    "paired": {"color": "#e69f00", "lw": 3.0},
+    "untrained": {"color": "#7b3294", "lw": 1.2},
+    "one_set": {"color": "#66ccee", "lw": 1.7, "ls": (0, (5, 3, 1, 3))},
+    "bank": {"color": "#a04000", "lw": 1.7, "ls": (0, (6, 6))},
+    "bank_learned": {"color": "#ddcc77", "lw": 1.7, "ls": (0, (4, 4))},
+    "even": {"color": "#117733", "lw": 1.7, "ls": (0, (2, 2))},
+    "random": {"color": "#dd6688", "lw": 1.7, "ls": (0, (1, 1.5))},
     "paper": {"color": "#000000", "lw": 0.9, "ls": (0, (4, 4))},
 }
 """Lines of the modes, the lowest first."""
