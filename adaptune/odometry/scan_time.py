@@ -9,6 +9,7 @@ are not the motions between stamps.
 import numpy as np
 
 from adaptune.geometry import Poses, invert, scale
+from adaptune.odometry.isolation import pose_fault
 from adaptune.sequence.scan import Scan
 
 START, MIDDLE, END = 0.0, 0.5, 1.0
@@ -63,7 +64,9 @@ class AtStamp:
         return T_odom_then
 
     def __call__(self, stamp: int, duration: int, T_odom_then: Poses) -> Poses:
-        """The pose at a scan's stamp, from the odometry's."""
+        """The pose at a scan's stamp, from the odometry's; a faulty pose is left as it is."""
+        if pose_fault(T_odom_then):
+            return T_odom_then
         before, T_odom_before = self._before
         then = stamp + self._share * duration
         if self._begun_at is not None:

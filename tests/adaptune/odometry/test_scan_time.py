@@ -60,6 +60,14 @@ def test_a_scan_without_duration_stays():
     np.testing.assert_array_equal(carry(TURN, 0, at(1.5)), at(1.5))
 
 
+@pytest.mark.parametrize("faulty", [np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1]), np.eye(3)])
+def test_a_faulty_pose_is_left_to_those_who_tell_of_it(faulty):
+    carry = AtStamp(END)
+    carry.begin(0, TURN, at(0.0), at(0.5))
+    assert carry(TURN, TURN, faulty) is faulty
+    np.testing.assert_allclose(carry(2 * TURN, TURN, at(1.5)), at(1.0), atol=1e-9)
+
+
 def test_how_long_a_scan_takes():
     points = np.zeros((3, 3), np.float32)
     times = np.array([0.0, 0.05, 0.1], np.float32)
