@@ -229,7 +229,8 @@ def _check_switching(
         if isinstance(given, dict):
             yield from _check_set((*key, "sets", i), given, space)
     whole, names = any(one.whole for one in described), ", ".join(config.odometries)
-    if whole and "rules" in online.model_fields_set and online.rules:
+    # A study's folder holds the defaults, too.
+    if whole and online.rules and online.rules != type(online)().rules:
         message = f"{names} runs whole recordings and cannot adapt; leave this out"
         yield Mistake(("online", "rules"), message)
     live = len(described) == 1 and described[0].live

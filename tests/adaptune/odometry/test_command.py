@@ -342,6 +342,12 @@ def test_mistakes_in_the_study(make, override, words):
     assert words in str(caught.value)
 
 
+def test_its_study_is_loaded_from_the_folder_too(make):
+    study = make()
+    study.open()
+    assert load_study(study.folder / "study.yaml").config.online == study.config.online
+
+
 def test_a_template_whose_values_share_a_name(make, tmp_path):
     make()
     twice = '{"registration": {"voxel": 1}, "a": {"distance": 1}, "b": {"distance": 2}}'
