@@ -68,22 +68,27 @@ def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
 def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
     """What is estimated where there is no reference, and where the reference contradicts it."""
     said = []
+    contradicted: dict[str, list[str]] = {}
     for row in rows:
         if row.estimated is None or row.sequence == ALL:
             continue
         ends = row.estimated_interval
-        interval = "" if ends is None else f" (95 % interval {ends[0]:.3f}-{ends[1]:.3f} %)"
+        interval = "" if ends is None else f"95 % interval {ends[0]:.3f}-{ends[1]:.3f} %"
         if row.rte is None:
             said.append(
                 f"{row.sequence} has no reference. `{row.mode}` estimates its own mean RTE there: "
-                f"{row.estimated:.3f} %{interval}."
+                f"{row.estimated:.3f} %{interval and f' ({interval})'}."
             )
         elif ends is not None and not ends[0] <= row.rte <= ends[1]:
-            said.append(
-                f"On {row.sequence} `{row.mode}` estimates its own mean RTE at "
-                f"{row.estimated:.3f} %{interval}; by the {_called(row)} it is {row.rte:.3f} %. "
-                f"One of the two is wrong over this length."
+            contradicted.setdefault(row.mode, []).append(
+                f"{row.estimated:.3f} % ({interval}) on {row.sequence}, where by the "
+                f"{_called(row)} it is {row.rte:.3f} %"
             )
+    for mode, those in contradicted.items():
+        said.append(
+            f"`{mode}` estimates its own mean RTE at {'; '.join(those)}. "
+            f"Either the estimate or the reference is wrong there over this length."
+        )
     return said
 
 

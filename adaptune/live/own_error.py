@@ -27,6 +27,10 @@ UNSURE = 0.3
 scaled to e times the metres of its chains."""
 
 
+HOP_ERROR = 0.05
+"""Metres by which a hop itself is wrong where registrations are worst, as among plants."""
+
+
 class OwnError(NamedTuple):
     """An odometry's own error, estimated without ground truth, in percent of the distance."""
 
@@ -53,6 +57,7 @@ class _Chain(NamedTuple):
     end: float
     seconds: float
     error: float  # metres
+    hops: int
 
 
 class OwnErrors:
@@ -101,23 +106,26 @@ class OwnErrors:
         """The mean error over the last chains; None without any."""
         if not self._chains:
             return None
-        start, end, _, error = np.array(self._chains).T
+        start, end, _, error, hops = np.array(self._chains).T
         reach = end - start
         # Of a whole recording, the last chain may be a short one.
         usual = float(reach.max() if self._whole else reach[-1])
         long = reach >= NEARLY * min(self._length, usual)
-        start, end, reach, error = start[long], end[long], reach[long], error[long]
+        start, end, reach, error, hops = (of[long] for of in (start, end, reach, error, hops))
         times = max(1.0, self._length / float(reach.mean()))
         mean = times**GROWTH * float((100.0 * error / reach).mean())
         deviation = UNSURE * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
         factor = float(np.exp(1.96 * deviation))
-        return OwnError(mean, mean / factor, mean * factor)
+        # Some of it, or all, may be what the hops are wrong by.
+        of_hops = times**GROWTH * float((100.0 * HOP_ERROR * np.sqrt(hops) / reach).mean())
+        low = float(np.sqrt(max(0.0, mean**2 - of_hops**2))) / factor
+        return OwnError(mean, low, mean * factor)
 
 
 def _chain(links: deque[Link], length: float) -> _Chain:
     """Chain hops from the newest back until they reach over a length, or none is near enough."""
     first = newest = links[-1]
-    covered = newest.end - newest.start
+    covered, n = newest.end - newest.start, 1
     T = _completed(newest)
     for link in reversed(links):
         if newest.end - first.start >= NEARLY * length:
@@ -128,12 +136,12 @@ def _chain(links: deque[Link], length: float) -> _Chain:
         if hops < COVERED * (newest.end - link.start):
             break
         T = _completed(link) @ (invert(link.T_odom_end) @ first.T_odom_start) @ T
-        first, covered = link, hops
+        first, covered, n = link, hops, n + 1
     T_odom = invert(first.T_odom_start) @ newest.T_odom_end
     error = float(np.linalg.norm(T_odom[:3, 3] - T[:3, 3]))
     # Between the hops it errs, too, and not in the same direction.
     error *= float(np.sqrt((newest.end - first.start) / covered))
-    return _Chain(first.start, newest.end, newest.seconds, error)
+    return _Chain(first.start, newest.end, newest.seconds, error, n)
 
 
 def _completed(link: Link) -> Poses:

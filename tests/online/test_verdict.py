@@ -208,3 +208,19 @@ def test_it_is_told_where_no_choice_of_one_set_could_gain(best, told):
     what = "In hindsight, the best set of each sequence would gain less than 1 %"
     assert any(sentence.startswith(what) for sentence in said) == told
     assert said[-1].startswith("What to do: ")
+
+
+def test_all_estimates_that_the_reference_contradicts_are_one_sentence():
+    """The fixed set's error is 1.0 % by the reference."""
+    fixed = [row for row in every(n=3) if row.mode == "fixed"]
+    measured = [
+        replace(row, estimated=1.5, estimated_interval=(low, 2.0))
+        for row, low in zip(fixed, (1.2, 0.9, 1.1, 1.3), strict=True)
+    ]
+    said = [sentence for sentence in remarks(measured) if "estimates its own" in sentence]
+    assert said == [
+        "`fixed` estimates its own mean RTE at 1.500 % (95 % interval 1.200-2.000 %) on s0, where "
+        "by the reference it is 1.000 %; 1.500 % (95 % interval 1.100-2.000 %) on s2, where by the "
+        "reference it is 1.000 %. Either the estimate or the reference is wrong there over this "
+        "length."
+    ]

@@ -5,7 +5,7 @@ import pytest
 from rooms import moved
 
 from adaptune.live.hop import Hop
-from adaptune.live.own_error import COVERED, GROWTH, UNSURE, Link, OwnErrors
+from adaptune.live.own_error import COVERED, GROWTH, HOP_ERROR, UNSURE, Link, OwnErrors
 from adaptune.live.squares import SECONDS
 
 KNOWN = np.eye(3)
@@ -95,12 +95,24 @@ def test_a_length_that_no_chain_reaches_is_scaled_and_less_sure():
     assert one.mean == pytest.approx(2.0 * 10.0**GROWTH)
     deviation = UNSURE * np.sqrt(1.0 + np.log(10.0) ** 2)
     assert one.high / one.mean == pytest.approx(np.exp(1.96 * deviation))
-    assert one.mean / one.low == pytest.approx(one.high / one.mean)
+    of_hops = 10.0**GROWTH * 100.0 * HOP_ERROR / 10.0
+    without = np.sqrt(one.mean**2 - of_hops**2)
+    assert without / one.low == pytest.approx(one.high / one.mean)
+
+
+def test_an_error_that_may_be_the_hops_own_may_be_none():
+    """A chain of two hops is less wrong for its length than a single hop."""
+    for length, of_hops in ((10.0, 0.5), (20.0, 0.5 / np.sqrt(2.0))):
+        for times in (0.9, 1.1):
+            share = 1.0 + times * of_hops / 100.0
+            _, found = along(length, lambda metres, share=share: moved(share * metres))
+            assert found[-1].mean == pytest.approx(times * of_hops)
+            assert (found[-1].low > 0.0) == (times > 1.0)
 
 
 def test_the_interval_narrows_with_the_path_it_rests_on():
     _, found = along(10.0, lambda metres: moved(1.02 * metres), n=21)
-    width = [one.high / one.low for one in found]
+    width = [one.high / one.mean for one in found]
     assert all(late <= early for early, late in pairwise(width))
     assert np.log(width[-1]) == pytest.approx(np.log(width[0]) / np.sqrt(3.0))
 
