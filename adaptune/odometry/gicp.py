@@ -31,8 +31,8 @@ class _SmallGicp(KeyframeOdometry):
         cloud, tree = small_gicp.preprocess_points(
             points, downsampling_resolution=self.parameters["downsampling"], num_threads=1
         )
-        # Points, normals, covariances (4 + 4 + 16 doubles) and the tree.
-        nbytes = 4096 + 230 * cloud.size()
+        # Measured. Points, normals and covariances alone are 24 doubles; then there is the tree.
+        nbytes = 4096 + 300 * cloud.size()
         return PreparedCloud(scan.stamp, cloud, cloud.size() >= MIN_POINTS, nbytes, tree)
 
     @abstractmethod
