@@ -56,6 +56,10 @@ MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
 ELSEWHERE, AS_MANY = float(np.log(0.8)), 2
 """The loss of banks elsewhere, and as how many stretches it counts: few stretches show little."""
+BASELINE = 0
+"""Trial number of the baseline; of several odometries, that of the first."""
+MANY = 3
+"""A bank of so many members, or more, has one to spare."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
@@ -197,7 +201,7 @@ def _choosers(
     def of_size(
         way: Chooser, size: int = bank, spending: Spending | None = None
     ) -> Callable[[LabelledData, int], list[int]]:
-        return lambda data, fixed: way(data, fixed, size, spending)
+        return lambda data, fixed: with_baseline(way(data, fixed, size, spending), data, spending)
 
     if data.costs is None or data.budget is None:
         return {name: of_size(way) for name, way in WAYS.items()}
@@ -324,6 +328,21 @@ def complementary_members(
         if len(chosen) < size and trial not in chosen and fits:
             chosen.append(trial)
     return chosen
+
+
+def with_baseline(
+    members: list[int], data: LabelledData, spending: Spending | None = None
+) -> list[int]:
+    """Let the baseline take the place of the member that was chosen last, if it is none of them.
+
+    In places that are unlike the training, what the odometry's authors chose is the best guess
+    there is; live evidence tells whether it is right.
+    """
+    swapped = [*members[:-1], BASELINE]
+    known = all(BASELINE in s.vectors for s in data.sequences)
+    if BASELINE in members or len(members) < MANY or not known:
+        return members
+    return swapped if spending is None or spending.allows(swapped) else members
 
 
 WAYS: dict[str, Chooser] = {

@@ -16,6 +16,7 @@ from offline.tuning import (
     cancelling_members,
     choose,
     complementary_members,
+    with_baseline,
 )
 
 
@@ -132,6 +133,18 @@ def test_members_are_chosen_in_both_ways():
     # A set whose motions are unknown is no member.
     few = [replace(s, vectors={t: s.vectors[t] for t in (0, 3)}) for s in data.sequences]
     assert complementary_members(labelled(few), 0, 4) == [0, 3]
+
+
+def test_the_baseline_takes_the_last_place_of_a_bank():
+    rng = np.random.default_rng(7)
+    data = labelled([in_stretches(with_motions("s", rng, 500))])
+    assert with_baseline([3, 8, 4], data) == [3, 8, 0]
+    assert with_baseline([3, 0, 4], data) == [3, 0, 4]
+    assert with_baseline([3, 8], data) == [3, 8]  # it has none to spare
+    *_, last = choose(data, 3, fixed=3).members
+    assert last == 0
+    without = [replace(s, vectors={t: s.vectors[t] for t in (3, 4, 8)}) for s in data.sequences]
+    assert with_baseline([3, 8, 4], labelled(without)) == [3, 8, 4]
 
 
 def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
