@@ -30,8 +30,13 @@ class ComparedModes(NamedTuple):
             for mode, twin in self.twins.items()
         ]
         if self.unfinished:
+            there = [mode for mode in self.modes if mode not in ALSO]
+            each = (
+                f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(study, name, m))})"
+                for name in self.unfinished
+            )
             said.append(
-                f"Not compared, for want of replays: {', '.join(self.unfinished)}; "
+                f"Not compared, because replays are missing: {', '.join(each)}; "
                 f"`adaptune online` makes them."
             )
         where: dict[tuple[str, ...], list[str]] = {}

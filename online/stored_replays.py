@@ -161,12 +161,12 @@ class StoredReplay:
         try:
             trajectory = read_tum(folder / "trajectory.tum")
         except TrajectoryError as error:
-            help_ = "run `adaptune online --again`"
-            raise StoredReplayError(f"{error}; {help_}") from error
+            raise StoredReplayError(f"{error}; {_made_again(folder)}") from error
         frames = read_columns(folder / "frames.csv")
         restarted = np.array(frames.get("restarted", [])) == "1"
         if len(restarted) != len(trajectory):
-            raise damaged(folder / "frames.csv", ValueError("not a row for every scan"))
+            cut = "frames.csv" if len(trajectory) == summary.scans else "trajectory.tum"
+            raise damaged(folder / cut, ValueError("not a row for every scan"))
         try:
             seconds = 1e-3 * sum(float(ms) for key in _TIMES for ms in frames[key])
         except (KeyError, ValueError) as error:
@@ -403,4 +403,8 @@ def _numbers(values: Sequence[str]) -> list[Any]:
 def damaged(path: Path, error: Exception) -> StoredReplayError:
     """What is raised on a file of a replay that cannot be understood."""
     what = f"is damaged ({in_one_line(error)})"
-    return StoredReplayError(f"{path}: {what}; run `adaptune online --again`")
+    return StoredReplayError(f"{path}: {what}; {_made_again(path.parent)}")
+
+
+def _made_again(folder: Path) -> str:
+    return f"remove {folder} and run `adaptune online` with this study, which makes it again"

@@ -69,7 +69,13 @@ def _where(rows: Sequence[ComparisonRow]) -> str:
 
 def _interval(ratio: Ratio) -> str:
     ends = ratio.interval
-    return "no interval" if ends is None else f"95 % interval {ends[0]:.2f} to {ends[1]:.2f}"
+    return "no interval" if ends is None else f"95 % interval {_end(ends[0])} to {_end(ends[1])}"
+
+
+def _end(ratio: float) -> str:
+    """An end of an interval; one that is near 1 has more digits, to show on which side it lies."""
+    text = f"{ratio:.2f}"
+    return f"{ratio:.3f}" if text == "1.00" and ratio != 1.0 else text
 
 
 def _ratio(row: ComparisonRow) -> Ratio:

@@ -58,10 +58,13 @@
     const body = header.closest("table").tBodies[0];
     const value = (row) => row.cells[header.cellIndex].dataset.value;
     const sign = ascending ? 1 : -1;
-    body.append(...[...body.rows].sort((a, b) => compared(value(a), value(b), sign)));
+    // The average over the rows stays below them.
+    const below = (row) => row.cells[0].dataset.value === "average";
+    const order = (a, b) => below(a) - below(b) || compared(value(a), value(b), sign);
+    body.append(...[...body.rows].sort(order));
   }
   for (const header of document.querySelectorAll("th[aria-sort]")) {
-    header.querySelector("button").addEventListener("click", () => sort(header));
+    header.addEventListener("click", () => sort(header));
   }
   drawAll();
 })();

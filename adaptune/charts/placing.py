@@ -59,7 +59,8 @@ def ticks(low: float, high: float) -> list[float]:
     decades = np.log10(high) - np.log10(low)  # the ratio may be too large for a number
     if decades < 0.5:
         beyond = 0.1 * (high - low) or 0.2 * low
-        values = MaxNLocator(5).tick_values(low - beyond, high + beyond)
+        # Round steps: of ratios, 1 is named.
+        values = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(low - beyond, high + beyond)
         return [float(value) for value in values if value > 0.0]
     few = "1" if decades > 4.0 else "125" if decades > 1.3 else "12357"
     powers = range(int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1)

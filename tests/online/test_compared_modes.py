@@ -151,9 +151,10 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     shutil.rmtree(both.folder / "replays/four/untrained")
     compared = compared_modes(both)
     assert (compared.sequences, compared.unfinished) == (("three",), ("four",))
-    assert "Not compared, for want of replays: four; `adaptune online` makes them." in (
-        compare(both).words
-    )
+    assert (
+        "Not compared, because replays are missing: four (`fixed`, `paper`); `adaptune online` "
+        "makes them."
+    ) in compare(both).words
     shutil.rmtree(both.folder / "replays/three/fixed")
     with pytest.raises(StoredReplayError, match=r"three/fixed: there is no replay; run"):
         compare(both)

@@ -296,7 +296,8 @@ def test_a_damaged_replay_is_named(replayed, file, text):
     before = path.read_text()
     path.write_text(text)
     try:
-        with pytest.raises(StoredReplayError, match=rf"{file}: is damaged .*--again") as caught:
+        what = rf"{file}: is damaged .*; remove .*paired and run `adaptune online` with this study"
+        with pytest.raises(StoredReplayError, match=what) as caught:
             compare(replayed)
         assert "https://" not in str(caught.value)
     finally:
@@ -385,8 +386,14 @@ def test_restarts_and_speed_are_those_of_the_stored_replay(own):
     assert remarks(found)[-1] == (
         "On three the health check restarted paired 2 times, first at 0.5 s (max_speed)."
     )
+    trajectory = folder / "trajectory.tum"
+    whole = trajectory.read_text()
+    trajectory.write_text("".join(whole.splitlines(keepends=True)[:20]))
+    with pytest.raises(StoredReplayError, match=r"trajectory\.tum: is damaged \(not a row"):
+        compare(own)
+    trajectory.write_text(whole)
     (folder / "frames.csv").write_text("restarted\n" + "0\n" * 40)
-    with pytest.raises(StoredReplayError, match=r"frames\.csv: is damaged .*--again"):
+    with pytest.raises(StoredReplayError, match=r"frames\.csv: is damaged .*; remove .* and run"):
         compare(own)
 
 

@@ -258,7 +258,7 @@ def test_a_model_that_is_older_than_the_trials(load):
 def test_a_file_that_was_removed_is_made_again(load, file):
     study = load()
     (study.folder / "replays/three/fixed" / file).unlink()
-    with pytest.raises(StoredReplayError, match=rf"{file}.* run `adaptune online --again`"):
+    with pytest.raises(StoredReplayError, match=rf"{file}.*; remove .* and run `adaptune online`"):
         compare(study)
     assert run(study) == 1
     compare(study)

@@ -210,6 +210,12 @@ def test_it_is_told_where_no_choice_of_one_set_could_gain(best, told):
     assert said[-1].startswith("What to do: ")
 
 
+def test_an_end_near_1_shows_on_which_side_it_lies():
+    near = [replace(row, ratio_interval=(1.004, 1.12)) for row in rows_of(paired=1.04)]
+    said = verdict([*every(paired=1.04)[:-3], *near])
+    assert "(95 % interval 1.004 to 1.12)" in said[0]
+
+
 def test_all_estimates_that_the_reference_contradicts_are_one_sentence():
     """The fixed set's error is 1.0 % by the reference."""
     fixed = [row for row in every(n=3) if row.mode == "fixed"]
