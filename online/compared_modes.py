@@ -31,12 +31,12 @@ class ComparedModes(NamedTuple):
         ]
         if self.unfinished:
             there = [mode for mode in self.modes if mode not in ALSO]
-            each = (
+            lacking = (
                 f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(study, name, m))})"
                 for name in self.unfinished
             )
             said.append(
-                f"Not compared, because replays are missing: {', '.join(each)}; "
+                f"Not compared, because replays are missing: {', '.join(lacking)}; "
                 f"`adaptune online` makes them."
             )
         where: dict[tuple[str, ...], list[str]] = {}
