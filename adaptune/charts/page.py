@@ -21,6 +21,8 @@ from adaptune.report import Listing, cell_text
 
 FIGURES = "figures"
 """The folder beside a page that holds its charts as PNG and SVG."""
+_WIDE = 14
+"""A table with more columns is printed smaller, so that it does not make the whole page smaller."""
 _LONG = 40
 """Letters from which on a cell has several lines."""
 # Nothing may be fetched, whatever a name in the page says.
@@ -186,8 +188,9 @@ def _table(table: Listing) -> str:
     body = f"<table><thead><tr>{headings}</tr></thead>\n<tbody>{rows}</tbody></table>"
     # The box scrolls, and so has to be reached by the keyboard.
     box = f'<div class="box" role="region" tabindex="0" aria-label="{title}">{body}</div>'
+    kind = "wide table" if len(keys) > _WIDE else "table"
     return (
-        f'<div class="table"><h3>{title}</h3>\n{box if keys else "<p>No rows.</p>"}{note}</div>\n'
+        f'<div class="{kind}"><h3>{title}</h3>\n{box if keys else "<p>No rows.</p>"}{note}</div>\n'
     )
 
 

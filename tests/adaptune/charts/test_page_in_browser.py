@@ -4,7 +4,8 @@ import pytest
 from needs import needs_browser
 from sample_charts import sample_page, samples
 
-from adaptune.charts.page import page_text
+from adaptune.charts.page import Page, PageSection, page_text
+from adaptune.report import Listing
 
 DRAWN = "html[data-drawn]"
 
@@ -168,3 +169,22 @@ def test_a_section_is_reached_from_the_navigation(page):
     page.get_by_role("link", name="What is missing").click()
     page.wait_for_timeout(600)
     assert page.locator("#page-section-3").bounding_box()["y"] < 900
+
+
+def test_a_table_of_many_columns_does_not_make_the_printed_page_wider(page):
+    rows = [{f"name_{i}": 1.234 * i for i in range(20)}]
+    page.set_content(
+        page_text(Page("A", "", (), (PageSection("B", tables=(Listing("C", rows),)),)))
+    )
+    page.set_viewport_size({"width": 688, "height": 900})
+    page.emulate_media(media="print")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 688
+
+
+def test_a_click_anywhere_in_a_heading_sorts_and_the_average_stays_last(page):
+    rows = [{"sequence": name, "error": error} for name, error in (("a", 2.0), ("b", 1.0))]
+    listing = Listing("C", [*rows, {"sequence": "average", "error": 1.5}])
+    page.set_content(page_text(Page("A", "", (), (PageSection("B", tables=(listing,)),))))
+    for order in (["b", "a", "average"], ["a", "b", "average"]):
+        page.locator("th").nth(1).click(position={"x": 2, "y": 2})
+        assert page.locator("td:first-child").all_text_contents() == order
