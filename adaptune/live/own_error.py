@@ -25,8 +25,6 @@ GROWTH = -0.15
 UNSURE = 0.3
 """Standard deviation of the logarithm of an estimate that rests on one chain; and of one that is
 scaled to e times the metres of its chains."""
-
-
 HOP_ERROR = 0.05
 """Metres by which a hop itself is wrong where registrations are worst, as among plants."""
 
@@ -57,7 +55,7 @@ class _Chain(NamedTuple):
     end: float
     seconds: float
     error: float  # metres
-    hops: int
+    hops: int  # how many
 
 
 class OwnErrors:
@@ -132,11 +130,11 @@ def _chain(links: deque[Link], length: float) -> _Chain:
             break
         if link.end > first.start:
             continue
-        hops = covered + link.end - link.start
-        if hops < COVERED * (newest.end - link.start):
+        metres = covered + link.end - link.start
+        if metres < COVERED * (newest.end - link.start):
             break
         T = _completed(link) @ (invert(link.T_odom_end) @ first.T_odom_start) @ T
-        first, covered, n = link, hops, n + 1
+        first, covered, n = link, metres, n + 1
     T_odom = invert(first.T_odom_start) @ newest.T_odom_end
     error = float(np.linalg.norm(T_odom[:3, 3] - T[:3, 3]))
     # Between the hops it errs, too, and not in the same direction.
