@@ -2,7 +2,8 @@
 
 import logging
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +30,17 @@ SCANS_TO_KNOW = 10
 
 WORSE = 2.0
 """A single odometry leaves a set whose error is surely more than so many times the predicted."""
-AVOIDED = 60.0
-"""Seconds for which it does not return to that set."""
+REMEMBERED = 60.0
+"""Seconds for which what was measured of that set counts, and not what is predicted."""
 
 _log = logging.getLogger(__name__)
+
+
+class _Worse(NamedTuple):
+    """What was measured of a set that did worse than predicted."""
+
+    error: float  # percent
+    until: float  # seconds
 
 
 class Selector:
@@ -44,7 +52,8 @@ class Selector:
     is measured counts from the next selection on. The selector reads no clock and no file.
 
     With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
-    the last selections. A single odometry leaves a set that does worse than predicted. Scans of a
+    the last selections. A single odometry leaves a set that surely does worse than predicted, if
+    another one, or the baseline, is predicted to do better than that. Scans of a
     sensor or mount that was not trained with (`ErrorModel.is_foreign`) get the fixed set, or in a
     bank weights by what is measured alone.
 
@@ -132,7 +141,7 @@ class Selector:
         self._elevations: list[float] = []
         self._warned = False
         self._live.reset()
-        self._avoided: dict[int, float] = {}
+        self._worse: dict[int, _Worse] = {}  # by trial
         self._predicted = np.nan
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
@@ -175,7 +184,9 @@ class Selector:
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
         selection = self._choose(feature)
-        if self._rule.gated and self._is_foreign(self._scan):
+        # Where the fixed set does worse than predicted, training's guess is better than none.
+        leaves = self.fixed in self._worse
+        if self._rule.gated and self._is_foreign(self._scan) and not leaves:
             selection = self._without_training(selection)
         if self.members and selection.weights is None:
             selection = self._of_those_present(selection)
@@ -216,19 +227,19 @@ class Selector:
             return self._rule.select(feature, self._current, self._worse_than_predicted())
         return self._rule.select(feature, self._current)
 
-    def _worse_than_predicted(self) -> Collection[int]:
-        """The sets that have done worse than predicted over the last metres."""
+    def _worse_than_predicted(self) -> Mapping[int, float]:
+        """By trial, what was measured of sets that have done worse than predicted, in percent."""
         seconds = self._stamp * 1e-9
-        self._avoided = {t: until for t, until in self._avoided.items() if until > seconds}
+        self._worse = {t: worse for t, worse in self._worse.items() if worse.until > seconds}
         error = self._live.own_error()
         current = self._current
         if error is not None and current is not None and error.low > WORSE * self._predicted:
-            self._avoided[current] = seconds + AVOIDED
-        return self._avoided
+            self._worse[current] = _Worse(error.mean, seconds + REMEMBERED)
+        return {trial: worse.error for trial, worse in self._worse.items()}
 
     def _kept(self) -> int | None:
         """The current set, if it has just been selected and does not do worse than predicted."""
-        if self._current in self._avoided or self._stamp - self._switched >= self._dwell:
+        if self._current in self._worse or self._stamp - self._switched >= self._dwell:
             return None
         return self._current
 

@@ -23,6 +23,7 @@ from adaptune.model.bank_weights import (
 )
 from adaptune.model.base import complementary, mean_errors
 from adaptune.model.costs import Spending
+from adaptune.model.paired import BASELINE
 from adaptune.study.config import MOST_MEMBERS
 from adaptune.study.driven import BANK, ONE_SET, RELIES_ON_LIVE
 from offline.expected_loss import Figures, expected_loss, figures, log_ratios
@@ -56,8 +57,6 @@ MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
 ELSEWHERE, AS_MANY = float(np.log(0.8)), 2
 """The loss of banks elsewhere, and as how many stretches it counts: few stretches show little."""
-BASELINE = 0
-"""Trial number of the baseline; of several odometries, that of the first."""
 MANY = 3
 """A bank of so many members, or more, has one to spare."""
 ROUNDING = 1e-6

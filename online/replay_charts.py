@@ -46,6 +46,7 @@ def charts_of_replays(study: Study, sequence: str) -> Charts:
     if not replayed.modes:
         none = [f"No replays of {sequence}: run `adaptune online`."]
         return Charts([], [*replayed.refused] or none)
+    whose = "mode whose replay can be read" if replayed.refused else "mode"
     return charts_of(
         (
             *replayed.refused,
@@ -53,7 +54,7 @@ def charts_of_replays(study: Study, sequence: str) -> Charts:
             or f"No errors of the replays of {sequence}: it has no reference.",
             choice_chart(replayed),
             map_chart(replayed)
-            or f"No map of what was selected on {sequence}: no mode has changed anything.",
+            or f"No map of what was selected on {sequence}: no {whose} has changed anything.",
             familiarity_chart(replayed),
             latency_chart(replayed),
         )

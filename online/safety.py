@@ -1,10 +1,14 @@
-"""Applies what is selected, and returns to the fixed set where that or the odometry goes wrong."""
+"""Applies what is selected, and returns to the fixed set where that or the odometry goes wrong.
+
+The baseline is as safe as the fixed set: where the odometry goes wrong with it, it only restarts.
+"""
 
 import logging
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from adaptune.errors import AdaptuneError
+from adaptune.model.paired import BASELINE
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
@@ -92,9 +96,11 @@ class Driver:
         return self._tracker.register_prepared(scan.stamp, prepared, seconds, scan)
 
     def _unhealthy(self, stamp: int, what: str) -> bool:
-        """Return to the fixed set, unless it is in use; whether it was not."""
+        """Return to the fixed set, unless it or the baseline is in use; whether it was not."""
         applied, fixed = self._applied, self._fixed
         if applied is None or fixed is None or applied[:3] == fixed[:3]:
+            return False
+        if applied.weights is None and applied.trial == BASELINE:
             return False
         return self._fall_back(stamp, applied, f"the health check found {what}")
 

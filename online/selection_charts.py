@@ -80,7 +80,7 @@ def latency_chart(replayed: ReplayedSequence) -> Chart | None:
         marks = () if selects else (Mark(period, "scan period", "x"),)
         panels.append(
             Panel(
-                Axis(f"milliseconds {what} [ms]", log=True),
+                Axis(f"time {what} [ms]", log=True),
                 Axis(f"share of the {'selections' if selects else 'scans'} [%]"),
                 (*histograms(times), *marks),
             )

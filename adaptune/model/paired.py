@@ -1,6 +1,6 @@
 """Selection by the paired expected ratio."""
 
-from collections.abc import Collection
+from collections.abc import Mapping
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
@@ -14,6 +14,8 @@ from adaptune.selection import Selection
 
 ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
+BASELINE = 0
+"""Trial number of the baseline; of several odometries, that of the first."""
 
 
 class PairedSettings(BaseModel):
@@ -22,7 +24,7 @@ class PairedSettings(BaseModel):
     # A file of a later version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    adapt: bool = True  # if not, the rule always keeps the fixed set
+    adapt: bool = True  # if not, the rule keeps the fixed set as long as that does as predicted
     # Number of complementary sets to choose among, the fixed one included; all sets if None.
     # Candidates that the training data name come first.
     n_sets: PositiveInt | None = 3
@@ -41,8 +43,8 @@ class Near(NamedTuple):
     """Errors on the training frames nearest to some scans."""
 
     evidence: Evidence
-    # (n_scans, n_sequences, n_candidates): mean error of every candidate in percent, mixed with
-    # that of its neighbours.
+    # (n_scans, n_sequences, n_candidates): mean error of every candidate, and of the baseline, in
+    # percent, mixed with that of its neighbours.
     errors: NDArray[np.float64]
     fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean error of the fixed set
 
@@ -72,6 +74,9 @@ class PairedExpectedRatio(Rule):
     The farther a scan is from all training sequences, compared with how far these are from each
     other, the more every ratio is drawn to 1. Beyond all of them the rule takes the fixed set.
 
+    Where a set does worse than predicted, what was measured of it counts instead. Then the baseline
+    is a candidate, too: in a place unlike all training, it is the best guess there is.
+
     Parameters
     ----------
     settings
@@ -90,6 +95,7 @@ class PairedExpectedRatio(Rule):
         """See `Rule.fit`."""
         self.data_ = data
         self.candidates_ = self._candidates()
+        self._known = self._with_baseline()
         self._fixed_at = self.candidates_.index(data.fixed)
         self.fixed_errors_ = data.fixed_errors
         self.errors_ = self._mixed_errors()
@@ -108,14 +114,24 @@ class PairedExpectedRatio(Rule):
             return tuple(data.sets.trials[c] for c in np.flatnonzero(complete))
         return tuple(complementary(data, n_sets))
 
+    def _with_baseline(self) -> tuple[int, ...]:
+        """The candidates, and behind them the baseline if it is none of them but may be chosen."""
+        data = self.data_
+        if BASELINE in self.candidates_ or BASELINE not in data.sets:
+            return self.candidates_
+        column = data.sets.column(BASELINE)
+        was_run = np.isfinite(mean_errors(data.errors[:, [column]], data.sequence)).all()
+        may_be = was_run and data.allows()[column]
+        return (*self.candidates_, BASELINE) if may_be else self.candidates_
+
     def _mixed_errors(self) -> NDArray[np.float32]:
-        """Error of every candidate on every frame, mixed with that of its neighbours.
+        """Error of the candidates and the baseline on every frame, mixed with their neighbours'.
 
         They are mixed before ratios are taken, for a ratio of means is linear in its numerator.
         """
         data = self.data_
         unit = data.sets.unit
-        columns = data.sets.columns(self.candidates_)
+        columns = data.sets.columns(self._known)
         squared = ((unit[:, None] - unit[columns]) ** 2).sum(axis=2)
         kernel = np.exp(-0.5 * squared / self.settings.width**2)
         kernel /= kernel.sum(axis=0)
@@ -141,7 +157,8 @@ class PairedExpectedRatio(Rule):
 
         The settings may differ in `sharpness`, `threshold` and `caution`.
         """
-        best, _ = _best_candidates(near, self._fixed_at, settings)
+        ratios = self._ratios(near, settings)
+        best = _best(ratios.cautious[:, : len(self.candidates_)], self._fixed_at, settings)
         return [self.candidates_[position] for position in best]
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -153,15 +170,16 @@ class PairedExpectedRatio(Rule):
         near = self.near(feature[None])
         predicted = np.full(len(self.data_.sets), np.inf)
         expected, _, weights = _expected_ratios(near, self.settings)
+        n = len(self.candidates_)
         columns = self.data_.sets.columns(self.candidates_)
-        predicted[columns] = expected[0] * float(weights[0] @ near.fixed[0])
+        predicted[columns] = expected[0, :n] * float(weights[0] @ near.fixed[0])
         return predicted
 
     def select(
         self,
         feature: NDArray[np.float64],
         current: int | None = None,
-        avoid: Collection[int] = (),
+        measured: Mapping[int, float] | None = None,
     ) -> Selection:
         """See `Rule.select`.
 
@@ -171,26 +189,29 @@ class PairedExpectedRatio(Rule):
             The scan's scaled descriptor, of shape (n_features,).
         current
             Trial number of the set that the odometry has now.
-        avoid
-            Trial numbers of sets that are not chosen, unless there is no other: they did worse than
-            predicted.
+        measured
+            By trial number, errors in percent of sets that did worse than predicted.
         """
+        measured = measured or {}
         near = self.near(feature[None])
-        (best,), ratios = _best_candidates(near, self._fixed_at, self.settings)
-        (expected,), (cautious,), (weights,) = ratios
-        if self.candidates_[best] in avoid:
-            others = [c for c, trial in enumerate(self.candidates_) if trial not in avoid]
-            best = min(others, key=lambda c: cautious[c], default=best)
+        (expected,), (cautious,), (weights,) = self._ratios(near, self.settings)
+        (best,) = _best(cautious[None, : len(self.candidates_)], self._fixed_at, self.settings)
+        fixed = float(weights @ near.fixed[0])
+        if self._known[best] in measured:
+            errors = dict(zip(self._known, (cautious * fixed).tolist(), strict=True))
+            errors.update(measured)
+            # Far from all training, all ratios are 1.
+            of_known = [(errors[trial], trial != BASELINE) for trial in self._known]
+            best = min(range(len(of_known)), key=of_known.__getitem__)
         familiarity = float(near.evidence.familiarity[0])
-        at = self.candidates_.index(current) if current in self.candidates_ else None
+        at = self._known.index(current) if current in self._known else None
         # In a place unlike all training, a switch back to the fixed set need not pay. Nor need a
         # switch away from a set that is expected to be worse than the fixed one.
         weighs = self.switch_cost > 0.0 and not familiarity < NOVEL
-        weighs = weighs and current not in avoid
+        weighs = weighs and current not in measured
         if weighs and at is not None and cautious[best] + self.switch_cost >= cautious[at] <= 1.0:
             best = at
-        fixed = float(weights @ near.fixed[0])
-        trial = self.candidates_[best]
+        trial = self._known[best]
         return Selection(
             trial,
             self.data_.sets[trial],
@@ -199,6 +220,13 @@ class PairedExpectedRatio(Rule):
             familiarity=familiarity,
             n_sequences=float(1.0 / (weights @ weights)),
         )
+
+    def _ratios(self, near: Near, settings: PairedSettings) -> Ratios:
+        """Ratios of all in `near` to the fixed set's error."""
+        ratios = _expected_ratios(near, settings)
+        # Neither mixing nor caution is for the set that all are compared with.
+        ratios.expected[:, self._fixed_at] = ratios.cautious[:, self._fixed_at] = 1.0
+        return ratios
 
 
 def _expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
@@ -216,13 +244,9 @@ def _expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
     return Ratios(expected, expected + trust * settings.caution * error, weights)
 
 
-def _best_candidates(
-    near: Near, fixed_at: int, settings: PairedSettings
-) -> tuple[NDArray[np.intp], Ratios]:
-    """Position of the best candidate for each scan, of shape (n_scans,), and the ratios."""
-    ratios = _expected_ratios(near, settings)
-    expected, cautious, _ = ratios
-    # Neither mixing nor caution is for the set that all are compared with.
-    expected[:, fixed_at] = cautious[:, fixed_at] = 1.0
+def _best(
+    cautious: NDArray[np.float64], fixed_at: int, settings: PairedSettings
+) -> NDArray[np.intp]:
+    """Position of the best candidate for each scan, of shape (n_scans,)."""
     worth = np.log(cautious.min(axis=1)) < settings.threshold
-    return np.where(worth, cautious.argmin(axis=1), fixed_at), ratios
+    return np.where(worth, cautious.argmin(axis=1), fixed_at)

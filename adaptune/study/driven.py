@@ -8,6 +8,7 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
+from adaptune.model.paired import BASELINE
 from adaptune.pooled_space import ODOMETRY
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
@@ -100,7 +101,10 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         )
     else:
         why = _too_little(model)
-    return Driven(None, f"{fixed} as `paired`, because {why}.", paper)
+    words = f"{fixed} as `paired`, because {why}."
+    if model.fixed != BASELINE:
+        words += " Where it measures far more error than predicted, it tries the baseline."
+    return Driven(None, words, paper)
 
 
 def named(model: ErrorModel, trial: int) -> str:

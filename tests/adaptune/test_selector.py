@@ -11,12 +11,12 @@ from adaptune.descriptor.motion import speed_and_turn_rate
 from adaptune.descriptor.ndt_histogram import describe
 from adaptune.live.live_evidence import LiveEvidence, OwnError
 from adaptune.live.squares import LiveSquares
-from adaptune.model import BankRule, BankSettings, ErrorModel
+from adaptune.model import BankRule, BankSettings, ErrorModel, PairedSettings
 from adaptune.model.bank_weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
-from adaptune.selector import AVOIDED, WORSE, Selector
+from adaptune.selector import REMEMBERED, WORSE, Selector, _Worse
 from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import simulate
@@ -121,8 +121,8 @@ def test_a_set_stays_for_a_while():
         selector.observe(i * 10**8, scan, moving(0.5))
     assert selector.select().trial == first
     # One that does worse than predicted does not stay.
-    selector._avoided = {first: 100.0}
-    assert selector.select().trial != first
+    selector._worse = {first: _Worse(9.0, 100.0)}
+    assert selector._kept() is None
 
 
 def test_places_differ_by_the_sensors_motion():
@@ -274,18 +274,56 @@ def test_a_single_odometry_leaves_a_set_that_does_worse_than_predicted(monkeypat
     told.error = OwnError(9.0, 0.99 * limit, 20.0)  # not surely worse
     assert select(1.0).trial == 5
     assert told.forgotten == forgotten
+    # It stays where no other set is predicted to do better than what was measured.
+    told.error = OwnError(1.05 * limit, 1.01 * limit, 20.0)
+    assert select(1.5).trial == 5
     told.error = OwnError(9.0, 1.01 * limit, 20.0)
     left = select(2.0)
     assert (left.trial, left.parameters) == (3, SETS[3])
     # The hops were those of the set that it left.
     assert told.forgotten == forgotten + 1
-    assert select(AVOIDED + 1.9).trial == 3
-    assert select(AVOIDED + 2.1).trial == 5
+    assert select(REMEMBERED + 1.9).trial == 3
+    assert select(REMEMBERED + 2.1).trial == 5
     # After a reset nothing is held against it.
     told.error = OwnError(9.0, 1.01 * limit, 20.0)
-    assert select(AVOIDED + 3.0).trial == 3
+    assert select(REMEMBERED + 3.0).trial == 3
     selector.reset()
     assert select(0.0).trial == 5
+
+
+def test_where_the_fixed_set_does_worse_than_predicted_the_baseline_takes_its_place(monkeypatch):
+    told, scans = Told(monkeypatch), drive_cave("hdl32e", 1)
+    model = of_two_caves()
+    sets = replace(SETS, trials=(0, 3, 5), parameters=({"speed": 4.5}, *SETS.parameters))
+    errors = np.column_stack([np.full(len(model.errors), 2.0, np.float32), model.errors])
+    model = replace(
+        model,
+        sets=sets,
+        fixed=5,
+        errors=errors,
+        paired=PairedSettings(adapt=False),
+        bank=[],
+        vectors=model.vectors[:, :0],
+    )
+
+    def chosen(scan, *errors):
+        """What is selected second by second while so much is measured, in percent."""
+        told.error, selector, trials = None, Selector(model), []
+        for i, error in enumerate(errors):
+            told.error = None if error is None else OwnError(error, 0.8 * error, 1.2 * error)
+            selector.observe(i * 10**9, scan, STILL)
+            trials.append(selector.select().trial)
+        return trials
+
+    assert chosen(scans[0], None, 0.2, 9.0, None) == [5, 5, 0, 0]
+    # As bad as the baseline is in training, and no worse than the fixed set where both are bad.
+    assert chosen(scans[0], None, 1.5) == [5, 5]
+    assert chosen(scans[0], None, 9.0, 8.0, 12.0, None) == [5, 0, 0, 5, 5]
+    # So it is with another sensor.
+    assert chosen(drive_cave("vlp16", 1)[0], None, 0.2, 9.0, None) == [5, 5, 0, 0]
+    # What has not been run on every sequence is no candidate.
+    model = replace(model, errors=np.where(sets.column(0) == np.arange(3), np.nan, errors))
+    assert chosen(scans[0], None, 9.0) == [5, 5]
 
 
 def test_a_selection_tells_what_was_measured(monkeypatch):

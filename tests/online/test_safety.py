@@ -119,6 +119,14 @@ def test_where_the_fixed_set_is_in_use_the_odometry_restarts_as_ever():
     assert of[0].restarted.sum() == 1
 
 
+def test_with_the_baseline_it_restarts_as_with_the_fixed_set():
+    odometry = Fragile(lambda n, _: 9.0 if n == 25 else None)
+    result = drive(odometry, InTurns(0.0), fixed=Selection(1, {"gain": 1.0}))
+    assert [(c.selection.trial, c.fallen_back) for c in result.choices] == [(0, "")] * 4
+    assert not result.rejected
+    assert result.restarted.sum() == 1
+
+
 def test_where_the_warm_up_fails_too_it_begins_without_a_past():
     odometry = Fragile(lambda n, _: 9.0 if n == 25 else None)
     result = drive(odometry, InTurns(1.0, 2.0))
