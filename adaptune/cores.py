@@ -39,6 +39,20 @@ def release_memory() -> None:
         trim(0)
 
 
+def avoid_holes() -> None:
+    """Let this process give large arrays back to the system as soon as they are free.
+
+    By default, the C library keeps them among small ones. Where a process holds many arrays of
+    different sizes and replaces them time after time, as prepared scans, holes between them then
+    take several times what they hold.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:  # glibc has it
+        mallopt(_M_MMAP_THRESHOLD, _LARGE)
+
+
+_M_MMAP_THRESHOLD, _LARGE = -3, 256 * 1024
+"""The number of the setting in malloc.h, and bytes."""
 _before: set[int] | None = None
 """Cores that this process had before it was pinned alone."""
 _numbers = itertools.count(1)

@@ -35,6 +35,8 @@ class Selection(NamedTuple):
         Whether the last measurements say that the odometry, or the bank, has lost track.
     restart : frozenset of int
         Trial numbers of members of a bank that have lost track: they start again at its pose.
+    resting : frozenset of int
+        Trial numbers of members of a bank that need not work now.
     """
 
     trial: int
@@ -49,3 +51,4 @@ class Selection(NamedTuple):
     estimated_high: float = math.nan
     lost: bool = False
     restart: frozenset[int] = frozenset()
+    resting: frozenset[int] = frozenset()

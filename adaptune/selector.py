@@ -20,6 +20,7 @@ from adaptune.model.bank_weights import (
     smooth_weights,
     weighted_selection,
 )
+from adaptune.model.evidence import NOVEL
 from adaptune.model.paired import PairedExpectedRatio
 from adaptune.odometry.base import Motions
 from adaptune.selection import Selection
@@ -31,7 +32,8 @@ SCANS_TO_KNOW = 10
 WORSE = 2.0
 """A single odometry leaves a set whose error is surely more than so many times the predicted."""
 REMEMBERED = 60.0
-"""Seconds for which what was measured of that set counts, and not what is predicted."""
+"""Seconds for which what was measured of that set counts, and not what is predicted; and for which
+the members of a bank go on that should else rest."""
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +55,9 @@ class Selector:
 
     With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
     the last selections. A single odometry leaves a set that surely does worse than predicted, if
-    another one, or the baseline, is predicted to do better than that. Scans of a
+    another one, or the baseline, is predicted to do better than that. Where training says that no
+    bank gains (`ErrorModel.bank_rests`), all members but the fixed set rest, except for the next
+    minute after a place that training does not know, and after a failure. Scans of a
     sensor or mount that was not trained with (`ErrorModel.is_foreign`) get the fixed set, or in a
     bank weights by what is measured alone.
 
@@ -105,7 +109,8 @@ class Selector:
     ):
         model.check_descriptors(descriptors)
         if members is None:
-            members = model.bank if rule == "paired" and model.bank_adapts else ()
+            drives_bank = rule == "paired" and (model.bank_adapts or model.bank_rests)
+            members = model.bank if drives_bank else ()
         self.members = tuple(members)
         self.fixed = self.members[0] if self.members else model.fixed
         self._model = model
@@ -113,9 +118,10 @@ class Selector:
         self._measures = measures
         self._pca = model.pca()
         weighs = bool(self.members) and rule == "paired"
-        fitted = (
-            BankRule(model.bank_settings) if weighs else make_rule(rule, model.paired, switch_cost)
-        )
+        # A bank that need not always work weighs its members where it does.
+        self._may_rest = weighs and not model.bank_settings.adapt
+        settings = model.bank_settings.model_copy(update={"adapt": True})
+        fitted = BankRule(settings) if weighs else make_rule(rule, model.paired, switch_cost)
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
         self._live = LiveEvidence(self.members, model.length)
         self._describe = Describer(model.blocks)
@@ -142,6 +148,9 @@ class Selector:
         self._warned = False
         self._live.reset()
         self._worse: dict[int, _Worse] = {}  # by trial
+        self._at_work = -np.inf  # until when a bank may not rest, in seconds
+        self._resting: frozenset[int] = frozenset()
+        self._members_moved: Mapping[int, Poses] = {}
         self._predicted = np.nan
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
@@ -162,7 +171,7 @@ class Selector:
             self._recent.append((self._stamp, T_odom_before @ motions.T_previous_current))
             while len(self._recent) > 1 and self._recent[1][0] <= self._stamp - SECOND:
                 self._recent.popleft()
-        self._scan, self._stamp = scan, stamp
+        self._scan, self._stamp, self._members_moved = scan, stamp, motions.members
         self._live.observe(stamp, scan, motions)
 
     def select(self) -> Selection:
@@ -190,7 +199,9 @@ class Selector:
             selection = self._without_training(selection)
         if self.members and selection.weights is None:
             selection = self._of_those_present(selection)
-        if selection.weights is not None:
+        if self._may_rest and self._need_not_work(selection):
+            selection = self._at_rest(selection)
+        elif selection.weights is not None:
             selection = self._smoothed(selection)
         elif selection.trial != self._current:
             if (current := self._kept()) is not None:
@@ -203,6 +214,7 @@ class Selector:
                 self._live.forget()  # the hops were those of another set
                 self._switched = self._stamp
         self._current, self._predicted = selection.trial, selection.predicted_error
+        self._resting = selection.resting
         return self._live.estimated(selection)
 
     def measure(self) -> None:
@@ -262,6 +274,28 @@ class Selector:
         weighted = weighted_selection(self._model.sets, of_members)
         return selection._replace(
             trial=weighted.trial, parameters=weighted.parameters, weights=weighted.weights
+        )
+
+    def _need_not_work(self, selection: Selection) -> bool:
+        """Whether the fixed set is enough: training knows the place, and it does as predicted."""
+        seconds = self._stamp * 1e-9
+        error = self._live.own_error()
+        is_worse = error is not None and error.low > WORSE * selection.predicted_fixed
+        # Where the odometry failed, those that should rest have been woken.
+        failed = any(np.isfinite(self._members_moved[t]).all() for t in self._resting)
+        if selection.familiarity < NOVEL or is_worse or failed or self._live.lost:
+            self._at_work = seconds + REMEMBERED
+        return seconds >= self._at_work
+
+    def _at_rest(self, selection: Selection) -> Selection:
+        """The fixed set alone, without the other members of the bank."""
+        self._found.clear()
+        return self.fall_back()._replace(
+            predicted_error=selection.predicted_fixed,
+            predicted_fixed=selection.predicted_fixed,
+            familiarity=selection.familiarity,
+            n_sequences=selection.n_sequences,
+            resting=frozenset(self.members[1:]),
         )
 
     def _of_those_present(self, selection: Selection) -> Selection:

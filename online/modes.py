@@ -105,7 +105,7 @@ class ReplaySetup:
         """The mode whose replay is also that of a mode on demand: usually itself."""
         if "paired" in self.rules:
             way = self._mechanism("paired", model)
-            if mode == "bank" and way == "bank":
+            if mode == "bank" and way == "bank" and model.bank_adapts:
                 return "paired"
             if mode == "one_set" and way != "bank" and model.paired.adapt:
                 return "paired"

@@ -81,7 +81,7 @@ class Driver:
             self._note(choice._replace(why_not=str(error)))
             self._fall_back(stamp, selection, why)
             return
-        self._tell_of_loss(choice)
+        self._tell(choice)
         self._applied = selection
         self._note(choice)
 
@@ -96,9 +96,14 @@ class Driver:
         return self._tracker.register_prepared(scan.stamp, prepared, seconds, scan)
 
     def _unhealthy(self, stamp: int, what: str) -> bool:
-        """Return to the fixed set, unless it or the baseline is in use; whether it was not."""
+        """Return to the fixed set, unless it or the baseline is in use; whether it was not.
+
+        All members of a bank join in.
+        """
         applied, fixed = self._applied, self._fixed
-        if applied is None or fixed is None or applied[:3] == fixed[:3]:
+        if applied is None or fixed is None:
+            return False
+        if applied[:3] == fixed[:3] and not applied.resting:
             return False
         if applied.weights is None and applied.trial == BASELINE:
             return False
@@ -127,8 +132,12 @@ class Driver:
         """Since the first scan."""
         return 0.0 if self._first is None else (stamp - self._first) * 1e-9
 
-    def _tell_of_loss(self, choice: Choice) -> None:
-        """Log that the bank, or the odometry, is lost since the last selection, or not any more."""
+    def _tell(self, choice: Choice) -> None:
+        """Log what has changed since the last selection: the odometry is lost, the bank rests."""
+        applied = self._applied
+        if applied is not None and bool(applied.resting) != bool(choice.selection.resting):
+            what = "the bank rests" if choice.selection.resting else "the bank joins in"
+            _log.info("%s: %s at %.1f s", self._what, what, self._seconds(choice.stamp))
         lost = choice.selection.lost
         if lost != (self._applied is not None and self._applied.lost):
             who = "odometry" if choice.selection.weights is None else "bank"

@@ -159,6 +159,11 @@ class ErrorModel:
         """Whether there is a bank, and it is what is driven."""
         return bool(self.bank) and self.bank_settings.adapt
 
+    @property
+    def bank_rests(self) -> bool:
+        """Whether the fixed set is driven, and the bank only where that may be wrong."""
+        return len(self.bank) > 1 and not self.bank_adapts and not self.paired.adapt
+
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
         from adaptune.descriptor.pca import ScaledPCA  # not needed to load a model

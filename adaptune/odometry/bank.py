@@ -40,6 +40,8 @@ class Bank(OdometryInstance):
     The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
     others restart on the scans of the last seconds, at most once a second. So does a member that a
     fault has ended, until it has had too many of them: it costs its weight, and nothing else.
+    Members that rest see no scans; when they are to work again, they begin on those of the last
+    seconds, too.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ class Bank(OdometryInstance):
         self._agreement = Agreement(len(sets), lost_track)
         self._short = ShortRegistrations()
         self._lost = False
-        self._asked = np.zeros(len(sets), np.bool_)
+        self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
         self._preparations = Preparations()
         self._recent = RecentScans(warm_up)
         self._last_motion = LastMotion()
@@ -125,6 +127,7 @@ class Bank(OdometryInstance):
 
     def prepare(self, scan: Scan) -> PreparedScan:
         prepared = self._preparations.of(scan)
+        self.late.resting = self._resting
         self.late.begin()
         for member in self._present:
             prepared.by(member)
@@ -147,10 +150,13 @@ class Bank(OdometryInstance):
         self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
         self._lost = selection.lost
         self._asked = np.isin(self.trials, list(selection.restart))
+        self._resting = np.isin(self.trials, list(selection.resting))
+        self._waking = (self._waking | self.late.resting) & ~self._resting
 
     def start(
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
+        self.late.resting = self._resting
         self.late.settle()
         self._returning.clear()
         for member in self._present:
@@ -161,12 +167,15 @@ class Bank(OdometryInstance):
         self._short.start(prepared.stamp, prepared.scan.points)
         self._recent.start(prepared, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
-        self._asked[:] = False
+        self._asked[:] = self._waking[:] = False
         self._tell()
 
     def submit(self, prepared: PreparedScan) -> None:
-        self._restart(self._asked)
+        # One that was woken after this scan was prepared begins with the next one.
+        woken = self._waking & ~self.late.absent
+        self._restart(self._asked | woken)
         self._asked[:] = False
+        self._waking &= ~woken
         self._submitted = prepared
         for member in self._present:
             member.submit(prepared.by(member))

@@ -44,6 +44,8 @@ class Lateness:
         Members that were always late: they take no part any more.
     away : ndarray of shape (n_members,)
         Members that are restarting.
+    resting : ndarray of shape (n_members,)
+        Members that are given no scans; the bank says which, before each scan.
     absent : ndarray of shape (n_members,)
         Members that have no motion over the newest scan.
     """
@@ -53,7 +55,7 @@ class Lateness:
     ):
         n = len(members)
         self.scans = np.zeros(n, np.intp)
-        self.removed, self.absent, self.away = (np.zeros(n, np.bool_) for _ in range(3))
+        self.removed, self.resting, self.absent, self.away = np.zeros((4, n), np.bool_)
         self._members, self._names, self._rate = members, names, rate
         self._owing = np.zeros(n, np.bool_)
         self._behind = np.zeros(n)  # seconds for which each member has been late
@@ -66,19 +68,20 @@ class Lateness:
         for i in np.flatnonzero(self._owing & ~self.removed).tolist():
             self._members[i].collect()
         self._owing[:] = self.away[:] = False
-        self.absent[:] = self.removed
+        self.absent = self.removed | self.resting
 
     def begin(self) -> None:
         """A scan is there: take what came late. Members that still work are absent."""
         self._begun = time.perf_counter()
         if self._rate is None:
+            self.absent = self.resting.copy()
             return
         for i in np.flatnonzero(self._owing).tolist():
             if self._members[i].ready(0.0):
                 self._members[i].collect()
                 self._owing[i] = False
         busy = [member.busy for member in self._members]
-        self.absent = self._owing | self.removed | self.away | np.array(busy)
+        self.absent = self._owing | self.removed | self.resting | self.away | np.array(busy)
         if self.absent.all() and (first := self._first(self._owing)) is not None:
             self._members[first].collect()
             self._owing[first] = self.absent[first] = False
@@ -125,7 +128,7 @@ class Lateness:
         return self._members[i].ready(left)
 
     def _note(self, i: int, interval: float) -> None:
-        if self.removed[i] or self.away[i]:
+        if self.removed[i] or self.resting[i] or self.away[i]:
             return
         self.scans[i] += 1
         # Another member of its process may be at work.

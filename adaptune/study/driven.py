@@ -73,7 +73,7 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     )
     if mechanism is None:
         return Driven(None, "`online` will drive `paper`, and not `paired` (online.rules).", paper)
-    if mechanism == "bank":
+    if mechanism == "bank" and model.bank_adapts:
         trials = list(bank_members(study.config.online.switching, model))
         members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `paired`"
@@ -84,13 +84,19 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         else:
             words += f". It relies on what it measures while it drives, for {_too_little(model)}."
         return Driven("bank", words, paper)
-    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
         words = f"`online` will drive one set at a time as `paired`, {how}"
         if ONE_SET in model.expected:
             words += f", because it has the least expected loss: {_expected(model, ONE_SET)}"
         return Driven(mechanism, f"{words}.", paper)
+    why = _why_fixed(study, model, mechanism)
+    return Driven(None, f"{fixed} as `paired`, because {why}", paper)
+
+
+def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism) -> str:
+    """Why the fixed set is driven, and where it is left."""
+    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
     known = [way for way in ways if way in model.expected]
     if known:
         way = min(known, key=lambda way: model.expected[way]["loss"])
@@ -101,10 +107,15 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         )
     else:
         why = _too_little(model)
-    words = f"{fixed} as `paired`, because {why}."
+    if mechanism == "bank":
+        _, *others = (named(model, t) for t in bank_members(study.config.online.switching, model))
+        return (
+            f"{why}. In places that training does not know, and after failures, trials "
+            f"{', '.join(others)} join in, as a bank."
+        )
     if model.fixed != BASELINE:
-        words += " Where it measures far more error than predicted, it tries the baseline."
-    return Driven(None, words, paper)
+        why += ". Where it measures far more error than predicted, it tries the baseline"
+    return f"{why}."
 
 
 def named(model: ErrorModel, trial: int) -> str:
@@ -160,13 +171,13 @@ def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool)
     mode
         A selection rule.
     model
-        The error model. A bank with more expected loss would only cost.
+        The error model. A bank with more expected loss than one set at a time would only cost.
     mechanism
         The study's.
     live
         Whether the odometry changes its parameters between scans.
     """
-    if mechanism == "bank" and (mode != "paired" or model.bank_adapts):
+    if mechanism == "bank" and (mode != "paired" or model.bank_adapts or model.bank_rests):
         return "bank"
     return "live" if mechanism != "hand_over" and live else "hand_over"
 

@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -80,3 +82,31 @@ def test_processes_compute_and_say_what_went_wrong():
 def test_a_process_that_is_killed_is_told():
     with pytest.raises(AdaptuneError, match="was the memory full"), cores.processes(1) as pool:
         pool.submit(os._exit, 1).result()
+
+
+HOLES = """
+import sys
+import numpy as np
+from adaptune import cores
+if sys.argv[1] == "avoid":
+    cores.avoid_holes()
+np.ones(2**22)  # once it is free, the C library keeps arrays of this size
+before = cores.resident_megabytes()
+large, small = [], []
+for _ in range(50):
+    large.append(np.ones(2**18))
+    small.append(np.ones(2**10))
+large.clear()
+print(cores.resident_megabytes() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other C libraries do otherwise")
+def test_large_arrays_among_small_ones_leave_no_holes():
+    def kept(what):
+        """Megabytes that a process keeps of 105 that are free."""
+        command = [sys.executable, "-c", HOLES, what]
+        return float(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+
+    assert kept("nothing") > 50.0
+    assert kept("avoid") < 10.0

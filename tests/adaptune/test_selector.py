@@ -326,6 +326,63 @@ def test_where_the_fixed_set_does_worse_than_predicted_the_baseline_takes_its_pl
     assert chosen(scans[0], None, 9.0) == [5, 5]
 
 
+def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_predicted(
+    monkeypatch,
+):
+    told = Told(monkeypatch)
+    model = of_two_caves()
+    keeps = replace(
+        model,
+        paired=PairedSettings(adapt=False),
+        bank_settings=BankSettings(adapt=False),
+        vectors=np.tile(np.float32([[1.0, 0.0, 0.0], [0.0, 0.1, 0.0]]), (len(model.errors), 1, 1)),
+    )
+    assert keeps.bank_rests
+    assert not model.bank_rests
+    assert not replace(keeps, paired=PairedSettings()).bank_rests
+    assert not replace(keeps, bank=[3], vectors=keeps.vectors[:, :1]).bank_rests
+    selector = Selector(keeps)
+    assert selector.members == (3, 5)
+    awake = Motions(np.eye(4), {3: np.eye(4), 5: np.eye(4)})
+    asleep = Motions(np.eye(4), {3: np.eye(4), 5: np.full((4, 4), np.nan)})
+    known, new = drive_cave("hdl32e", 1)[0], drive_cave("vlp16", 1)[0]
+
+    def rests(seconds, scan=known, motions=asleep):
+        selector.observe(round(seconds * 1e9), scan, motions)
+        one = selector.select()
+        assert one.resting in (frozenset(), {5})
+        if one.resting:
+            assert (one.trial, one.weights) == (3, {3: 1.0, 5: 0.0})
+            assert one.predicted_error == one.predicted_fixed == pytest.approx(1.0)
+        return bool(one.resting)
+
+    assert rests(0.0, motions=awake)
+    assert rests(1.0)
+    # The fixed set is surely worse than predicted, until a minute after that.
+    told.error = OwnError(4.0, 2.1, 9.0)
+    assert not rests(2.0)
+    told.error = OwnError(4.0, 1.9, 9.0)
+    assert not rests(61.0, motions=awake)
+    assert rests(62.0, motions=awake)
+    # Its odometry has failed: somebody has woken the other member.
+    assert not rests(63.0, motions=awake)
+    assert rests(123.0, motions=awake)
+    assert rests(124.0)
+    # A place that training does not know.
+    foreign = Selector(keeps)
+    foreign.observe(0, new, awake)
+    assert not foreign.select().resting
+    # Awake, the member that is better gets the most weight.
+    selector.reset()
+    told.error = OwnError(4.0, 2.1, 9.0)
+    for i in range(20):
+        selector.observe(i * 10**9, known, awake)
+        one = selector.select()
+    assert one.weights[5] > 0.8
+    # A single odometry knows no rest.
+    assert Selector(keeps, members=()).members == ()
+
+
 def test_a_selection_tells_what_was_measured(monkeypatch):
     told, scans = Told(monkeypatch), drive_cave("hdl32e", 3)
     selector = Selector(of_two_caves())

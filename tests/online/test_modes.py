@@ -102,6 +102,8 @@ def test_a_mode_on_demand_that_is_another_one_is_not_replayed_again():
     assert with_bank.twin("bank", model) == "paired"
     unpaying = replace(fixed, bank_settings=BankSettings(adapt=False))
     assert with_bank.modes(unpaying)[3:5] == ("one_set", "bank")
+    # The bank that is driven may rest, the one on demand does not.
+    assert with_bank.identity("paired", unpaying)["switching"]["mechanism"] == "bank"
     # Without `paired`, nothing is.
     alone = replace(asked, rules=("paper",))
     assert alone.modes(model) == ("baseline", "fixed", "one_set", *demand, "paper")

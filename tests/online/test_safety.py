@@ -179,6 +179,33 @@ def test_a_bank_without_a_pose_gets_the_fixed_weights():
     )
 
 
+def test_where_a_bank_that_rests_fails_all_join_in(caplog):
+    made = []
+
+    def make(parameters):
+        one = Fragile(lambda n, gain: 9.0 if n == 25 and gain == 1.0 else None, parameters)
+        made.append(one)
+        return InProcess(one)
+
+    bank = Bank(make, {0: {"gain": 1.0}, 2: {"gain": 2.0}}, WarmUp(seconds=1.0))
+    fixed = Selection(0, {"gain": 1.0}, {0: 1.0, 2: 0.0})
+
+    class Alone(InTurns):
+        def select(self):
+            return fixed._replace(resting=frozenset({2}))
+
+    with caplog.at_level(logging.INFO):
+        result = replay(scans(40), bank, HEALTH, Alone(), what="home", fixed=fixed)
+    rested = [(c.stamp // TENTH, bool(c.selection.resting)) for c in result.choices]
+    assert rested == [(0, True), (10, True), (20, True), (25, False), (30, True)]
+    assert made[1].events[0] == ("start", 4)
+    assert made[1].events[-1] == ("register", 29)
+    np.testing.assert_allclose(
+        result.trajectory.T_world_sensor[:, 0, 3], STEP * np.arange(40), atol=1e-9
+    )
+    assert caplog.messages[-1] == "home: the bank rests at 3.0 s"
+
+
 def test_the_log_says_when_it_is_lost(caplog):
     class Lost(InTurns):
         def select(self):

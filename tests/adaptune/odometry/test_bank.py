@@ -124,6 +124,34 @@ def test_members_restart_where_the_selection_says_so():
     assert made[1].seen[-6:] == [2, 3, 4, 5, 6, 7]
 
 
+def test_members_that_rest_see_no_scans_until_they_are_woken():
+    make, made = makes()
+    sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.04}}
+    odometry = Bank(make, sets, every(2.0), 0.1)
+    alone = Selection(7, {}, {7: 1.0}, resting=frozenset({3, 5}))
+    odometry.apply(alone)
+    assert x_of(odometry, range(5)) == [0, 1, 2, 3, 4]
+    assert [len(one.seen) for one in made] == [5, 0, 0]
+    assert [t for t, T in odometry.motions.members.items() if np.isfinite(T).all()] == [7]
+    odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, resting=frozenset({5})))
+    np.testing.assert_allclose(np.diff([4.0, *x_on(odometry, range(5, 8))]), 1.01)
+    # As one that restarts, it begins two seconds ago at the bank's pose.
+    assert made[1].starts == [(2, 2.0)]
+    assert made[1].seen == [2, 3, 4, 5, 6, 7]
+    assert not made[2].seen
+    odometry.apply(alone)
+    np.testing.assert_allclose(np.diff(x_on(odometry, range(8, 11))), 1.0)
+    assert len(made[1].seen) == 6
+    # Where the bank starts, those that rest do not.
+    odometry.start(odometry.prepare(at(11)), np.eye(4))
+    assert [len(one.starts) for one in made] == [2, 1, 0]
+    # One that is woken then begins as the others do.
+    odometry.apply(Selection(7, {}, {7: 1.0}))
+    odometry.start(odometry.prepare(at(12)), np.eye(4))
+    x_on(odometry, [13])
+    assert [one.starts[1:] for one in made[1:]] == [[(12, 0.0)], []]
+
+
 @pytest.mark.parametrize("chosen", [1.0, 3.0])
 def test_no_pose_is_worse_than_any(chosen):
     make, _ = makes({1.0: {3: np.nan}})
@@ -189,6 +217,12 @@ def test_a_bank_of_equal_instances_is_the_single_run():
     bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=every(1.0))
     switched = drive(bank, [0, 1], n=15)
     np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
+
+
+def test_a_bank_that_rests_is_the_single_run():
+    bank = Bank(gicp, {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    bank.apply(Selection(0, {}, {0: 1.0}, resting=frozenset({1})))
+    np.testing.assert_allclose(drive(bank, n=15), drive(gicp(NEAR), n=15), atol=1e-12)
 
 
 def test_a_bank_in_other_processes_is_the_same():

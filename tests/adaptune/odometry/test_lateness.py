@@ -229,6 +229,27 @@ def test_a_member_that_restarts_sees_the_past_bit_by_bit(make, scans):
     assert not goes_on.late.removed.any()
 
 
+def test_one_that_rests_is_not_late_and_sees_the_past_bit_by_bit(make, scans):
+    bank = make(0.1)
+    resting = EVEN._replace(resting=frozenset({5}))
+    bank.apply(resting)
+    bank.start(bank.prepare(scans[0]), np.eye(4))
+    known = []
+    for i, scan in enumerate(scans[1:], 1):
+        prepared = bank.prepare(scan)
+        # In real time, a selection may come after a scan was prepared.
+        if i == 15:
+            bank.apply(EVEN)
+        T = bank.register(prepared).T_odom_sensor
+        np.testing.assert_allclose(T[0, 3], STEP * i, atol=0.05)
+        known.append(bool(np.isfinite(bank.motions.members[5]).all()))
+    # It joins in at the next scan, sees ten scans of the past and those that come meanwhile.
+    assert known == [False] * 20 + [True] * (len(known) - 20)
+    assert bank.restarts == 1
+    assert not bank.late.removed.any()
+    assert not bank.late.scans[1]
+
+
 def test_a_bank_may_start_while_a_member_restarts(make, scans):
     bank = make(0.1)
     run(bank, scans[:15], {})
