@@ -90,7 +90,7 @@ import numpy as np
 from adaptune import cores
 if sys.argv[1] == "avoid":
     cores.avoid_holes()
-np.ones(2**22)  # once it is free, the C library keeps arrays of this size
+np.ones(2**21)  # once it is free, the C library keeps arrays of this size
 before = cores.resident_megabytes()
 large, small = [], []
 for _ in range(50):
