@@ -16,7 +16,7 @@ from adaptune.model.bank_weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.parameter_sets import ParameterSets
 from adaptune.selection import Selection
-from adaptune.selector import REMEMBERED, WORSE, Selector, _Worse
+from adaptune.selector import REMEMBERED, WORSE, Selector
 from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.simulate import simulate
@@ -120,9 +120,6 @@ def test_a_set_stays_for_a_while():
     for i in range(1, 30):
         selector.observe(i * 10**8, scan, moving(0.5))
     assert selector.select().trial == first
-    # One that does worse than predicted does not stay.
-    selector._worse = {first: _Worse(9.0, 100.0)}
-    assert selector._kept() is None
 
 
 def test_places_differ_by_the_sensors_motion():
@@ -284,6 +281,11 @@ def test_a_single_odometry_leaves_a_set_that_does_worse_than_predicted(monkeypat
     assert told.forgotten == forgotten + 1
     assert select(REMEMBERED + 1.9).trial == 3
     assert select(REMEMBERED + 2.1).trial == 5
+    # It need not stay for the dwell.
+    selector, told.error = Selector(of_two_caves(), members=(), dwell=100.0), None
+    assert select(0.0).trial == 5
+    told.error = OwnError(9.0, 1.01 * limit, 20.0)
+    assert select(1.0).trial == 3
     # After a reset nothing is held against it.
     told.error = OwnError(9.0, 1.01 * limit, 20.0)
     assert select(REMEMBERED + 3.0).trial == 3
