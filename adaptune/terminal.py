@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -134,19 +135,29 @@ def _logger() -> Show:
 
 
 class _Pace:
-    """How long each thing will take, by how long it took so far."""
+    """How long each thing will take, by how long it took in the newer half of the time so far.
+
+    What a study that is resumed has done already comes in the first moment, and says nothing.
+    """
 
     def __init__(self) -> None:
-        self._begun: dict[str, tuple[float, float]] = {}
+        self._begun: dict[str, float] = {}
+        self._past: dict[str, deque[tuple[float, float]]] = {}  # when, and how much was done
 
     def left(self, what: str, done: float, total: int, now: float | None = None) -> str:
         """In words; empty before a first piece is done, and in the first seconds."""
         now = time.monotonic() if now is None else now
-        if done <= self._begun.get(what, (now, done))[1]:
-            self._begun[what] = now, done
-        start, before = self._begun[what]
-        seconds, gained = now - start, done - before
-        if gained < 1.0 or seconds < LOG_EVERY or done >= total:
+        past = self._past.setdefault(what, deque())
+        if not past or done < past[0][1] or done == past[-1][1] == past[0][1]:
+            self._begun[what] = now
+            past.clear()
+        elapsed = now - self._begun[what]
+        if not past or now - past[-1][0] > 0.01 * elapsed:
+            past.append((now, done))
+        while len(past) > 1 and past[1][0] <= now - 0.5 * elapsed:
+            past.popleft()
+        seconds, gained = now - past[0][0], done - past[0][1]
+        if gained < 1.0 or elapsed < LOG_EVERY or done >= total:
             return ""
         return _time_left((total - done) * seconds / gained)
 

@@ -84,6 +84,21 @@ def test_time_left_is_told_once_a_piece_is_done_and_no_sooner(caplog, monkeypatc
     assert "left" in caplog.text + screen.file.getvalue()
 
 
+def test_what_a_resumed_study_has_done_already_does_not_count(caplog, monkeypatch):
+    monkeypatch.setattr(terminal, "errors", Console(file=io.StringIO(), force_terminal=False))
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    with caplog.at_level(logging.INFO), terminal.progress() as show:
+        # In the first second 1,000 of 2,000, then one a second.
+        for i in range(1000):
+            now = 0.001 * i
+            show("runs", i, 2000)
+        for i in range(1000, 1100):
+            now += 1.0
+            show("runs", i, 2000)
+    assert caplog.messages[-1].startswith("runs: 1099 of 2000, about 15 min left")
+
+
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_what_a_second_worker_reads_is_not_shown_again(caplog, monkeypatch, is_terminal):
     screen = Console(file=io.StringIO(), force_terminal=is_terminal, width=200)
