@@ -12,6 +12,7 @@ from adaptune.metrics import span
 from adaptune.model import ModelError
 from adaptune.model.bank_weights import POOL
 from adaptune.model.base import mean_errors
+from adaptune.model.paired import BASELINE
 from adaptune.odometry.pool import Factory
 from adaptune.parameter_sets import ParameterSets
 from adaptune.sequence.names import origin
@@ -65,7 +66,8 @@ def labelled_data(
     # With a sequence left out, others than now may be among the best. To read the poses of
     # thousands of trials would take long.
     order = np.argsort(means, kind="stable")[: 2 * POOL]
-    eligible = {sets.trials[c] for c in order if np.isfinite(means[c])}
+    best = [sets.trials[c] for c in order]
+    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
     named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
     eligible |= {trial for trial in named if trial is not None}
     slots = archive.slots()
