@@ -39,20 +39,28 @@ def release_memory() -> None:
         trim(0)
 
 
-def avoid_holes() -> None:
-    """Let this process give large arrays back to the system as soon as they are free.
+@contextmanager
+def apart() -> Iterator[None]:
+    """Let large arrays that are made meanwhile go back to the system as soon as they are free.
 
     By default, the C library keeps them among small ones. Where a process holds many arrays of
-    different sizes and replaces them time after time, as prepared scans, holes between them then
-    take several times what they hold.
+    different sizes and replaces them time after time, as prepared scans, the holes between them
+    then take several times what they hold. It costs some time for each array.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:  # glibc has it
-        mallopt(_M_MMAP_THRESHOLD, _LARGE)
+    if mallopt is None:  # only glibc has it
+        yield
+        return
+    mallopt(_M_MMAP_THRESHOLD, _LARGE)
+    try:
+        yield
+    finally:
+        mallopt(_M_MMAP_THRESHOLD, _LARGEST)
 
 
-_M_MMAP_THRESHOLD, _LARGE = -3, 256 * 1024
-"""The number of the setting in malloc.h, and bytes."""
+_M_MMAP_THRESHOLD, _LARGE, _LARGEST = -3, 256 * 1024, 32 * 1024**2
+"""The number of the setting in malloc.h; bytes of arrays that are kept apart, and to what glibc
+raises that by itself as such arrays become free."""
 _before: set[int] | None = None
 """Cores that this process had before it was pinned alone."""
 _numbers = itertools.count(1)

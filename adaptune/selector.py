@@ -12,6 +12,7 @@ from adaptune.descriptor.base import Describer, DescriptorError, lowest_elevatio
 from adaptune.descriptor.motion import MOTION, SECOND, fill_in, speed_and_turn_rate
 from adaptune.geometry import Poses
 from adaptune.live.live_evidence import LiveEvidence
+from adaptune.metrics import FAILURE
 from adaptune.model import RULES, BankRule, ErrorModel, make_rule
 from adaptune.model.bank_weights import (
     SMOOTHING,
@@ -33,7 +34,11 @@ WORSE = 2.0
 """A single odometry leaves a set whose error is surely more than so many times the predicted."""
 REMEMBERED = 60.0
 """Seconds for which what was measured of that set counts, and not what is predicted; and for which
-the members of a bank go on that should else rest."""
+members of a bank keep working that would otherwise rest."""
+NEW = 2 * 10**9
+"""Nanoseconds after a selection for which a failure says nothing of the set."""
+FEW = 5
+"""A place is new by the median of so many selections: a single one may look odd."""
 
 _log = logging.getLogger(__name__)
 
@@ -55,9 +60,9 @@ class Selector:
 
     With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
     the last selections. A single odometry leaves a set that surely does worse than predicted, if
-    another one, or the baseline, is predicted to do better than that. Where training says that no
-    bank gains (`ErrorModel.bank_rests`), all members but the fixed set rest, except for the next
-    minute after a place that training does not know, and after a failure. Scans of a
+    another one, or the baseline, is predicted to do better than that. The reserve of a bank
+    (`ErrorModel.reserve`) rests, except for a minute after a place that training does not know, and
+    after a failure. Scans of a
     sensor or mount that was not trained with (`ErrorModel.is_foreign`) get the fixed set, or in a
     bank weights by what is measured alone.
 
@@ -118,8 +123,10 @@ class Selector:
         self._measures = measures
         self._pca = model.pca()
         weighs = bool(self.members) and rule == "paired"
+        reserve = model.reserve if weighs else []
+        self._reserve = frozenset(reserve).intersection(self.members)
+        self._always = [member for member in self.members if member not in self._reserve]
         # A bank that need not always work weighs its members where it does.
-        self._may_rest = weighs and not model.bank_settings.adapt
         settings = model.bank_settings.model_copy(update={"adapt": True})
         fitted = BankRule(settings) if weighs else make_rule(rule, model.paired, switch_cost)
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
@@ -150,7 +157,9 @@ class Selector:
         self._worse: dict[int, _Worse] = {}  # by trial
         self._at_work = -np.inf  # until when a bank may not rest, in seconds
         self._resting: frozenset[int] = frozenset()
-        self._members_moved: Mapping[int, Poses] = {}
+        self._familiar: deque[float] = deque(maxlen=FEW)
+        self._starts: int | None = None
+        self._failed = False
         self._predicted = np.nan
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
@@ -166,13 +175,21 @@ class Selector:
             What the odometry, or the bank and its members, moved over the scan before; see
             `adaptune.odometry.base.OdometryInstance`.
         """
-        if self._scan is not None and np.isfinite(motions.T_previous_current).all():
+        if self._scan is not None:
+            self._go_on(motions)
+        self._scan, self._stamp = scan, stamp
+        self._live.observe(stamp, scan, motions)
+
+    def _go_on(self, motions: Motions) -> None:
+        """Take note of what was moved, and whether the odometry has failed."""
+        # The first start comes after the first scan.
+        self._failed |= self._starts is not None and motions.starts > self._starts
+        self._starts = motions.starts
+        if np.isfinite(motions.T_previous_current).all():
             T_odom_before = self._recent[-1][1] if self._recent else np.eye(4)
             self._recent.append((self._stamp, T_odom_before @ motions.T_previous_current))
             while len(self._recent) > 1 and self._recent[1][0] <= self._stamp - SECOND:
                 self._recent.popleft()
-        self._scan, self._stamp, self._members_moved = scan, stamp, motions.members
-        self._live.observe(stamp, scan, motions)
 
     def select(self) -> Selection:
         """Choose what to apply before the newest scan is registered.
@@ -192,16 +209,15 @@ class Selector:
         self._descriptors.append(descriptor)
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
-        selection = self._choose(feature)
+        is_foreign = self._rule.gated and self._is_foreign(self._scan)
+        selection = self._choose(feature, is_foreign)
+        self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
-        leaves = self.fixed in self._worse
-        if self._rule.gated and self._is_foreign(self._scan) and not leaves:
+        if is_foreign and self.fixed not in self._worse:
             selection = self._without_training(selection)
         if self.members and selection.weights is None:
             selection = self._of_those_present(selection)
-        if self._may_rest and self._need_not_work(selection):
-            selection = self._at_rest(selection)
-        elif selection.weights is not None:
+        if selection.weights is not None:
             selection = self._smoothed(selection)
         elif selection.trial != self._current:
             if (current := self._kept()) is not None:
@@ -232,12 +248,33 @@ class Selector:
         is_weighed = isinstance(self._rule, BankRule)
         return Selection(self.fixed, self._model.sets[self.fixed], weights if is_weighed else None)
 
-    def _choose(self, feature: NDArray[np.float64]) -> Selection:
+    def _choose(self, feature: NDArray[np.float64], is_foreign: bool) -> Selection:
         if isinstance(self._rule, BankRule):
-            return self._rule.weigh(feature, self._live.squares())
+            near = self._rule.near(feature[None])
+            familiarity = 0.0 if is_foreign else float(near.evidence.familiarity[0])
+            if self._reserve and self._is_enough(familiarity, self._rule.predicted_fixed(near)):
+                found = self._rule.weigh(near.of(self._always), self._live.squares(self._always))
+                return found._replace(resting=self._reserve)
+            return self._rule.weigh(near, self._live.squares())
         if isinstance(self._rule, PairedExpectedRatio):
             return self._rule.select(feature, self._current, self._worse_than_predicted())
         return self._rule.select(feature, self._current)
+
+    def _is_enough(self, familiarity: float, predicted: float) -> bool:
+        """Whether the members that always work are enough.
+
+        Training knows the place, they do as predicted, and have not failed in the last minute.
+        """
+        seconds = self._stamp * 1e-9
+        self._familiar.append(familiarity)
+        error = self._live.own_error()
+        is_worse = error is not None and error.low > WORSE * predicted
+        is_new = float(np.median(self._familiar)) < NOVEL
+        if is_new or is_worse or self._failed or self._live.lost:
+            self._at_work = seconds + REMEMBERED
+        # Somebody has to go on.
+        present = self._live.present()[np.isin(self.members, self._always)]
+        return seconds >= self._at_work and bool(present.any())
 
     def _worse_than_predicted(self) -> Mapping[int, float]:
         """By trial, what was measured of sets that have done worse than predicted, in percent."""
@@ -245,8 +282,12 @@ class Selector:
         self._worse = {t: worse for t, worse in self._worse.items() if worse.until > seconds}
         error = self._live.own_error()
         current = self._current
-        if error is not None and current is not None and error.low > WORSE * self._predicted:
-            self._worse[current] = _Worse(error.mean, seconds + REMEMBERED)
+        if current is not None:
+            # One that has just been selected may have begun with an odometry that was lost.
+            if self._failed and self._stamp - self._switched > NEW:
+                self._worse[current] = _Worse(FAILURE, seconds + REMEMBERED)
+            elif error is not None and error.low > WORSE * self._predicted:
+                self._worse[current] = _Worse(error.mean, seconds + REMEMBERED)
         return {trial: worse.error for trial, worse in self._worse.items()}
 
     def _kept(self) -> int | None:
@@ -264,6 +305,8 @@ class Selector:
 
     def _smoothed(self, selection: Selection) -> Selection:
         """Replace the weights by the smoothed ones; what is predicted stays as it is."""
+        if selection.resting != self._resting:
+            self._found.clear()
         self._found.append(selection)
         weights = np.array([[(s.weights or {})[m] for m in self.members] for s in self._found])
         return self._weighted(selection, smooth_weights(weights)[-1])
@@ -274,28 +317,6 @@ class Selector:
         weighted = weighted_selection(self._model.sets, of_members)
         return selection._replace(
             trial=weighted.trial, parameters=weighted.parameters, weights=weighted.weights
-        )
-
-    def _need_not_work(self, selection: Selection) -> bool:
-        """Whether the fixed set is enough: training knows the place, and it does as predicted."""
-        seconds = self._stamp * 1e-9
-        error = self._live.own_error()
-        is_worse = error is not None and error.low > WORSE * selection.predicted_fixed
-        # Where the odometry failed, those that should rest have been woken.
-        failed = any(np.isfinite(self._members_moved[t]).all() for t in self._resting)
-        if selection.familiarity < NOVEL or is_worse or failed or self._live.lost:
-            self._at_work = seconds + REMEMBERED
-        return seconds >= self._at_work
-
-    def _at_rest(self, selection: Selection) -> Selection:
-        """The fixed set alone, without the other members of the bank."""
-        self._found.clear()
-        return self.fall_back()._replace(
-            predicted_error=selection.predicted_fixed,
-            predicted_fixed=selection.predicted_fixed,
-            familiarity=selection.familiarity,
-            n_sequences=selection.n_sequences,
-            resting=frozenset(self.members[1:]),
         )
 
     def _of_those_present(self, selection: Selection) -> Selection:

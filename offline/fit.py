@@ -10,7 +10,7 @@ from adaptune.model import ErrorModel
 from adaptune.study.config import SwitchingConfig
 from offline.labelled import LabelledData
 from offline.rivals import driven_cost, rivals
-from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose
+from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, reserve
 
 _log = logging.getLogger(__name__)
 
@@ -80,12 +80,15 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
     bank = named_members(model, switching, complete) or switching.size
     chosen = choose(complete, bank, fixed=model.fixed)
     members = chosen.members or [model.fixed]
+    # Where the user names the members, there are no others.
+    besides = reserve(members, complete) if isinstance(bank, int) else []
+    members = [*members, *besides]
     return replace(
         model,
         paired=chosen.one_set,
         bank=members,
         vectors=complete.vectors(members),
-        bank_settings=chosen.bank,
+        bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
         expected={
             way: {key: float(value) for key, value in figures._asdict().items()}

@@ -57,8 +57,6 @@ MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
 ELSEWHERE, AS_MANY = float(np.log(0.8)), 2
 """The loss of banks elsewhere, and as how many stretches it counts: few stretches show little."""
-MANY = 3
-"""A bank of so many members, or more, has one to spare."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
@@ -200,7 +198,7 @@ def _choosers(
     def of_size(
         way: Chooser, size: int = bank, spending: Spending | None = None
     ) -> Callable[[LabelledData, int], list[int]]:
-        return lambda data, fixed: with_baseline(way(data, fixed, size, spending), data, spending)
+        return lambda data, fixed: way(data, fixed, size, spending)
 
     if data.costs is None or data.budget is None:
         return {name: of_size(way) for name, way in WAYS.items()}
@@ -329,19 +327,20 @@ def complementary_members(
     return chosen
 
 
-def with_baseline(
-    members: list[int], data: LabelledData, spending: Spending | None = None
-) -> list[int]:
-    """Let the baseline take the place of the member that was chosen last, if it is none of them.
+def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
+    """What a bank has besides, for places that training does not know: the baseline.
 
-    In places that are unlike the training, what the odometry's authors chose is the best guess
-    there is; live evidence tells whether it is right.
+    What the odometry's authors chose is the best guess there, and live evidence tells whether it is
+    right. There is none if it is a member already, was not run on every sequence, or costs too
+    much.
     """
-    swapped = [*members[:-1], BASELINE]
     known = all(BASELINE in s.vectors for s in data.sequences)
-    if BASELINE in members or len(members) < MANY or not known:
-        return members
-    return swapped if spending is None or spending.allows(swapped) else members
+    if len(members) < 2 or BASELINE in members or not known:
+        return []
+    if data.costs is not None and data.budget is not None:
+        allowed = Spending(data.costs, data.budget).allows([*members, BASELINE])
+        return [BASELINE] if allowed else []
+    return [BASELINE]
 
 
 WAYS: dict[str, Chooser] = {

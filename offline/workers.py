@@ -15,7 +15,7 @@ from multiprocessing.context import ForkServerProcess
 from typing import Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 
 from adaptune.archive import Frames, Trial
-from adaptune.cores import avoid_holes, pin
+from adaptune.cores import apart, pin
 from adaptune.errors import AdaptuneError
 from adaptune.hosting import verdict
 from adaptune.space import ParameterSet
@@ -204,7 +204,6 @@ class Sequences:
         if setup.odometry.user_code and setup.odometry.has_user_class:
             self._apart = replace(setup, odometry=setup.odometry.allowing(user_code=False))
         self._memory = memory
-        avoid_holes()
         self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 
     def run(self, task: Task, report: Report) -> TaskResult:
@@ -227,7 +226,8 @@ class Sequences:
                 del self._ready[next(iter(self._ready))]
             free = self._memory - sum(s.nbytes for s in self._ready.values())
             advance = partial(_report, report, "reading")
-            sequence = setup.prepare(task.sequence, free, advance)
+            with apart():
+                sequence = setup.prepare(task.sequence, free, advance)
         self._ready[key] = sequence
         return sequence
 

@@ -30,6 +30,8 @@ BASELINE, UNTRAINED = "baseline", "untrained"
 LEARNED, EVEN, RANDOM = "bank_learned", "even", "random"
 BANKS = ("bank", LEARNED, EVEN)
 """The modes on demand that drive the study's bank, whatever `paired` drives."""
+MEASURING = ("paired", "bank")
+"""Those with live evidence."""
 SINGLES = ("one_set", RANDOM)
 """Those that drive one set at a time."""
 WITHOUT_MODEL = (BASELINE, UNTRAINED)
@@ -258,7 +260,7 @@ class ReplaySetup:
         model = needed(mode, model)
         mechanism = self._mechanism(mode, model)
         if mechanism == "bank":
-            return self._bank(bank_members(self.switching, model))
+            return self._bank(self.members(mode, model))
         fixed = model.sets[model.fixed]
         if mechanism == "live":
             return self.odometry(fixed)
@@ -284,9 +286,9 @@ class ReplaySetup:
             return None
         model = needed(mode, model)
         if mode == EVEN:
-            return EvenSelector(model.sets, list(bank_members(self.switching, model)))
+            return EvenSelector(model.sets, list(self.members(mode, model)))
         if mode == RANDOM:
-            candidates = list(bank_members(self.switching, model))
+            candidates = list(self.members(mode, model))
             seed = random_seed(sequence or "", repeat)
             return RandomSelector(model.sets, candidates, model.fixed, seed)
         descriptors, dwell, rule = self.descriptors, self.dwell, mode
@@ -294,10 +296,21 @@ class ReplaySetup:
             model, rule = _adapting(model), "paired"
         if self._mechanism(mode, model) != "bank":
             return Selector(model, rule, (), self.switch_cost, descriptors, dwell)
-        members, measures = list(bank_members(self.switching, model)), mode != LEARNED
+        members, measures = list(self.members(mode, model)), mode != LEARNED
         return Selector(
             model, rule, members, descriptors=descriptors, dwell=dwell, measures=measures
         )
+
+    def members(self, mode: str, model: ErrorModel) -> dict[int, ParameterSet]:
+        """The members of the bank that a mode drives, or among which it chooses.
+
+        The bank's reserve joins in by what is measured: other modes than those have none.
+        """
+        members = bank_members(self.switching, model)
+        if mode in MEASURING:
+            return members
+        reserve = _adapting(model).reserve
+        return {trial: of for trial, of in members.items() if trial not in reserve}
 
     def adapts(self, mode: str) -> bool:
         """Whether a mode has a selector."""
@@ -308,7 +321,7 @@ class ReplaySetup:
         if mode == UNTRAINED:
             return self.untrained_sets().trials[0]
         if self.adapts(mode) and self._mechanism(mode, model) == "bank":
-            return next(iter(bank_members(self.switching, model)))
+            return next(iter(self.members(mode, model)))
         return model.fixed
 
     def core_ms(self, mode: str, model: ErrorModel | None) -> float:
@@ -321,7 +334,7 @@ class ReplaySetup:
             return model.costs.alone(model.rivals.get(mode, model.fixed))
         if self._mechanism(mode, model) != "bank":
             return max(model.costs.adaptive([trial]) for trial in model.sets)
-        members = bank_members(self.switching, model)
+        members = self.members(mode, model)
         return model.costs.adaptive(members) / min(len(members), self.cores)
 
     def _bank(self, sets: Mapping[int, ParameterSet]) -> Bank:

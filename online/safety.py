@@ -1,7 +1,4 @@
-"""Applies what is selected, and returns to the fixed set where that or the odometry goes wrong.
-
-The baseline is as safe as the fixed set: where the odometry goes wrong with it, it only restarts.
-"""
+"""Applies what is selected, and returns to the fixed set where that or the odometry goes wrong."""
 
 import logging
 from collections.abc import Callable
@@ -15,6 +12,8 @@ from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 
+NEW = 2 * 10**9
+"""Nanoseconds for which a failure may still be that of the set before."""
 AVOIDED = 60 * 10**9
 """Nanoseconds for which a set is not applied after the odometry failed with it."""
 
@@ -36,7 +35,8 @@ class Driver:
 
     Where the health check finds no pose or an impossible one, where a switch fails, and where the
     odometry ends, it returns to the fixed set. A single set with which that happened is not applied
-    for `AVOIDED`; a bank keeps its members.
+    for `AVOIDED`; a bank keeps its members. Where the baseline has just taken the place of another
+    set, the odometry only restarts: it was lost already.
 
     Parameters
     ----------
@@ -63,6 +63,7 @@ class Driver:
         self._odometry, self._fixed, self._what, self._note = odometry, fixed, what, note
         self._tracker = Tracker(odometry, health, None if fixed is None else self._unhealthy)
         self._applied = fixed
+        self._since = 0  # when that was first applied
         self._first: int | None = None  # stamp
         self._avoided: dict[int, int] = {}  # until when, by trial
 
@@ -82,6 +83,8 @@ class Driver:
             self._fall_back(stamp, selection, why)
             return
         self._tell(choice)
+        if self._applied is None or self._applied.trial != selection.trial:
+            self._since = stamp
         self._applied = selection
         self._note(choice)
 
@@ -96,7 +99,7 @@ class Driver:
         return self._tracker.register_prepared(scan.stamp, prepared, seconds, scan)
 
     def _unhealthy(self, stamp: int, what: str) -> bool:
-        """Return to the fixed set, unless it or the baseline is in use; whether it was not.
+        """Return to the fixed set, unless it is in use; whether it was not.
 
         All members of a bank join in.
         """
@@ -105,7 +108,8 @@ class Driver:
             return False
         if applied[:3] == fixed[:3] and not applied.resting:
             return False
-        if applied.weights is None and applied.trial == BASELINE:
+        is_baseline = applied.weights is None and applied.trial == BASELINE
+        if is_baseline and stamp - self._since <= NEW:
             return False
         return self._fall_back(stamp, applied, f"the health check found {what}")
 

@@ -213,7 +213,8 @@ def _padded(size: int) -> int:
 def _one_after_the_other(first: Motions, second: Motions) -> Motions:
     """The motion over two scans."""
     members = {trial: first.members[trial] @ T for trial, T in second.members.items()}
-    return Motions(first.T_previous_current @ second.T_previous_current, members)
+    T_previous_current = first.T_previous_current @ second.T_previous_current
+    return Motions(T_previous_current, members, second.starts)
 
 
 def _run(connection: Connection, make: Make, period: float, cores: list[int]) -> None:

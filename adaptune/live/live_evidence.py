@@ -1,7 +1,7 @@
 """What the errors of an odometry, or of a bank's members, were over the last metres."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -285,9 +285,17 @@ class LiveEvidence:
         present = np.asarray(now - self._without[1:] > SECONDS)
         return present if present.any() else ~present
 
-    def squares(self) -> LiveSquares | None:
-        """What the last hops say of the members, or of a single odometry; None without any."""
-        return live_squares(self._hops._replace(errors=self._hops.errors[:, bool(self.members) :]))
+    def squares(self, members: Collection[int] | None = None) -> LiveSquares | None:
+        """What the last hops say of members, or of a single odometry; None without any.
+
+        Parameters
+        ----------
+        members
+            Trial numbers of some of the bank's; None for all.
+        """
+        chosen = self.members if members is None else members
+        columns = [i for i, trial in enumerate(self.members, 1) if trial in chosen] or [0]
+        return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
 
     def forget(self) -> None:
         """Forget the hops so far, for the odometry has got another set.

@@ -1,11 +1,19 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+)
 
 from adaptune.live.squares import LiveSquares, blend
 from adaptune.metrics import FAILURE
@@ -47,6 +55,8 @@ class BankSettings(BaseModel):
     # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
     # member that has lost track is left out of the mean, and does not cost what it would alone.
     clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
+    # How many of the last members rest where the training knows the place.
+    reserve: NonNegativeInt = 0
 
 
 class MemberWeights(NamedTuple):
@@ -65,6 +75,12 @@ class NearProducts(NamedTuple):
     # squared.
     products: NDArray[np.float64]
     fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean squared error of the fixed set
+
+    def of(self, members: Collection[int]) -> "NearProducts":
+        """Those of some of the members."""
+        kept = [i for i, trial in enumerate(self.members) if trial in members]
+        products = self.products[:, :, kept][..., kept]
+        return self._replace(members=tuple(self.members[i] for i in kept), products=products)
 
 
 class BankRule(Rule):
@@ -148,23 +164,28 @@ class BankRule(Rule):
         current: int | None = None,  # noqa: ARG002 - nothing is switched
     ) -> Selection:
         """See `Rule.select`; by the training alone."""
-        return self.weigh(feature, None)
+        return self.weigh(self.near(feature[None]), None)
 
-    def weigh(self, feature: NDArray[np.float64], live: LiveSquares | None) -> Selection:
-        """Weigh the members for one scan.
+    def predicted_fixed(self, near: NearProducts) -> float:
+        """Root mean square of the fixed set's error that is expected for one scan, in percent."""
+        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
+        return float(np.sqrt(of_sequences @ near.fixed[0]))
+
+    def weigh(self, near: NearProducts, live: LiveSquares | None) -> Selection:
+        """Weigh members for one scan; the others get no weight.
 
         Parameters
         ----------
-        feature
-            The scan's scaled descriptor, of shape (n_features,).
+        near
+            Of the scan, and of the members to weigh.
         live
-            What was measured of the members, in their order; None if nothing was.
+            What was measured of them, in their order; None if nothing was.
         """
-        near = self.near(feature[None])
         (weights,), (ratio,) = bank_weights(near, self.settings, [live])
         (of_sequences,) = near.evidence.weights(self.settings.sharpness)
-        fixed = float(np.sqrt(of_sequences @ near.fixed[0]))
-        of_members = dict(zip(self.members_, weights.tolist(), strict=True))
+        fixed = self.predicted_fixed(near)
+        of_members = dict.fromkeys(self.members_, 0.0)
+        of_members |= dict(zip(near.members, weights.tolist(), strict=True))
         return weighted_selection(self.data_.sets, of_members)._replace(
             predicted_error=float(ratio) * fixed,
             predicted_fixed=fixed,

@@ -160,6 +160,17 @@ class ErrorModel:
         return bool(self.bank) and self.bank_settings.adapt
 
     @property
+    def many_stretches(self) -> bool:
+        """Whether there is more than one training stretch, so that some places are unlike them."""
+        return len(np.unique(self.stretches())) > 1
+
+    @property
+    def reserve(self) -> list[int]:
+        """The members of the bank that rest where the training knows the place."""
+        n = self.bank_settings.reserve if self.bank_settings.adapt else len(self.bank) - 1
+        return self.bank[len(self.bank) - n :] if n > 0 else []
+
+    @property
     def bank_rests(self) -> bool:
         """Whether the fixed set is driven, and the bank only where that may be wrong."""
         return len(self.bank) > 1 and not self.bank_adapts and not self.paired.adapt

@@ -207,7 +207,7 @@ class PairedExpectedRatio(Rule):
         at = self._known.index(current) if current in self._known else None
         # In a place unlike all training, a switch back to the fixed set need not pay. Nor need a
         # switch away from a set that is expected to be worse than the fixed one.
-        weighs = self.switch_cost > 0.0 and not familiarity < NOVEL
+        weighs = self.settings.adapt and self.switch_cost > 0.0 and not familiarity < NOVEL
         weighs = weighs and current not in measured
         if weighs and at is not None and cautious[best] + self.switch_cost >= cautious[at] <= 1.0:
             best = at

@@ -63,10 +63,15 @@ def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
     if not model.bank:
         return
     if not bank.adapt:
-        yield Text("Bank: it has not the least expected loss, and `paired` does not use it.")
-        return
-    share = 100 * bank.min_fixed_share
-    yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
+        yield Text("Bank: it has not the least expected loss.")
+        if not model.bank_rests:
+            return
+    else:
+        share = 100 * bank.min_fixed_share
+        yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
+    if model.reserve:
+        reserve = ", ".join(map(str, model.reserve))
+        yield Text(f"Members that work only in new places and after failures: {reserve}.")
     yield report.table(f"The bank's {len(model.bank)} members", _sets(model, model.bank))
 
 
@@ -75,8 +80,8 @@ def _spending(model: ErrorModel) -> Iterator[RenderableType]:
     costs = model.costs
     if costs is not None and model.bank and np.isfinite(cost := costs.adaptive(model.bank)):
         yield Text(
-            f"The bank costs {cost:.1f} ms of CPU time a scan, {costs.evidence:.1f} ms of it for "
-            f"live evidence."
+            f"All members of the bank together cost {cost:.1f} ms of CPU time a scan, "
+            f"{costs.evidence:.1f} ms of it for live evidence."
         )
     if model.budget is not None:
         yield Text(f"Budget: {model.budget:g} ms of CPU time a scan.")

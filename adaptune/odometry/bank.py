@@ -95,6 +95,8 @@ class Bank(OdometryInstance):
         self._told: set[int] = set()
         self.late = Lateness(self._members, self._names, rate)
         self._rate = rate
+        # In real time, there is none for it.
+        self.rewinds = rate is None
         self._returning: list[Successor] = []
         self._weights = np.eye(len(sets))[0]
         self._agreement = Agreement(len(sets), lost_track)
@@ -112,8 +114,8 @@ class Bank(OdometryInstance):
     @property
     def dead(self) -> frozenset[int]:
         """Trial numbers of the members that a fault has ended, and that are not back yet."""
-        pairs = zip(self.trials, self._members, strict=True)
-        return frozenset(trial for trial, member in pairs if member.ended)
+        of_members = zip(self.trials, self._members, self.late.resting, strict=True)
+        return frozenset(t for t, member, rests in of_members if member.ended and not rests)
 
     @property
     def usage(self) -> Usage:
@@ -173,9 +175,13 @@ class Bank(OdometryInstance):
     def submit(self, prepared: PreparedScan) -> None:
         # One that was woken after this scan was prepared begins with the next one.
         woken = self._waking & ~self.late.absent
-        self._restart(self._asked | woken)
-        self._asked[:] = False
         self._waking &= ~woken
+        # Those that work go first: before they begin, the woken ones cannot go on in their place.
+        self.late.absent |= woken
+        self._restart(self._asked)
+        self.late.absent &= ~woken
+        self._restart(woken)
+        self._asked[:] = False
         self._submitted = prepared
         for member in self._present:
             member.submit(prepared.by(member))
@@ -221,6 +227,8 @@ class Bank(OdometryInstance):
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             catch_up_together(successors)
+            for i in np.flatnonzero(members).tolist():
+                self.late.back(i, self._recent.last.T_odom_sensor)
         else:
             self._returning += successors
             self.late.away |= members
@@ -246,6 +254,8 @@ class Bank(OdometryInstance):
     def _tell(self) -> None:
         """Log which members have ended, or are back, since this was last called."""
         for i, (name, member) in enumerate(zip(self._names, self._members, strict=True)):
+            if self.late.resting[i]:
+                continue
             if member.ended and i not in self._told:
                 self._told.add(i)
                 why = member.faults[-1] if member.faults else "it was closed"

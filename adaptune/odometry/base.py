@@ -94,10 +94,13 @@ class Motions(NamedTuple):
         NaN if there was no pose. After a start, what `start` received, or the identity.
     members : dict of ndarray
         The same for each member of a bank, by trial number; empty for single odometries.
+    starts : int
+        How often it has begun anew so far: one more than before means that it failed.
     """
 
     T_previous_current: Poses
     members: Mapping[int, Poses]
+    starts: int = 0
 
 
 class Description(NamedTuple):
@@ -129,11 +132,11 @@ class OdometryInstance(Protocol):
     apart : bool
         Whether it works in another process, from `submit` on; class attribute.
     rewinds : bool
-        Whether it can be shown scans of the past again; class attribute.
+        Whether it can be shown scans of the past again.
     """
 
     apart: ClassVar[bool] = False
-    rewinds: ClassVar[bool] = True
+    rewinds: bool = True
 
     @property
     def faults(self) -> Sequence[str]:
@@ -226,10 +229,12 @@ class LastMotion:
     """The motion over the last scan, from one pose to the next."""
 
     def __init__(self) -> None:
+        self._starts = -1
         self.start(np.eye(4))
 
     def start(self, T_odom_sensor: Poses, T_previous_current: Poses | None = None) -> None:
         """Begin at a pose, with the motion that led there; None if the sensor stood still."""
+        self._starts += 1
         self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
         self._T_before: Poses | None = None
         self._T_now = np.array(T_odom_sensor, order="C")
@@ -244,8 +249,8 @@ class LastMotion:
     def motions(self) -> Motions:
         """The motion, without members."""
         if self._T_before is None:
-            return Motions(self._started_with, {})
-        return Motions(invert(self._T_before) @ self._T_now, {})
+            return Motions(self._started_with, {}, self._starts)
+        return Motions(invert(self._T_before) @ self._T_now, {}, self._starts)
 
 
 class Odometry(ABC):

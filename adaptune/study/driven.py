@@ -8,7 +8,6 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.model.paired import BASELINE
 from adaptune.pooled_space import ODOMETRY
 from adaptune.space import ParameterSet
 from adaptune.study.config import SwitchingConfig
@@ -40,7 +39,7 @@ class ModeError(AdaptuneError):
 class Driven(NamedTuple):
     """What is driven, and by what."""
 
-    mechanism: Mechanism | None  # of `paired`; None if it never leaves the fixed set
+    mechanism: Mechanism | None  # of `paired`; None if the fixed set is its plan
     words: str  # a sentence
     paper: Mechanism | None = None  # of `paper`, if the study names it
 
@@ -74,7 +73,7 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     if mechanism is None:
         return Driven(None, "`online` will drive `paper`, and not `paired` (online.rules).", paper)
     if mechanism == "bank" and model.bank_adapts:
-        trials = list(bank_members(study.config.online.switching, model))
+        trials = always_at_work(study.config.online.switching, model)
         members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `paired`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
@@ -83,6 +82,7 @@ def driven(study: Study, model: ErrorModel) -> Driven:
             words += f", because it has the least expected loss: {_expected(model, BANK)}."
         else:
             words += f". It relies on what it measures while it drives, for {_too_little(model)}."
+        words += _who_joins_in(study, model)
         return Driven("bank", words, paper)
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
@@ -107,15 +107,20 @@ def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism) -> str:
         )
     else:
         why = _too_little(model)
-    if mechanism == "bank":
-        _, *others = (named(model, t) for t in bank_members(study.config.online.switching, model))
-        return (
-            f"{why}. In places that training does not know, and after failures, trials "
-            f"{', '.join(others)} join in, as a bank."
-        )
-    if model.fixed != BASELINE:
-        why += ". Where it measures far more error than predicted, it tries the baseline"
-    return f"{why}."
+    return f"{why}.{_who_joins_in(study, model) if mechanism == 'bank' else ''}"
+
+
+def _who_joins_in(study: Study, model: ErrorModel) -> str:
+    """Which members of a bank rest, and when they do not; empty if none rests."""
+    switching = study.config.online.switching
+    always = always_at_work(switching, model)
+    others = [named(model, t) for t in bank_members(switching, model) if t not in always]
+    if not others:
+        return ""
+    # With a single stretch, nothing tells what is far from it.
+    is_new = "In places that training does not know, and after" if model.many_stretches else "After"
+    who = "trials {} join in" if len(others) > 1 else "trial {} joins in"
+    return f" {is_new} failures, {who.format(', '.join(others))}."
 
 
 def named(model: ErrorModel, trial: int) -> str:
@@ -196,11 +201,13 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
     if switching.sets is None:
         size = switching.size
         complete = int((~np.isnan(model.errors).any(axis=0)).sum())
-        if len(model.bank) < min(size, complete):
+        n = len(model.bank) - model.bank_settings.reserve
+        chosen, reserve = model.bank[:n], model.bank[n:]
+        if len(chosen) < min(size, complete):
             raise _another_bank("size")
         if model.bank[0] != model.fixed:
             raise _another_bank("sets")
-        return {trial: model.sets[trial] for trial in model.bank[:size]}
+        return {trial: model.sets[trial] for trial in (*chosen[:size], *reserve)}
     members: dict[int, ParameterSet] = {}
     for i, named in enumerate(switching.sets):
         trial = model.trial(named)
@@ -222,6 +229,11 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
     if list(members) != model.bank:
         raise _another_bank("sets")
     return members
+
+
+def always_at_work(switching: SwitchingConfig, model: ErrorModel) -> list[int]:
+    """The members of the study's bank that work everywhere; see `ErrorModel.reserve`."""
+    return [trial for trial in bank_members(switching, model) if trial not in model.reserve]
 
 
 def _another_bank(key: str) -> ModeError:

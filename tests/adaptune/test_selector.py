@@ -215,7 +215,7 @@ class Told:
                 LiveEvidence, name, lambda _, *args, n=name: getattr(self, n)(*args)
             )
 
-    def squares(self):
+    def squares(self, _members=None):
         return self.now
 
     def measure(self):
@@ -345,44 +345,79 @@ def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_p
     assert not replace(keeps, bank=[3], vectors=keeps.vectors[:, :1]).bank_rests
     selector = Selector(keeps)
     assert selector.members == (3, 5)
-    awake = Motions(np.eye(4), {3: np.eye(4), 5: np.eye(4)})
-    asleep = Motions(np.eye(4), {3: np.eye(4), 5: np.full((4, 4), np.nan)})
     known, new = drive_cave("hdl32e", 1)[0], drive_cave("vlp16", 1)[0]
+    resting, absent = np.eye(4), np.full((4, 4), np.nan)
 
-    def rests(seconds, scan=known, motions=asleep):
+    def rests(seconds, scan=known, starts=1, fixed=resting):
+        motions = Motions(np.eye(4), {3: fixed, 5: resting}, starts)
         selector.observe(round(seconds * 1e9), scan, motions)
         one = selector.select()
         assert one.resting in (frozenset(), {5})
         if one.resting:
             assert (one.trial, one.weights) == (3, {3: 1.0, 5: 0.0})
-            assert one.predicted_error == one.predicted_fixed == pytest.approx(1.0)
+            assert one.predicted_error == pytest.approx(1.0)
+            assert one.predicted_fixed == pytest.approx(1.0)
         return bool(one.resting)
 
-    assert rests(0.0, motions=awake)
+    # The start after the first scan is no failure.
+    assert rests(0.0, starts=0)
     assert rests(1.0)
     # The fixed set is surely worse than predicted, until a minute after that.
     told.error = OwnError(4.0, 2.1, 9.0)
     assert not rests(2.0)
     told.error = OwnError(4.0, 1.9, 9.0)
-    assert not rests(61.0, motions=awake)
-    assert rests(62.0, motions=awake)
-    # Its odometry has failed: somebody has woken the other member.
-    assert not rests(63.0, motions=awake)
-    assert rests(123.0, motions=awake)
-    assert rests(124.0)
-    # A place that training does not know.
-    foreign = Selector(keeps)
-    foreign.observe(0, new, awake)
-    assert not foreign.select().resting
+    assert not rests(61.9)
+    assert rests(62.0)
+    # The odometry has failed, also while nobody rests.
+    assert not rests(63.0, starts=2)
+    assert not rests(122.0, starts=3)
+    assert not rests(181.0, starts=3)
+    assert rests(182.0, starts=3)
+    # Where the fixed set gives no pose, somebody has to go on.
+    assert not rests(183.0, starts=3, fixed=absent)
+    # A place that training does not know; a single odd look is none.
+    selector.reset()
+    told.error = None
+    assert not rests(0.0, new)
+    selector.reset()
+    assert all(rests(float(i)) for i in range(5))
     # Awake, the member that is better gets the most weight.
     selector.reset()
     told.error = OwnError(4.0, 2.1, 9.0)
     for i in range(20):
-        selector.observe(i * 10**9, known, awake)
+        selector.observe(i * 10**9, known, Motions(np.eye(4), {3: resting, 5: resting}))
         one = selector.select()
     assert one.weights[5] > 0.8
     # A single odometry knows no rest.
     assert Selector(keeps, members=()).members == ()
+
+
+def test_the_reserve_of_a_bank_joins_in_where_training_knows_nothing(monkeypatch):
+    told, model = Told(monkeypatch), of_two_caves()
+    sets = replace(SETS, trials=(3, 5, 0), parameters=(*SETS.parameters, {"speed": 4.5}))
+    vectors = np.zeros((len(model.errors), 3, 3), np.float32)
+    vectors[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    model = replace(
+        model,
+        sets=sets,
+        errors=np.column_stack([model.errors, np.ones(len(model.errors), np.float32)]),
+        bank=[3, 5, 0],
+        vectors=vectors,
+        bank_settings=BankSettings(reserve=1),
+    )
+    assert (model.reserve, model.bank_adapts, model.bank_rests) == ([0], True, False)
+    selector = Selector(model)
+    motions = Motions(np.eye(4), dict.fromkeys((3, 5, 0), np.eye(4)), 1)
+    shares = []
+    for i in range(20):
+        told.error = OwnError(9.0, 8.0, 10.0) if i >= 10 else None
+        selector.observe(i * 10**9, drive_cave("hdl32e", 1)[0], motions)
+        one = selector.select()
+        assert one.resting == ({0} if i < 10 else frozenset())
+        shares.append([one.weights[t] for t in (3, 5, 0)])
+    # Their errors are as large, and independent.
+    np.testing.assert_allclose(shares[9], [0.5, 0.5, 0.0], atol=0.01)
+    np.testing.assert_allclose(shares[19], [1 / 3] * 3, atol=0.01)
 
 
 def test_a_selection_tells_what_was_measured(monkeypatch):

@@ -5,9 +5,11 @@ import pytest
 from labelled_places import TRIALS, in_stretches, labelled, sequence, two_kinds, with_motions
 
 from adaptune.model import BankSettings, PairedSettings
+from adaptune.model.costs import Costs, SetCost
 from offline import tuning
 from offline.bank_simulation import BankSimulation
 from offline.expected_loss import expected_loss
+from offline.labelled import LabelledData
 from offline.tuning import (
     BANK_SETTINGS,
     DO_NOT_ADAPT,
@@ -16,7 +18,7 @@ from offline.tuning import (
     cancelling_members,
     choose,
     complementary_members,
-    with_baseline,
+    reserve,
 )
 
 
@@ -135,16 +137,18 @@ def test_members_are_chosen_in_both_ways():
     assert complementary_members(labelled(few), 0, 4) == [0, 3]
 
 
-def test_the_baseline_takes_the_last_place_of_a_bank():
+def test_the_baseline_is_the_reserve_of_a_bank():
     rng = np.random.default_rng(7)
     data = labelled([in_stretches(with_motions("s", rng, 500))])
-    assert with_baseline([3, 8, 4], data) == [3, 8, 0]
-    assert with_baseline([3, 0, 4], data) == [3, 0, 4]
-    assert with_baseline([3, 8], data) == [3, 8]  # it has none to spare
-    *_, last = choose(data, 3, fixed=3).members
-    assert last == 0
+    assert reserve([3, 8, 4], data) == [0]
+    assert reserve([3, 0, 4], data) == []
+    assert reserve([3], data) == []  # there is no bank
     without = [replace(s, vectors={t: s.vectors[t] for t in (3, 4, 8)}) for s in data.sequences]
-    assert with_baseline([3, 8, 4], labelled(without)) == [3, 8, 4]
+    assert reserve([3, 8, 4], labelled(without)) == []
+    costs = Costs({trial: SetCost(2.0, 1.0, 0) for trial in data.sets}, 0.5)
+    for budget, found in ((9.5, [0]), (9.4, [])):
+        limited = LabelledData(data.sequences, data.sets, costs, budget)
+        assert reserve([3, 8, 4], limited) == found
 
 
 def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):

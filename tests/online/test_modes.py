@@ -104,6 +104,12 @@ def test_a_mode_on_demand_that_is_another_one_is_not_replayed_again():
     assert with_bank.modes(unpaying)[3:5] == ("one_set", "bank")
     # The bank that is driven may rest, the one on demand does not.
     assert with_bank.identity("paired", unpaying)["switching"]["mechanism"] == "bank"
+    # Controls have no reserve, and `paired` has one.
+    bank, vectors = [*model.bank, 0], np.zeros((len(model.errors), 3, 3), np.float32)
+    reserve = replace(model, bank=bank, vectors=vectors, bank_settings=BankSettings(reserve=1))
+    few = replace(with_bank, switching=SwitchingConfig(size=2))
+    assert list(few.members("paired", reserve)) == reserve.bank
+    assert list(few.members("even", reserve)) == reserve.bank[:-1]
     # Without `paired`, nothing is.
     alone = replace(asked, rules=("paper",))
     assert alone.modes(model) == ("baseline", "fixed", "one_set", *demand, "paper")

@@ -119,12 +119,18 @@ def test_where_the_fixed_set_is_in_use_the_odometry_restarts_as_ever():
     assert of[0].restarted.sum() == 1
 
 
-def test_with_the_baseline_it_restarts_as_with_the_fixed_set():
+def test_where_the_baseline_has_just_been_taken_the_odometry_restarts_with_it():
     odometry = Fragile(lambda n, _: 9.0 if n == 25 else None)
-    result = drive(odometry, InTurns(0.0), fixed=Selection(1, {"gain": 1.0}))
-    assert [(c.selection.trial, c.fallen_back) for c in result.choices] == [(0, "")] * 4
+    fixed = Selection(1, {"gain": 1.0})
+    result = drive(odometry, InTurns(1.0, 1.0, 0.0), fixed=fixed)
+    assert [(c.selection.trial, c.fallen_back) for c in result.choices][2:] == [(0, "")] * 2
     assert not result.rejected
     assert result.restarted.sum() == 1
+    # Later, the fault is its own.
+    odometry = Fragile(lambda n, gain: 9.0 if n == 25 and gain == 0.0 else None)
+    result = drive(odometry, InTurns(0.0), fixed=fixed)
+    assert result.choices[-1].fallen_back == "the health check found max_speed"
+    assert [c.why_not for c in result.rejected] == ["the odometry failed with it"]
 
 
 def test_where_the_warm_up_fails_too_it_begins_without_a_past():

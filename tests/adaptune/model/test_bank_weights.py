@@ -88,7 +88,7 @@ def test_the_fixed_set_keeps_its_minimum_share(of, kept):
     if of.adapt:
         # What is measured takes its place: 9 windows next to the prior's 3.
         live = LiveSquares(np.diag([100.0, 1.0, 1.0, 100.0]), 0.0, 9.0)
-        weights = rule.weigh(data.features[0], live).weights
+        weights = rule.weigh(rule.near(data.features[0][None]), live).weights
         assert weights[0] == pytest.approx(kept / 4.0, abs=0.05)
 
 
@@ -101,25 +101,32 @@ def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more():
     (near,) = rule.near(new[None]).evidence.trust
     assert near == 0.0
     assert rule.select(new).familiarity == 0.0
-    assert rule.weigh(new, live).weights[0] > rule.weigh(known, live).weights[0] + 0.1
+    assert (
+        rule.weigh(rule.near(new[None]), live).weights[0]
+        > rule.weigh(rule.near(known[None]), live).weights[0] + 0.1
+    )
     # Without measurements, the fixed set is the best guess.
     assert rule.select(known).weights[0] < 0.1
     assert max(rule.select(new).weights.items(), key=lambda item: item[1])[0] == 0
     # As many windows as the prior has there: half and half.
     few = live._replace(windows=UNFAMILIAR * rule.settings.prior_windows)
     (found,), _ = bank_weights(rule.near(new[None]), rule.settings, [few])
-    assert found[0] == pytest.approx(rule.weigh(new, few).weights[0])
+    assert found[0] == pytest.approx(rule.weigh(rule.near(new[None]), few).weights[0])
 
 
 def test_many_windows_overrule_the_training():
     data = places(np.random.default_rng(6))
     rule = BankRule(BankSettings(even=0.0)).fit(data)
     live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1000.0)
-    assert rule.weigh(data.features[0], live).weights[3] > 0.9
-    assert rule.weigh(data.features[0], live._replace(windows=1e-3)).weights[3] < 0.1
+    assert rule.weigh(rule.near(data.features[0][None]), live).weights[3] > 0.9
+    assert (
+        rule.weigh(rule.near(data.features[0][None]), live._replace(windows=1e-3)).weights[3] < 0.1
+    )
     # The registrations' own part, which all share, changes nothing.
     shifted = live._replace(products=live.products + 0.2, noise=0.2)
-    found, plain = (rule.weigh(data.features[0], one).weights for one in (shifted, live))
+    found, plain = (
+        rule.weigh(rule.near(data.features[0][None]), one).weights for one in (shifted, live)
+    )
     np.testing.assert_allclose(list(found.values()), list(plain.values()), atol=1e-5)
 
 
@@ -218,3 +225,18 @@ def test_a_lost_track_costs_as_much_as_the_clip():
     }
     np.testing.assert_allclose(of[18.0][3], 3.0 * of[6.0][3], rtol=1e-6)
     np.testing.assert_allclose(of[18.0][:3], of[6.0][:3])
+
+
+def test_members_that_rest_have_no_weight_and_change_nothing():
+    rng = np.random.default_rng(3)
+    data = places(rng)
+    few = replace(data, candidates=(0, 1), vectors=data.vectors[:, :2])
+    rule, of_two = BankRule().fit(data), BankRule().fit(few)
+    near = rule.near(data.features[:1])
+    some = rule.weigh(near.of((0, 1)), None)
+    alone = of_two.weigh(of_two.near(data.features[:1]), None)
+    assert list(some.weights) == list(data.candidates)
+    assert list(some.weights.values())[:2] == pytest.approx(list(alone.weights.values()))
+    assert list(some.weights.values())[2:] == [0.0, 0.0]
+    assert some.predicted_error == pytest.approx(alone.predicted_error)
+    assert some.predicted_fixed == pytest.approx(rule.predicted_fixed(near))

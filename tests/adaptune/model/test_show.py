@@ -161,7 +161,7 @@ def test_a_bank_is_shown(model, tmp_path):
     for settings, said in (
         (
             BankSettings(adapt=False),
-            "it has not the least expected loss, and `paired` does not use it.",
+            "it has not the least expected loss.",
         ),
         (BankSettings(min_fixed_share=0.25), "has 25 % of the weight at least"),
     ):
@@ -181,7 +181,7 @@ def test_costs_rivals_and_a_budget_are_shown(model, tmp_path):
     text = shown(known, tmp_path)
     assert "0, fixed 3.000 5.000 4 none" in text
     assert "2 11.8 - 9 none" in text  # of unknown cost
-    assert "The bank costs 9.5 ms of CPU time a scan, 0.5 ms of it for live evidence." in text
+    assert "All members of the bank together cost 9.5 ms of CPU time a scan, 0.5 ms of it" in text
     assert "Budget: 9.5 ms of CPU time a scan." in text
     assert "equal_cost 1 3.000 7.000 2 [huber]" in text
     assert "cost [ms]" not in shown(model, tmp_path)

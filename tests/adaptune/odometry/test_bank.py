@@ -186,7 +186,8 @@ def test_motions_of_the_members_by_trial_number():
     make, made = kept(makes({1.02: {5: 4.0}})[0])
     bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1)
     x_of(bank, range(6))
-    whole, members = bank.motions
+    whole, members, starts = bank.motions
+    assert starts == 1
     assert list(members) == [7, 3, 5]
     # The motion of the lost member before it was restarted.
     assert [T[0, 3] for T in members.values()] == pytest.approx([1.0, 4.0, 1.06])
