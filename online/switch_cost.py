@@ -160,7 +160,7 @@ def switch_cost_in_words(study: Study) -> str:
         return f"{online.words} Then {cost}."
     if online.paper in ("live", "hand_over"):
         return f"{online.words} It never switches; `paper` does, and then {cost}."
-    return f"{online.words} It never switches, so there is no switch cost."
+    return f"{online.words} That has no switch cost."
 
 
 def _read(study: Study, name: str, seconds: float) -> Recording:

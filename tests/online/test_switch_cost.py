@@ -59,7 +59,7 @@ def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_p
         return switch_cost.switch_cost_in_words(study)
 
     assert said().startswith(f"`online` will drive the fixed set (trial {model.fixed}) as `paired`")
-    assert said().endswith("It never switches, so there is no switch cost.")
+    assert said().endswith("That has no switch cost.")
     members = ", ".join(map(str, model.bank))
     bank = said(bank_adapts=True)
     assert bank.startswith(f"`online` will drive the bank of trials {members} as `paired`")
