@@ -28,8 +28,7 @@ def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
         of_rule, _ = data.training_data()
         few = complementary(of_rule, policy.one_set.n_sets or len(data.sets))
         return max(data.costs.adaptive([trial]) for trial in few)
-    # What joins in elsewhere does not count, but it measures its own error everywhere.
-    return data.costs.adaptive([fixed])
+    return data.costs.alone(fixed)
 
 
 def rivals(data: LabelledData, cost: float) -> dict[str, int]:

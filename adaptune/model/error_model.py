@@ -160,15 +160,10 @@ class ErrorModel:
         return bool(self.bank) and self.bank_settings.adapt
 
     @property
-    def many_stretches(self) -> bool:
-        """Whether there is more than one training stretch, so that some places are unlike them."""
-        return len(np.unique(self.stretches())) > 1
-
-    @property
     def reserve(self) -> list[int]:
         """The members of the bank that rest where the training knows the place."""
-        n = self.bank_settings.reserve if self.bank_settings.adapt else len(self.bank) - 1
-        return self.bank[len(self.bank) - n :] if n > 0 else []
+        n = len(self.bank) - self.bank_settings.reserve
+        return self.bank[n if self.bank_settings.adapt else 1 :]
 
     @property
     def bank_rests(self) -> bool:
@@ -430,9 +425,7 @@ class ErrorModel:
         if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
             raise ValueError("the errors are not of as many frames as the descriptors")
         if not self.sequence.shape == self.stretch.shape == (n_frames,):
-            raise ValueError(
-                "the errors are not of as many frames as the sequence and stretch numbers"
-            )
+            raise ValueError("the errors are not of as many frames as the stretch numbers")
         if not n_frames or len(self.sets) != n_sets or self.fixed not in self.sets:
             raise ValueError("errors and parameter sets do not go together")
         if self.vectors.shape != (n_frames if self.bank else 0, len(self.bank), 3):
@@ -448,6 +441,8 @@ class ErrorModel:
 
     def _check_sets(self) -> None:
         """Refuse a bank or rivals that are no sets of the model, or sets of another space."""
+        if self.bank and self.bank_settings.reserve >= len(self.bank):
+            raise ValueError("all members of the bank rest")
         if set(self.bank) - set(self.sets) or len(set(self.bank)) != len(self.bank):
             raise ValueError("the bank holds unknown sets, or one twice")
         if set(self.rivals.values()) - set(self.sets):

@@ -118,7 +118,8 @@ def _who_joins_in(study: Study, model: ErrorModel) -> str:
     if not others:
         return ""
     # With a single stretch, nothing tells what is far from it.
-    is_new = "In places that training does not know, and after" if model.many_stretches else "After"
+    knows = len(np.unique(model.stretches())) > 1
+    is_new = "In places that training does not know, and after" if knows else "After"
     who = "trials {} join in" if len(others) > 1 else "trial {} joins in"
     return f" {is_new} failures, {who.format(', '.join(others))}."
 

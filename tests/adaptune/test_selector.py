@@ -355,8 +355,7 @@ def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_p
         assert one.resting in (frozenset(), {5})
         if one.resting:
             assert (one.trial, one.weights) == (3, {3: 1.0, 5: 0.0})
-            assert one.predicted_error == pytest.approx(1.0)
-            assert one.predicted_fixed == pytest.approx(1.0)
+            assert one.predicted_error == one.predicted_fixed == pytest.approx(1.0)
         return bool(one.resting)
 
     # The start after the first scan is no failure.
@@ -381,15 +380,13 @@ def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_p
     assert not rests(0.0, new)
     selector.reset()
     assert all(rests(float(i)) for i in range(5))
-    # Awake, the member that is better gets the most weight.
-    selector.reset()
+    selector.reset()  # awake, the member that is better gets the most weight
     told.error = OwnError(4.0, 2.1, 9.0)
     for i in range(20):
         selector.observe(i * 10**9, known, Motions(np.eye(4), {3: resting, 5: resting}))
         one = selector.select()
     assert one.weights[5] > 0.8
-    # A single odometry knows no rest.
-    assert Selector(keeps, members=()).members == ()
+    assert Selector(keeps, members=()).members == ()  # a single odometry
 
 
 def test_the_reserve_of_a_bank_joins_in_where_training_knows_nothing(monkeypatch):
