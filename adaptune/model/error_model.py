@@ -103,8 +103,7 @@ class ErrorModel:
         Number of each frame's stretch in its recording, the same in a view of it; by default each
         recording is one stretch.
     bank : list of int, optional
-        Trial numbers of the sets whose errors cancel each other best, the fixed one first, see
-        `adaptune.model.bank_weights.choose_members`; empty if there is no bank.
+        Trial numbers of its members, the fixed set's first; empty if there is no bank.
     vectors : ndarray of shape (n_frames, len(bank), 3), optional
         float32, their errors as vectors; see `TrainingData`.
     elevations : list of float, optional
