@@ -15,10 +15,12 @@ from adaptune.hosting import server
 from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import LastMotion, OdometryInstance, Registration, WarmUp
 from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.isolation import SERVICE, Limits
 from adaptune.odometry.lateness import Lateness
 from adaptune.odometry.pool import OdometryPool
 from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.tracker import Tracker
 from adaptune.selection import Selection
 from adaptune.sequence.scan import Scan
 
@@ -248,6 +250,41 @@ def test_one_that_rests_is_not_late_and_sees_the_past_bit_by_bit(make, scans):
     assert bank.restarts == 1
     assert not bank.late.removed.any()
     assert not bank.late.scans[1]
+
+
+def test_one_that_restarts_does_not_wait_for_those_that_are_woken(make, scans):
+    bank = make(0.1)
+    bank.apply(EVEN._replace(resting=frozenset({5})))
+    bank.start(bank.prepare(scans[0]), np.eye(4))
+    for i, scan in enumerate(scans[1:], 1):
+        if i == 15:
+            (first,) = set(bank.trials) - {5}
+            bank.apply(EVEN._replace(restart=frozenset({first})))
+        T = bank.register(bank.prepare(scan)).T_odom_sensor
+        np.testing.assert_allclose(T[0, 3], STEP * i, atol=0.05)
+        moved = bank.motions.members[5]
+        # No motion contains the way that it did not see.
+        assert np.isnan(moved[0, 3]) if i < 20 else abs(moved[0, 3] - STEP) < 0.05
+    assert bank.restarts == 2
+
+
+def test_a_bank_that_fails_in_real_time_goes_on_with_all_members(make, scans):
+    bank = make(0.1)
+    # There is no time for scans of the past.
+    assert not bank.rewinds
+    assert make(None).rewinds
+    fixed = Selection(3, {}, {3: 1.0})
+    tracker = Tracker(bank, HealthCheck(max_speed=20.0), lambda *_: bank.apply(fixed) is None)
+    bank.apply(fixed._replace(resting=frozenset({5})))
+    unhealthy, known = [], []
+    for i, scan in enumerate(scans):
+        # At one scan, the way of a tenth of a second is made in a hundredth of that.
+        stamp = scans[14].stamp + 10**6 if i == 15 else scan.stamp
+        unhealthy.append(tracker.register(Scan(stamp, scan.points)).unhealthy)
+        known.append(bool(np.isfinite(bank.motions.members[5]).all()))
+    assert [i for i, what in enumerate(unhealthy) if what] == [15]
+    assert known[:15] == [False] * 15
+    assert all(known[20:])
 
 
 def test_a_bank_may_start_while_a_member_restarts(make, scans):
