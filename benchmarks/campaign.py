@@ -1,6 +1,7 @@
 """What a campaign adds to the odometry's own work, and what it takes with many trials.
 
     python benchmarks/campaign.py speed [TRIALS] [SCANS]
+    python benchmarks/campaign.py memory [ROUNDS]
     python benchmarks/campaign.py size [TRIALS]
 
 *speed* records a simulated cave and runs TRIALS (64) sets of GICP over its SCANS (600): once in a
@@ -8,11 +9,17 @@ bare loop that reads, prepares and registers the clouds, once as two such loops 
 with half of the sets each, once as a campaign with one worker, once with two. Limits: 1.10 times
 the bare loop's time with one worker, 1.8 times faster with two, where two bare loops are.
 
+*memory* lets a worker, which may keep 0.4 GB of prepared scans, run a trial on each of four caves,
+ROUNDS (4) times. Each cave makes room for the next one. It prints the worker's memory at the end,
+as a ratio to what it keeps, and its CPU time: as it is, and without `adaptune.cores.apart`.
+Limit: 2 times what it keeps.
+
 *size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are random numbers, and prints
 the driver's memory on the way. Then it measures how long a resumed campaign takes: until it
 proposes the next trial (limit 5 s), and until it ends, with its model, where it lacks nothing.
 """
 
+import contextlib
 import multiprocessing as mp
 import os
 import resource
@@ -31,11 +38,14 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import drives
 
+from adaptune import yaml
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
 from adaptune.simulation.recording import record
 from offline import train as training
+from offline import workers
 from offline.offline_study import OfflineStudy, load_study
+from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Task, TaskResult
 
 STUDY = """\
@@ -124,6 +134,38 @@ def speed(trials: int, scans: int) -> None:
         print(f"two, half of it each  {wall_halves:8.1f} s: {wall / wall_halves:.2f} times faster")
         print(f"1 worker              {wall_1:8.1f} s: {wall_1 / wall:.3f} times the bare loop's")
         print(f"2 workers             {wall_2:8.1f} s: {wall_1 / wall_2:.2f} times faster than one")
+
+
+def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
+    """Memory of a worker's process after some rounds, over what it keeps, and its CPU seconds."""
+    if not as_it_is:
+        workers.apart = contextlib.nullcontext  # type: ignore[assignment]
+    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    sequences = workers.Sequences(setup, 0.4e9)
+    before, begin = _memory(), time.process_time()
+    for name in n * study.training:
+        sequences.run(Task(name, (0,), (study.odometry.space.baseline,)), lambda _: None)
+    kept = 1e-6 * sum(one.nbytes for one in sequences._ready.values())
+    return (_memory() - before) / kept, time.process_time() - begin
+
+
+def memory(n: int) -> None:
+    """Compare the memory of workers."""
+    with tempfile.TemporaryDirectory() as temporary:
+        file = Path(temporary) / "caves.yaml"
+        caves = {f"cave_{i}": {"scenes": ["cave"], "length": 40, "seed": i} for i in range(4)}
+        odometry = {"name": "gicp", "settings": {"downsampling": 0.5}}
+        study = {"odometry": odometry, "courses": caves, "training": list(caves)}
+        file.write_text(yaml.dump(study))
+        loaded = load_study(file, [], Path(temporary) / "caves")
+        for name in caves:
+            loaded.sequences.recording(name).parent.mkdir(parents=True, exist_ok=True)
+            record(loaded.config.courses[name], loaded.sequences.recording(name))
+            for _ in loaded.sequences.open(name):
+                pass  # into the cache
+        for what, as_it_is in (("as it is", True), ("with holes", False)):
+            _, (ratio, seconds) = in_child(rounds, loaded, n, as_it_is)
+            print(f"{what:10s} {ratio:5.2f} times what it keeps, {seconds:6.1f} s of CPU time")
 
 
 class Drawn:
@@ -227,10 +269,12 @@ def size(trials: int) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2 or sys.argv[1] not in ("speed", "size"):
+    if len(sys.argv) < 2 or sys.argv[1] not in ("speed", "memory", "size"):
         sys.exit(__doc__)
     numbers = [int(word) for word in sys.argv[2:]]
     if sys.argv[1] == "speed":
         speed(*(numbers + [64, 600][len(numbers) :]))
+    elif sys.argv[1] == "memory":
+        memory(*(numbers or [4]))
     else:
         size(*(numbers or [10_000]))
