@@ -33,7 +33,7 @@ class ComparedReplays(NamedTuple):
     words: list[str]  # sentences: what was gained, and what must be known to trust it
 
 
-def compare(study: Study) -> ComparedReplays:
+def compare(study: Study, write: bool = True) -> ComparedReplays:
     """Compare the replays that were made, and write tables and pictures.
 
     A mode is compared if it was replayed on all sequences that are compared, see
@@ -46,6 +46,8 @@ def compare(study: Study) -> ComparedReplays:
         The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, the
         tables as Markdown (``tables.md``) and LaTeX (``tables.tex``), and a picture (PNG and SVG)
         for every sequence.
+    write
+        Whether it does.
 
     Raises
     ------
@@ -69,6 +71,8 @@ def compare(study: Study) -> ComparedReplays:
         if oracle is not None and model is not None:
             period = study.config.online.period
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
+        if not write:
+            continue
         draw_replays(
             study.folder / "comparison" / f"{name}.png",
             f"{study.name}: {name}",
@@ -80,13 +84,14 @@ def compare(study: Study) -> ComparedReplays:
         )
     twins = compared.twins
     rows = [replace(row, twin=twins.get(row.mode, "")) for row in _rows(judged, oracles)]
-    folder = study.folder / "comparison"
-    report.write_rows(folder, "comparison", [row.columns() for row in rows])
-    made = tables(rows, study.config.sub_trajectory)
     words = [*remarks(rows), *_equal_cost(model), *compared.words(study)]
     words += _missing_repeats(judged, study.config.online.repeats)
     words += _without_oracle(judged, oracles) if model is not None else []
-    report.write_tables(folder, study.name, made, words)
+    if write:
+        folder = study.folder / "comparison"
+        report.write_rows(folder, "comparison", [row.columns() for row in rows])
+        made = tables(rows, study.config.sub_trajectory)
+        report.write_tables(folder, study.name, made, words)
     return ComparedReplays(rows, words)
 
 

@@ -100,7 +100,7 @@ def _comparison(study: "OfflineStudy") -> "PageSection":
 
     title = "What adapting gained"
     try:
-        rows, said = compare(study)
+        rows, said = compare(study, write=False)
     except AdaptuneError as error:
         words = _so_far(study)
         return PageSection(title, tuple(words), (f"No comparison: {error}.",))
