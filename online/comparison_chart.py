@@ -1,6 +1,5 @@
 """The chart of a comparison: the ratio of each mode's error, over all sequences and on each."""
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,8 +16,7 @@ from adaptune.charts.chart import (
     Points,
     charts_of,
 )
-from adaptune.study.study import Study
-from online.comparison_row import ALL
+from online.comparison_row import ALL, ComparisonRow
 
 _VERSUS = "vs "
 _LINE, _BELOW = 0.12, 0.3
@@ -27,12 +25,9 @@ _MOST_NAMED = 6
 """Sequences that each have a look of their own."""
 
 
-def charts_of_comparison(study: Study) -> Charts:
-    """The chart of what `adaptune compare` wrote, or that it is missing."""
-    path = study.folder / "comparison" / "comparison.json"
-    if not path.exists():
-        return Charts([], ["No comparison: run `adaptune compare`."])
-    chart = comparison_chart(json.loads(path.read_text("utf-8")))
+def charts_of_comparison(rows: Sequence[ComparisonRow]) -> Charts:
+    """The chart of a comparison, or why there is none."""
+    chart = comparison_chart([row.columns() for row in rows])
     return charts_of((chart or "No ratios of errors: no sequence has a reference.",))
 
 

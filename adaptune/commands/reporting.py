@@ -104,7 +104,7 @@ def _comparison(study: "OfflineStudy") -> "PageSection":
     except AdaptuneError as error:
         words = _so_far(study)
         return PageSection(title, tuple(words), (f"No comparison: {error}.",))
-    found = charts_of_comparison(study)
+    found = charts_of_comparison(rows)
     made = [*tables(rows, study.config.sub_trajectory), modes_in_words(rows)]
     return PageSection(title, tuple(said), tuple(found.notes), tuple(found.charts), tuple(made))
 

@@ -10,7 +10,7 @@ import pytest
 from pictures import texts
 
 from adaptune.errors import AdaptuneError
-from adaptune.model import BankSettings, ErrorModel
+from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.selection import Selection
 from adaptune.study.driven import ModeError, bank_members
 from adaptune.study.mistakes import ConfigurationError
@@ -114,7 +114,8 @@ def test_an_odometry_that_is_not_live_adapts_too(own, study_file, mechanism):
     study = load_study(study_file, [*given, "online.period=0.5"], own.folder)
     # One set at a time is driven where a bank does not pay.
     path = own.folder / "unpaying.safetensors"
-    replace(model, bank_settings=BankSettings(adapt=False)).save(path)
+    one_set = replace(model, paired=PairedSettings(), bank_settings=BankSettings(adapt=False))
+    one_set.save(path)
     assert run_replays(study, path) == 4
     row = next(row for row in compare(study).rows if row.mode == "paired")
     assert row.rte < 3.0

@@ -1,11 +1,8 @@
-import json
-
 import numpy as np
 import pytest
 
 from adaptune.charts.chart import Line, Points
-from offline.offline_study import load_study
-from online.comparison_chart import charts_of_comparison, comparison_chart
+from online.comparison_chart import comparison_chart
 
 
 def row(sequence, mode, ratio, low=None, high=None, other="fixed"):
@@ -74,16 +71,6 @@ def test_the_baseline_may_be_what_others_are_compared_with():
     assert comparison_chart(rows) is None
     rows.append(row("one", "untrained", 0.7, other="baseline"))
     assert "baseline" in comparison_chart(rows).title
-
-
-def test_the_study_is_read(study_file, tmp_path):
-    study = load_study(study_file, [], tmp_path / "study")
-    assert charts_of_comparison(study) == ([], ["No comparison: run `adaptune compare`."])
-    folder = study.folder / "comparison"
-    folder.mkdir(parents=True)
-    (folder / "comparison.json").write_text(json.dumps(ROWS), "utf-8")
-    charts, notes = charts_of_comparison(study)
-    assert ([chart.key for chart in charts], notes) == (["comparison"], [])
 
 
 @pytest.mark.parametrize("rows", [[], [row("one", "paired", None)]])

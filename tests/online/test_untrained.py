@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from adaptune.cli import app
 from adaptune.live.untrained import UntrainedSelector, untrained_sets
-from adaptune.model import BankSettings, ErrorModel
+from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.driven import ModeError
 from offline.offline_study import load_study
 from online.comparison import compare
@@ -147,7 +147,8 @@ def test_it_is_compared_with_the_trained_modes_too(load, trained_folder):
     study = load()
     shutil.copytree(trained_folder, study.folder)
     model = ErrorModel.load(study.model_path)  # of which no bank is driven
-    replace(model, bank_settings=BankSettings(adapt=False)).save(study.model_path)
+    one_set = replace(model, paired=PairedSettings(), bank_settings=BankSettings(adapt=False))
+    one_set.save(study.model_path)
     run_replays(study, study.model_path)
     assert {row.mode for row in compare(study).rows} == {"baseline", "fixed", "paired", "paper"}
     assert run_untrained(study) == 1  # the baseline is the same
