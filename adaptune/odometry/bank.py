@@ -95,7 +95,7 @@ class Bank(OdometryInstance):
         self._told: set[int] = set()
         self.late = Lateness(self._members, self._names, rate)
         self._rate = rate
-        # In real time, there is none for it.
+        # In real time, there is no time for scans of the past.
         self.rewinds = rate is None
         self._returning: list[Successor] = []
         self._weights = np.eye(len(sets))[0]
