@@ -10,10 +10,9 @@ from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.selection import Selection
+from adaptune.selector import NEW
 from adaptune.sequence.scan import Scan
 
-NEW = 2 * 10**9
-"""Nanoseconds for which a failure may still be that of the set before."""
 AVOIDED = 60 * 10**9
 """Nanoseconds for which a set is not applied after the odometry failed with it."""
 
@@ -137,11 +136,13 @@ class Driver:
         return 0.0 if self._first is None else (stamp - self._first) * 1e-9
 
     def _tell(self, choice: Choice) -> None:
-        """Log what has changed since the last selection: the odometry is lost, the bank rests."""
-        applied = self._applied
-        if applied is not None and bool(applied.resting) != bool(choice.selection.resting):
-            what = "the bank rests" if choice.selection.resting else "the bank joins in"
-            _log.info("%s: %s at %.1f s", self._what, what, self._seconds(choice.stamp))
+        """Log what has changed since the last selection: who rests, and whether it is lost."""
+        before = frozenset() if self._applied is None else self._applied.resting
+        now = choice.selection.resting
+        for trial in sorted(before ^ now):
+            does = "rests" if trial in now else "joins in"
+            seconds = self._seconds(choice.stamp)
+            _log.info("%s: trial %d %s at %.1f s", self._what, trial, does, seconds)
         lost = choice.selection.lost
         if lost != (self._applied is not None and self._applied.lost):
             who = "odometry" if choice.selection.weights is None else "bank"

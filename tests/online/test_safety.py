@@ -209,7 +209,7 @@ def test_where_a_bank_that_rests_fails_all_join_in(caplog):
     np.testing.assert_allclose(
         result.trajectory.T_world_sensor[:, 0, 3], STEP * np.arange(40), atol=1e-9
     )
-    assert caplog.messages[-1] == "home: the bank rests at 3.0 s"
+    assert caplog.messages[-1] == "home: trial 2 rests at 3.0 s"
 
 
 def test_the_log_says_when_it_is_lost(caplog):
