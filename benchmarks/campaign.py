@@ -42,8 +42,8 @@ from adaptune import yaml
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
 from adaptune.simulation.recording import record
+from offline import prepared, workers
 from offline import train as training
-from offline import workers
 from offline.offline_study import OfflineStudy, load_study
 from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Task, TaskResult
@@ -139,12 +139,14 @@ def speed(trials: int, scans: int) -> None:
 def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     """Memory of a worker's process after some rounds, over what it keeps, and its CPU seconds."""
     if not as_it_is:
-        workers.apart = contextlib.nullcontext  # type: ignore[assignment]
+        workers.apart = prepared.apart = contextlib.nullcontext  # type: ignore[assignment]
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
     sequences = workers.Sequences(setup, 0.4e9)
     before, begin = _memory(), time.process_time()
-    for name in n * study.training:
-        sequences.run(Task(name, (0,), (study.odometry.space.baseline,)), lambda _: None)
+    # All but the baseline's clouds are prepared while trials run.
+    sets = [study.odometry.space.baseline | {"downsampling": d} for d in (0.25, 0.35, 0.7)]
+    for i, name in enumerate(n * study.training):
+        sequences.run(Task(name, (0,), (sets[i % len(sets)],)), lambda _: None)
     kept = 1e-6 * sum(one.nbytes for one in sequences._ready.values())
     return (_memory() - before) / kept, time.process_time() - begin
 
@@ -154,7 +156,7 @@ def memory(n: int) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         file = Path(temporary) / "caves.yaml"
         caves = {f"cave_{i}": {"scenes": ["cave"], "length": 40, "seed": i} for i in range(4)}
-        odometry = {"name": "gicp", "settings": {"downsampling": 0.5}}
+        odometry = {"name": "gicp"}
         study = {"odometry": odometry, "courses": caves, "training": list(caves)}
         file.write_text(yaml.dump(study))
         loaded = load_study(file, [], Path(temporary) / "caves")

@@ -7,6 +7,7 @@ from functools import partial
 from itertools import count
 from typing import Any
 
+from adaptune.cores import apart
 from adaptune.odometry.base import OdometryInstance, prepared_bytes
 from adaptune.sequence.scan import Scan
 
@@ -55,9 +56,11 @@ class SharedScans:
         kept = self._kept.setdefault(key, _Kept(instance))
         if i in kept.scans:
             return kept.scans[i]
-        scan, begin = read(), time.process_time()
-        prepared = kept.first.prepare(scan)
-        kept.seconds += time.process_time() - begin
+        # Also those that a pass makes while it runs: a worker once grew to five times its share.
+        with apart():
+            scan, begin = read(), time.process_time()
+            prepared = kept.first.prepare(scan)
+            kept.seconds += time.process_time() - begin
         kept.n_prepared += 1
         if self._has_room(size := prepared_bytes(prepared), i):
             kept.scans[i] = prepared
