@@ -64,6 +64,15 @@ class PooledSpace(ParameterSpace):
         ]
 
     @property
+    def labels(self) -> dict[str, str]:
+        """See `ParameterSpace.labels`; the unit only if it is that of every odometry's."""
+        every: dict[str, set[str]] = {name: set() for name in self.names}
+        for space in self.spaces.values():
+            for name, label in space.labels.items():
+                every[name].add(label)
+        return {name: of.pop() if len(of) == 1 else name for name, of in every.items()}
+
+    @property
     def baselines(self) -> list[ParameterSet]:
         """See `ParameterSpace.baselines`."""
         return [{ODOMETRY: label, **space.baseline} for label, space in self.spaces.items()]
@@ -138,6 +147,10 @@ class PooledSpace(ParameterSpace):
     def dump(self) -> dict[str, dict[str, Any]]:
         """The spaces by label, as plain data."""
         return {label: space.dump() for label, space in self.spaces.items()}
+
+    def definition(self) -> dict[str, dict[str, Any]]:
+        """The spaces by label, as plain data with units."""
+        return {label: space.definition() for label, space in self.spaces.items()}
 
 
 def load_space(data: Mapping[str, Any]) -> ParameterSpace:

@@ -31,7 +31,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
 
 
 class _Range(StrictModel):
-    """Bounds and scale of a real or whole number."""
+    """Bounds, scale and unit of a real or whole number."""
 
     _types: ClassVar[tuple[type, ...]] = (int,)
 
@@ -39,6 +39,7 @@ class _Range(StrictModel):
     high: float
     baseline: float
     log: bool = False
+    unit: str = ""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -115,6 +116,7 @@ class Categorical(StrictModel):
     type: Literal["categorical"] = "categorical"
     choices: tuple[Value, ...] = Field(min_length=2, max_length=1000)
     baseline: Value
+    unit: str = ""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -162,8 +164,8 @@ class ParameterSpace:
         return cls(parameters)
 
     def __eq__(self, other: object) -> bool:
-        mine = list(self.parameters.items())
-        return isinstance(other, ParameterSpace) and mine == list(other.parameters.items())
+        # As text, so that the order counts.
+        return isinstance(other, ParameterSpace) and repr(self.dump()) == repr(other.dump())
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -179,6 +181,11 @@ class ParameterSpace:
     def logarithmic(self) -> list[str]:
         """Those of `names` whose range is spaced evenly in ratio."""
         return [name for name, p in self.parameters.items() if getattr(p, "log", False)]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What an axis says of each of `names`: the name and, if it is known, the unit."""
+        return {name: label(name, parameter) for name, parameter in self.parameters.items()}
 
     @property
     def baseline(self) -> ParameterSet:
@@ -227,13 +234,33 @@ class ParameterSpace:
         ]
 
     def dump(self) -> dict[str, dict[str, Any]]:
-        """The space as plain data, for files."""
-        return {name: p.model_dump(mode="json") for name, p in self.parameters.items()}
+        """The space as plain data, without units: what trials depend on."""
+        return {
+            name: p.model_dump(mode="json", exclude={"unit"}) for name, p in self.parameters.items()
+        }
+
+    def definition(self) -> dict[str, dict[str, Any]]:
+        """The space as plain data, with the units that are known: what a study file may say."""
+        return {
+            name: of | ({"unit": unit} if (unit := self.parameters[name].unit) else {})
+            for name, of in self.dump().items()
+        }
 
     @classmethod
     def load(cls, data: Mapping[str, Any]) -> Self:
-        """Make a space from the result of `dump`; a pydantic.ValidationError if it is none."""
+        """Make a space from what `dump` or `definition` returned.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If it is none.
+        """
         return cls({name: _adapter.validate_python(p) for name, p in data.items()})
+
+
+def label(name: str, parameter: Float | Integer | Categorical) -> str:
+    """What an axis says of a parameter."""
+    return f"{name} [{parameter.unit}]" if parameter.unit else name
 
 
 def describe(parameter: Float | Integer | Categorical) -> str:

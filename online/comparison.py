@@ -7,7 +7,7 @@ from typing import NamedTuple
 from adaptune import report
 from adaptune.drawing import LINES
 from adaptune.model import ErrorModel
-from adaptune.study.driven import EQUAL_COST, RIVAL_WORDS, RIVALS
+from adaptune.study.driven import EQUAL_COST, RIVALS
 from adaptune.study.oracle_runs import read_oracle
 from adaptune.study.study import Study
 from online.compared_modes import compared_modes
@@ -79,7 +79,7 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
             study.config.sub_trajectory,
             {mode: track_of(replays[mode][0], reference, model) for mode in drawn_modes(modes)},
             None if reference.trajectory is None else seen_from(reference.trajectory),
-            setup.odometry.space.logarithmic,
+            setup.odometry.space,
             reference.estimated,
         )
     twins = compared.twins
@@ -99,7 +99,10 @@ def _equal_cost(model: ErrorModel | None) -> list[str]:
     """That the fixed set is its own rival, if it is."""
     if model is None or model.rivals.get(EQUAL_COST) != model.fixed:
         return []
-    return [f"In training, {RIVAL_WORDS[EQUAL_COST]} than what is driven is the fixed set itself."]
+    return [
+        "`equal_cost` is the fixed set: in training, no single set that costs no more than what is "
+        "driven was better."
+    ]
 
 
 def _missing_repeats(judged: Sequence[JudgedModes], repeats: int) -> list[str]:

@@ -158,7 +158,11 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
         for mode, values in chosen.items():
             y = [_place(value, names) for value in values]
             drawn.append(Line(single[mode].span, [*y, y[-1]], mode, steps=True))
-        axis = Axis("value", log=name in replayed.logarithmic and names is None, names=names)
+        log, label = (
+            name in replayed.space.logarithmic and names is None,
+            replayed.space.labels[name],
+        )
+        axis = Axis(label, log=log, names=names)
         yield Panel(TIME, axis, tuple(drawn), name)
 
 
@@ -235,7 +239,8 @@ def _maps(mode: str, of: ModeReplay, replayed: ReplayedSequence) -> Iterator[Pan
         if any(isinstance(v, str) for v in values) or len(set(map(repr, values))) < 2:
             continue
         chosen = np.array(values, float)
-        yield _map(of, chosen, name, f"{mode}: {name}", name in replayed.logarithmic)
+        label, log = replayed.space.labels[name], name in replayed.space.logarithmic
+        yield _map(of, chosen, label, f"{mode}: {name}", log)
 
 
 def _map(

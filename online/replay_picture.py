@@ -1,6 +1,6 @@
 """The picture of the replays of a sequence: from above, and the errors and selections over time."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.drawing import LINES, OTHERS, as_png_and_svg, log_scale, picture, plain
+from adaptune.space import ParameterSpace
 from adaptune.study.config import ALSO
 
 _HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---")
@@ -75,7 +76,7 @@ def draw_replays(
     length: float,
     tracks: Mapping[str, Track],
     reference: NDArray[np.float64] | None,
-    logarithmic: Collection[str] = (),
+    space: ParameterSpace,
     estimated: bool = False,
 ) -> None:
     """Draw the trajectories of all modes from above, and errors and selections over time.
@@ -92,8 +93,8 @@ def draw_replays(
         By mode.
     reference
         Its positions like those of a track; None if there is none.
-    logarithmic
-        The parameters in log scale.
+    space
+        The parameters.
     estimated
         Whether the reference was computed from the recording.
     """
@@ -104,9 +105,9 @@ def draw_replays(
         panels.append((2.4, partial(_draw_errors, tracks=tracks, length=length)))
     # Sets of several odometries have other parameters; a bank's weights are drawn instead.
     single = [track.choices for track in tracks.values() if not track.weights]
-    for name in (name for name in single[0] if all(name in choices for choices in single)):
-        log = name in logarithmic
-        panels.append((1.0, partial(_draw_parameter, tracks=tracks, name=name, log=log)))
+    shared = [name for name in single[0] if all(name in choices for choices in single)]
+    drawn = partial(_draw_parameter, tracks=tracks, space=space)
+    panels += [(1.0, partial(drawn, name=name)) for name in shared]
     for mode, track in tracks.items():
         if np.isfinite(track.estimated[:, 0]).any() or track.lost.any():
             known = partial(_draw_estimated, mode=mode, track=track, length=length, true=true)
@@ -183,7 +184,9 @@ def _draw_errors(axes: Any, tracks: Mapping[str, Track], length: float) -> None:
     axes.set_ylabel(f"RTE over the next {length:g} m [%]")
 
 
-def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool) -> None:
+def _draw_parameter(
+    axes: Any, tracks: Mapping[str, Track], space: ParameterSpace, name: str
+) -> None:
     """What was applied of a parameter; a bank applies that of each of its members."""
     single = {mode: track for mode, track in tracks.items() if not track.weights}
     named = any(isinstance(v, str) for track in single.values() for v in track.choices[name])
@@ -192,9 +195,9 @@ def _draw_parameter(axes: Any, tracks: Mapping[str, Track], name: str, log: bool
         axes.step(track.span, [*values, values[-1]], where="post", **LINES[mode])
     # A line at a bound does not lie on the frame.
     axes.margins(y=0.15)
-    if log:
+    if name in space.logarithmic:
         log_scale(axes)
-    axes.set_ylabel(name.replace("_", "\n"), fontsize="small")
+    axes.set_ylabel(space.labels[name].replace("_", "\n"), fontsize="small")
 
 
 def _name(value: Any) -> str:

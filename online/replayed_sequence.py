@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from adaptune.charts.chart import Spans
 from adaptune.charts.course_scenes import scene_spans
 from adaptune.model import ErrorModel
+from adaptune.space import ParameterSpace
 from adaptune.study.study import Study
 from adaptune.trajectory import read_tum
 from online.remarks import of_lengths, short_replays
@@ -49,8 +50,8 @@ class ReplayedSequence:
     name: str
     length: float  # metres of a sub-trajectory
     modes: Mapping[str, ModeReplay]  # in the order in which lines lie on each other
+    space: ParameterSpace
     scenes: Spans | None = None  # of a simulated course
-    logarithmic: Collection[str] = ()  # the parameters in log scale
     estimated: bool = False  # whether the reference was computed from the recording
     refused: Sequence[str] = ()  # sentences about replays that are not among them
 
@@ -88,8 +89,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         name,
         study.config.sub_trajectory,
         modes,
+        space,
         scenes,
-        space.logarithmic,
         reference.estimated,
         [*current.refused, *short, *_undrawn(name, [m for m in current.modes if m not in drawn])],
     )

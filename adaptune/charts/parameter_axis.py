@@ -1,4 +1,4 @@
-"""Axes of parameters: their scale, and their categories."""
+"""Axes of parameters: their unit, their scale, and their categories."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.charts.chart import Axis
-from adaptune.space import Categorical, Float, Integer
+from adaptune.space import Categorical, Float, Integer, label
 
 Parameter = Float | Integer | Categorical
 
@@ -15,8 +15,8 @@ Parameter = Float | Integer | Categorical
 def parameter_axis(name: str, parameter: Parameter) -> Axis:
     """The axis of a parameter: logarithmic as its range is, or with the names of its choices."""
     if isinstance(parameter, Categorical):
-        return Axis(name, names=tuple(map(str, parameter.choices)))
-    return Axis(name, log=parameter.log)
+        return Axis(label(name, parameter), names=tuple(map(str, parameter.choices)))
+    return Axis(label(name, parameter), log=parameter.log)
 
 
 def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:

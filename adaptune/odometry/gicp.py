@@ -57,8 +57,8 @@ class KeyframeGicp(_SmallGicp):
     """Scan-to-keyframe GICP (Segal et al., RSS 2009; Koide et al., small_gicp, JOSS 2024)."""
 
     space = ParameterSpace.of(
-        max_correspondence_distance=Float(low=1.0, high=10.0, baseline=4.0, log=True),
-        keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True),
+        max_correspondence_distance=Float(low=1.0, high=10.0, baseline=4.0, log=True, unit="m"),
+        keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True, unit="m"),
         downsampling=DOWNSAMPLING,
         iterations=ITERATIONS,
     )
@@ -72,8 +72,8 @@ class KeyframeVgicp(_SmallGicp):
     """Scan-to-keyframe voxelised GICP (Koide et al., ICRA 2021; small_gicp, JOSS 2024)."""
 
     space = ParameterSpace.of(
-        resolution=Float(low=0.5, high=5.0, baseline=1.0, log=True),
-        keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True),
+        resolution=Float(low=0.5, high=5.0, baseline=1.0, log=True, unit="m"),
+        keyframe_interval=Float(low=1.0, high=30.0, baseline=4.0, log=True, unit="m"),
         downsampling=DOWNSAMPLING,
         iterations=ITERATIONS,
     )

@@ -37,10 +37,10 @@ class Kiss(Odometry):
     """
 
     space = ParameterSpace.of(
-        voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True),
+        voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True, unit="m"),
         max_points_per_voxel=Integer(low=1, high=50, baseline=20, log=True),
-        initial_threshold=Float(low=0.2, high=5.0, baseline=2.0, log=True),
-        min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True),
+        initial_threshold=Float(low=0.2, high=5.0, baseline=2.0, log=True, unit="m"),
+        min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True, unit="m"),
         max_num_iterations=Integer(low=5, high=500, baseline=500, log=True),
     )
     settings_type = RangeSettings

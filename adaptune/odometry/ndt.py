@@ -13,9 +13,9 @@ class KeyframeNdt(KeyframeOdometry):
     """Scan-to-keyframe NDT (Magnusson, *The Three-Dimensional Normal-Distributions Transform*)."""
 
     space = ParameterSpace.of(
-        resolution=Float(low=1.0, high=10.0, baseline=4.0, log=True),
+        resolution=Float(low=1.0, high=10.0, baseline=4.0, log=True, unit="m"),
         # The paper's range begins at 0, where a logarithm has no place.
-        keyframe_interval=Float(low=0.1, high=10.0, baseline=4.0, log=True),
+        keyframe_interval=Float(low=0.1, high=10.0, baseline=4.0, log=True, unit="m"),
         downsampling=keyframe.DOWNSAMPLING,
         iterations=keyframe.ITERATIONS.model_copy(update={"baseline": 30}),
     )

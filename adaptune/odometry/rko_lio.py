@@ -85,9 +85,9 @@ class RkoLio(OwnFrameOdometry):
     """
 
     space = ParameterSpace.of(
-        voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True),
-        max_correspondence_distance=Float(low=0.1, high=3.0, baseline=0.5, log=True),
-        max_expected_jerk=Float(low=0.3, high=30.0, baseline=3.0, log=True),
+        voxel_size=Float(low=0.1, high=3.0, baseline=1.0, log=True, unit="m"),
+        max_correspondence_distance=Float(low=0.1, high=3.0, baseline=0.5, log=True, unit="m"),
+        max_expected_jerk=Float(low=0.3, high=30.0, baseline=3.0, log=True, unit="m/s^3"),
         min_beta=Float(low=10.0, high=5000.0, baseline=200.0, log=True),
     )
     settings_type = RkoLioSettings

@@ -19,9 +19,9 @@ type           holds                                                    answer
 
 or with ``refused`` and a ``message`` if it cannot do what is asked, or with ``fault`` and a
 ``message`` if it has ended. The answer to a hello holds version, odometry (its name), live,
-needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline.
-A pose comes with the stamp of its scan, with registered, and if they are known with cpu, the
-seconds of CPU time of the odometry's process, and memory, its peak in megabytes. A ``start``
+needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline;
+and unit?. A pose comes with the stamp of its scan, with registered, and if they are known with cpu,
+the seconds of CPU time of the odometry's process, and memory, its peak in megabytes. A ``start``
 forgets all scans.
 
 Points are float32 of shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16,
@@ -310,7 +310,7 @@ def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Serve
 
 def about(described: Description) -> dict[str, Any]:
     """A description as an answer holds it."""
-    space = {} if described.space is None else described.space.dump()
+    space = {} if described.space is None else described.space.definition()
     return {"live": described.live, "needs_imu": described.needs_imu, "space": space}
 
 

@@ -195,7 +195,7 @@ class Study(Generic[C_co]):
         for entry, config in zip(entries, self.config.odometries.values(), strict=True):
             made = self._factory(config)
             entry["settings"] = made.settings.model_dump(mode="json")
-            entry["parameters"] = made.space.dump()
+            entry["parameters"] = made.space.definition()
         return resolved
 
 

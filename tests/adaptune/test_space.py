@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from adaptune import yaml
+from adaptune.pooled_space import PooledSpace
 from adaptune.space import (
     Categorical,
     Float,
@@ -260,3 +261,27 @@ def test_choices_that_only_look_equal_are_told_apart(choices):
     parameter = Categorical(choices=choices, baseline=choices[0])
     back = [parameter.from_unit(parameter.to_unit(choice)) for choice in choices]
     assert list(map(repr, back)) == list(map(repr, choices))
+
+
+def test_a_unit_is_for_pictures_only():
+    distance = Float(low=0.1, high=2.0, baseline=1.0)
+    plain = ParameterSpace.of(distance=distance)
+    space = ParameterSpace.of(distance=distance.model_copy(update={"unit": "m"}))
+    assert (space.labels, plain.labels) == ({"distance": "distance [m]"}, {"distance": "distance"})
+    # Trials and models of a study stay those of the study that names no unit.
+    assert space == plain
+    assert space.dump() == plain.dump()
+    assert ParameterSpace.load(space.definition()).labels == space.labels
+
+
+KERNEL = Categorical(choices=("none", "huber"), baseline="none")
+
+
+def test_odometries_of_a_pool_may_differ_in_units():
+    metres, centimetres = (
+        ParameterSpace.of(voxel=Float(low=1.0, high=2.0, baseline=1.0, unit=unit), kernel=KERNEL)
+        for unit in ("m", "cm")
+    )
+    labels = PooledSpace({"one": metres, "two": centimetres}).labels
+    assert labels == {"odometry": "odometry", "voxel": "voxel", "kernel": "kernel"}
+    assert PooledSpace({"one": metres, "two": metres}).labels["voxel"] == "voxel [m]"

@@ -3,6 +3,7 @@ import pytest
 from pictures import MODES, is_white, share_of, texts
 
 from adaptune.drawing import LINES, OTHERS
+from adaptune.space import Categorical, Float, ParameterSpace
 from online.replay_picture import FEW, Track, draw_replays, drawn_modes
 
 SECONDS = np.arange(0.0, 20.0, 0.1)
@@ -25,9 +26,16 @@ def track(**changed):
     return made._replace(**changed)
 
 
+SPACE = ParameterSpace.of(
+    odometry=Categorical(choices=("gicp", "ndt"), baseline="gicp"),
+    max_distance=Float(low=0.1, high=2.0, baseline=1.0, log=True, unit="m"),
+    kernel=Categorical(choices=("none", "huber"), baseline="none"),
+)
+
+
 def drawn(folder, tracks, reference=REFERENCE):
     path = folder / "three.png"
-    draw_replays(path, "study: three", 15.0, tracks, reference, ["max_distance"])
+    draw_replays(path, "study: three", 15.0, tracks, reference, SPACE)
     return path, texts(path)
 
 
@@ -38,7 +46,7 @@ def test_all_modes_are_seen_where_they_are_equal(tmp_path):
         assert share_of(path, LINES[mode]["color"], above=0.9) > 0.05, mode  # the legend is below
     for label in ("RTE over the next 15 m [%]", "time [s]", "x [m]", "y [m]", "reference", "start"):
         assert said.count(label) == 1, label
-    for tick in ("0.7", "0.8", "none", "huber", "distance"):
+    for tick in ("0.7", "0.8", "none", "huber", "distance [m]"):
         assert tick in said
     assert is_white(path)
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from adaptune.charts.chart import Spans
+from adaptune.space import Categorical, Float, ParameterSpace
 from online.replay_picture import Track
 from online.replayed_sequence import ModeReplay, ReplayedSequence
 
@@ -44,6 +45,14 @@ def bank(**changed):
     return replay(weights=weights, **changed)
 
 
+SPACE = ParameterSpace.of(
+    odometry=Categorical(choices=("gicp", "ndt"), baseline="gicp"),
+    distance=Float(low=0.1, high=2.0, baseline=1.0, log=True, unit="m"),
+    kernel=Categorical(choices=("none", "huber"), baseline="none"),
+    resolution=Float(low=0.5, high=4.0, baseline=1.0, log=True, unit="m"),
+)
+
+
 def sequence(**modes):
     """The replays of a sequence by mode."""
-    return ReplayedSequence("new", 10.0, modes, SCENES, ["distance"])
+    return ReplayedSequence("new", 10.0, modes, SPACE, SCENES)

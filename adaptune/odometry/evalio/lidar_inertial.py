@@ -35,11 +35,15 @@ class LioSam(RingedPipeline):
     space = ParameterSpace.of(
         edgeThreshold=Float(low=0.1, high=10.0, baseline=1.0, log=True),
         surfThreshold=Float(low=0.01, high=1.0, baseline=0.1, log=True),
-        odometrySurfLeafSize=Float(low=0.1, high=1.5, baseline=0.4, log=True),
-        mappingCornerLeafSize=Float(low=0.05, high=1.0, baseline=0.2, log=True),
-        mappingSurfLeafSize=Float(low=0.1, high=1.5, baseline=0.4, log=True),
-        surroundingkeyframeAddingDistThreshold=Float(low=0.2, high=5.0, baseline=1.0, log=True),
-        surroundingKeyframeSearchRadius=Float(low=10.0, high=100.0, baseline=50.0, log=True),
+        odometrySurfLeafSize=Float(low=0.1, high=1.5, baseline=0.4, log=True, unit="m"),
+        mappingCornerLeafSize=Float(low=0.05, high=1.0, baseline=0.2, log=True, unit="m"),
+        mappingSurfLeafSize=Float(low=0.1, high=1.5, baseline=0.4, log=True, unit="m"),
+        surroundingkeyframeAddingDistThreshold=Float(
+            low=0.2, high=5.0, baseline=1.0, log=True, unit="m"
+        ),
+        surroundingKeyframeSearchRadius=Float(
+            low=10.0, high=100.0, baseline=50.0, log=True, unit="m"
+        ),
     )
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
@@ -105,11 +109,11 @@ class Dlio(Pipeline):
         "calibrate_accel": False,
     }
     space = ParameterSpace.of(
-        vf_res=Float(low=0.1, high=1.0, baseline=0.25, log=True),
-        gicp_max_corr_dist=Float(low=0.2, high=3.0, baseline=0.5, log=True),
+        vf_res=Float(low=0.1, high=1.0, baseline=0.25, log=True, unit="m"),
+        gicp_max_corr_dist=Float(low=0.2, high=3.0, baseline=0.5, log=True, unit="m"),
         gicp_max_iter=Integer(low=3, high=32, baseline=32, log=True),
         gicp_k_correspondences=Integer(low=8, high=32, baseline=16, log=True),
-        keyframe_thresh_dist=Float(low=0.3, high=10.0, baseline=1.0, log=True),
+        keyframe_thresh_dist=Float(low=0.3, high=10.0, baseline=1.0, log=True, unit="m"),
         submap_knn=Integer(low=2, high=30, baseline=10, log=True),
         geo_Kp=Float(low=1.0, high=10.0, baseline=4.5, log=True),
         geo_Kv=Float(low=2.0, high=25.0, baseline=11.25, log=True),
