@@ -47,20 +47,26 @@ def apart() -> Iterator[None]:
     different sizes and replaces them time after time, as prepared scans, the holes between them
     then take several times what they hold. It costs some time for each array.
     """
+    global _apart  # noqa: PLW0603 - the setting is that of the process
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:  # only glibc has it
         yield
         return
+    _apart += 1
     mallopt(_M_MMAP_THRESHOLD, _LARGE)
     try:
         yield
     finally:
-        mallopt(_M_MMAP_THRESHOLD, _LARGEST)
+        _apart -= 1
+        if not _apart:
+            mallopt(_M_MMAP_THRESHOLD, _LARGEST)
 
 
 _M_MMAP_THRESHOLD, _LARGE, _LARGEST = -3, 256 * 1024, 32 * 1024**2
 """The number of the setting in malloc.h; bytes of arrays that are kept apart, and to what glibc
 raises that by itself as such arrays become free."""
+_apart = 0
+"""In how many blocks of `apart` this process is."""
 _before: set[int] | None = None
 """Cores that this process had before it was pinned alone."""
 _numbers = itertools.count(1)

@@ -127,9 +127,12 @@ def select(
     return chosen[:top]
 
 
-def with_units(table: Sequence[Row], names: Sequence[str]) -> list[Row]:
-    """Rows for reading: headings say what is measured on the sequences, and its unit."""
-    headings = _HEADINGS | {name: f"RTE [%] {name}" for name in names}
+def with_units(table: Sequence[Row], names: Sequence[str], labels: Mapping[str, str]) -> list[Row]:
+    """Rows for reading: headings say what is measured on the sequences, and units.
+
+    `labels` are those of the parameters, see `ParameterSpace.labels`.
+    """
+    headings = {**labels, **_HEADINGS} | {name: f"RTE [%] {name}" for name in names}
     if table and ODOMETRY in table[0]:
         table = [_short(row) for row in table]
     return [{headings.get(key, key): value for key, value in row.items()} for row in table]

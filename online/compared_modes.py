@@ -30,14 +30,15 @@ class ComparedModes(NamedTuple):
             for mode, twin in self.twins.items()
         ]
         if self.unfinished:
-            there = [mode for mode in self.modes if mode not in ALSO]
+            there = [m for m in self.modes if m not in ALSO or self.modes == WITHOUT_MODEL]
             lacking = (
                 f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(study, name, m))})"
                 for name in self.unfinished
             )
+            command = replayed_by(study, UNTRAINED if self.modes == WITHOUT_MODEL else "fixed")
             said.append(
                 f"Not compared, because replays are missing: {', '.join(lacking)}; "
-                f"`adaptune online` makes them."
+                f"{command} makes them."
             )
         where: dict[tuple[str, ...], list[str]] = {}
         for mode, names in self.missing.items():
@@ -73,13 +74,15 @@ def compared_modes(study: Study) -> ComparedModes:
     names, without_model = study.config.test, sequences_without_model(study)
     of_model = [mode for mode in LINES if mode not in WITHOUT_MODEL]
     if not _any(study, names, of_model) and _any(study, without_model, [UNTRAINED]):
-        return ComparedModes(without_model, WITHOUT_MODEL, {}, {})
+        made, unfinished = _finished(study, without_model, WITHOUT_MODEL)
+        if made:
+            return ComparedModes(made, WITHOUT_MODEL, {}, {}, unfinished)
     if not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
     unfixed = [name for name in names if not _is_there(study, name, "fixed")]
-    if unfixed and all(_is_there(study, name, m) for name in names for m in WITHOUT_MODEL):
-        return ComparedModes(names, WITHOUT_MODEL, {}, {"fixed": unfixed})
     if len(unfixed) == len(names):
+        if all(_is_there(study, name, m) for name in names for m in WITHOUT_MODEL):
+            return ComparedModes(names, WITHOUT_MODEL, {}, {"fixed": unfixed})
         ReplaySummary.read(_folder(study, names[0], "fixed"))
     names, unfinished = _finished(study, names, ("fixed", BASELINE, *setup.rules))
     model = _model(study, names[0])

@@ -214,7 +214,7 @@ def _draw_estimated(axes: Any, mode: str, track: Track, length: float, true: str
         wide = LINES[mode] | {"lw": 3.6, "ls": "-"}  # seen where the estimate lies on it
         axes.plot(track.seconds, track.errors_behind, **wide, label=true)
     # A logarithmic axis has no zero.
-    low = np.maximum(low, 0.1 * estimated)
+    low = np.where(low > 0.0, low, 0.1 * high)
     seconds = track.choice_seconds
     axes.fill_between(seconds, low, high, color=_ESTIMATE, alpha=0.25, lw=0, label="95 % interval")
     axes.plot(seconds, estimated, color=_ESTIMATE, lw=1.4, label="estimated")

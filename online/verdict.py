@@ -129,8 +129,12 @@ def _how_surely(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
         on = f"on {row.worse} ({', '.join(worse)})" if worse else "on none"
         surely = ""
         if row.surely_better is not None:
+            known = sum(r.ratio_interval is not None for r in of)
+            which = "" if known == len(of) else f" of the {known} that are long enough to tell"
             surely = f"; surely better on {row.surely_better}, surely worse on {row.surely_worse}"
-        said.append(f"It has less error on {row.better} of {len(of)} sequences, more {on}{surely}.")
+            surely += which
+        less = f"By more than 1 %, it has less error on {row.better} of {len(of)} sequences"
+        said.append(f"{less}, and more {on}{surely}.")
     if row.worst_tenth is not None:
         said.append(
             f"In the worst tenth of {row.stretches} stretches it has {row.worst_tenth:.2f} times "

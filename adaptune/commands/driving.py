@@ -252,6 +252,7 @@ def compare(
 def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
     from adaptune.study.driven import MIN_RECORDINGS
     from offline.budget import TRIALS, more_trials
+    from online.compared_modes import compared_modes
 
     loaded = load(study, override, folder)
     rows = _compared(loaded)
@@ -260,6 +261,9 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
         say_next_of_study("look for better sets", "offline", study, override, folder)
         return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
+    if compared_modes(loaded).unfinished:
+        say_next_of_study("replay what is missing", "online", study, override, folder)
+        return
     n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
     if n < MIN_RECORDINGS and more is not None:
         why = f"try {TRIALS} sets; {MIN_RECORDINGS} training recordings tell of other recordings"

@@ -145,7 +145,11 @@ def _search(study: "OfflineStudy") -> "PageSection":
         return section
     best = trials.select([row for row in finished if row["mean"] is not None], [], "mean", _BEST)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
-    return replace(section, tables=(Listing(title, trials.with_units(best, study.training)),))
+    listed = trials.with_units(best, study.training, study.odometry.space.labels)
+    return replace(
+        section,
+        tables=(Listing(title, listed),),
+    )
 
 
 def _surroundings(study: "OfflineStudy") -> "PageSection":

@@ -169,7 +169,9 @@ def trials(
         sys.stdout.write(report.csv_text(chosen))
     else:
         title = f"{len(chosen)} of {len(finished)} trials"
-        console.print(report.table(title, table.with_units(chosen, names)))
+        console.print(
+            report.table(title, table.with_units(chosen, names, loaded.odometry.space.labels))
+        )
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")

@@ -350,7 +350,7 @@ class ErrorModel:
     def _header(self) -> dict[str, Any]:
         return {
             "odometry": self.odometry,
-            "space": self.sets.space.dump(),
+            "space": self.sets.space.definition(),
             "trials": self.sets.trials,
             "sets": self.sets.parameters,
             "fixed": self.fixed,

@@ -15,7 +15,7 @@ from adaptune.model.base import mean_errors
 from adaptune.model.error_model import ErrorModel
 from adaptune.parameter_sets import in_words
 from adaptune.pooled_space import ODOMETRY
-from adaptune.space import Categorical, Parameter, ParameterSet, describe
+from adaptune.space import Categorical, Parameter, ParameterSet, describe, label
 
 N_BEST = 5
 """Sets to show, besides the fixed one."""
@@ -165,7 +165,7 @@ def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
     fixed = model.sets.space.flat(model.sets[model.fixed])
     return [
         {
-            "parameter": name,
+            "parameter": label(name, parameter),
             "range": _range(parameter),
             "baseline": _words(parameter.baseline),
             "fixed": _words(fixed.get(name, "-")),

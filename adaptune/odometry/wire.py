@@ -19,10 +19,10 @@ type           holds                                                    answer
 
 or with ``refused`` and a ``message`` if it cannot do what is asked, or with ``fault`` and a
 ``message`` if it has ended. The answer to a hello holds version, odometry (its name), live,
-needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline;
-and unit?. A pose comes with the stamp of its scan, with registered, and if they are known with cpu,
-the seconds of CPU time of the odometry's process, and memory, its peak in megabytes. A ``start``
-forgets all scans.
+needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline,
+and unit if it is known. A pose comes with the stamp of its scan, with registered, and if they are
+known with cpu, the seconds of CPU time of the odometry's process, and memory, its peak in
+megabytes. A ``start`` forgets all scans.
 
 Points are float32 of shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16,
 intensities float32, poses and motions float64 of shape (4, 4), stamps integer nanoseconds. Four

@@ -85,7 +85,7 @@ def test_the_cost_is_a_column_and_its_parts_are_none(archive):
     assert [row["cost"] for row in table] == [None] * 4 + [8.0]
     assert not {"register_ms", "prepare_ms"} & set(table[4])
     assert table[4]["memory"] == 9.0
-    assert "cost [ms]" in with_units(table, ["cave", "street"])[0]
+    assert "cost [ms]" in with_units(table, ["cave", "street"], {})[0]
 
 
 def test_columns_go_by_what_objectives_call_them_too():
@@ -95,7 +95,10 @@ def test_columns_go_by_what_objectives_call_them_too():
 def test_headings_for_reading_have_units(archive):
     metrics = {"rpe": 0.1, "ape": 0.2, "kitti": 0.3, "memory": 40.0}
     archive.write("cave", 0, replace(archive.read("cave", 0), metrics=metrics))
-    (row,) = with_units(rows(archive, ["cave"])[:1], ["cave"])
+    finished = rows(archive, ["cave"])[:1]
+    name = list(finished[0])[1]
+    (row,) = with_units(finished, ["cave"], {name: f"{name} [m]"})
+    assert list(row)[1] == f"{name} [m]"
     expected = {"mean RTE [%]", "RTE [%] cave", "RPE [m]", "APE [m]", "KITTI [%]", "memory [MB]"}
     assert expected <= set(row)
     assert not {"mean", "cave", *metrics} & set(row)

@@ -142,13 +142,6 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     ]
     shutil.rmtree(both.folder / "replays/four/fixed")
     run_untrained(both)
-    assert {(row.mode, row.yardstick) for row in compare(both).rows} == {
-        ("baseline", "baseline"),
-        ("untrained", "baseline"),
-    }
-    (said,) = compared_modes(both).words(both)
-    assert said.startswith("`fixed` is not compared: there is no replay on four; `adaptune online`")
-    shutil.rmtree(both.folder / "replays/four/untrained")
     compared = compared_modes(both)
     assert (compared.sequences, compared.unfinished) == (("three",), ("four",))
     assert (
@@ -156,8 +149,29 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
         "makes them."
     ) in compare(both).words
     shutil.rmtree(both.folder / "replays/three/fixed")
+    assert {(row.mode, row.yardstick) for row in compare(both).rows} == {
+        ("baseline", "baseline"),
+        ("untrained", "baseline"),
+    }
+    (said,) = compared_modes(both).words(both)
+    assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
+    shutil.rmtree(both.folder / "replays/four/untrained")
     with pytest.raises(StoredReplayError, match=r"three/fixed: there is no replay; run"):
         compare(both)
+
+
+def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, tmp_path):
+    bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
+    four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
+    both = own("test=[three, four]", four)
+    shutil.rmtree(both.folder / "replays", ignore_errors=True)
+    run_untrained(both)
+    shutil.rmtree(both.folder / "replays/three/baseline")
+    assert {row.sequence for row in compare(both).rows} == {"four"}
+    assert (
+        "Not compared, because replays are missing: three (`baseline`); `adaptune online "
+        "--untrained` makes them."
+    ) in compare(both).words
 
 
 def test_every_mode_is_repeated_and_random_sets_differ(own):

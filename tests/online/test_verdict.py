@@ -146,8 +146,8 @@ def test_losses_costs_controls_and_rivals_are_told():
     rows = [replace(r, ratio=1.2) if (r.sequence, r.mode) == ("s3", "paired") else r for r in rows]
     said = verdict(rows)
     for sentence in (
-        "It has less error on 11 of 12 sequences, more on 1 (s3); surely better on 9, surely worse "
-        "on 1.",
+        "By more than 1 %, it has less error on 11 of 12 sequences, and more on 1 (s3); surely "
+        "better on 9, surely worse on 1.",
         "In the worst tenth of 24 stretches it has 1.25 times the fixed set's error.",
         "It gains 40 % of what the best set of each sequence would gain in hindsight.",
         "It takes 20.0 ms of CPU time a scan: 4.0 times what the fixed set takes.",
