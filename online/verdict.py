@@ -15,6 +15,8 @@ CONTROLS = {
 """Modes that choose nothing, in words."""
 ROUNDING = 1e-6
 """A ratio that differs less from 1 is 1."""
+_SAME_COST = 0.2
+"""Costs that differ by a smaller share are not worth a sentence."""
 ENOUGH_STRETCHES = 20
 """Fewer stretches say little about the worst tenth of others."""
 _UNSURE = "nothing can be said of how sure that is"
@@ -34,7 +36,9 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
     if all(row.ratio is None for row in last.values()):
         return ["No test sequence has a reference: nobody can say what was gained."]
     adaptive = [row for mode, row in last.items() if mode not in _NOT_ADAPTIVE]
-    tuned = _of_baseline(last["baseline"], rows) if {"fixed", "baseline"} <= last.keys() else []
+    tuned = []
+    if {"fixed", "baseline"} <= last.keys():
+        tuned = [*_of_baseline(last["baseline"], rows), *_cost_of_tuning(last)]
     if not adaptive:
         return [*tuned, _advice(last)]
     # `paired` comes first; without a model there is the untrained bank.
@@ -153,6 +157,17 @@ def _cost(row: ComparisonRow, yardstick: ComparisonRow) -> list[str]:
     return [
         f"It takes {row.cpu_ms:.1f} ms of CPU time a scan{cores}: "
         f"{row.cpu_ms / yardstick.cpu_ms:.1f} times what the {_YARDSTICKS[row.yardstick]} takes."
+    ]
+
+
+def _cost_of_tuning(last: Mapping[str, ComparisonRow]) -> list[str]:
+    """What the fixed set costs, if that differs from the baseline."""
+    fixed, baseline = last["fixed"].cpu_ms, last["baseline"].cpu_ms
+    if not fixed or not baseline or abs(fixed / baseline - 1.0) < _SAME_COST:
+        return []
+    return [
+        f"The fixed set takes {fixed:.1f} ms of CPU time a scan, {fixed / baseline:.1f} times what "
+        f"the baseline takes."
     ]
 
 

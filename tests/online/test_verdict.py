@@ -77,6 +77,14 @@ def test_without_a_mode_that_adapts_tuning_is_the_result():
     assert len(said) == 2
 
 
+@pytest.mark.parametrize(("fixed", "counts"), [(80.0, True), (42.0, False)])
+def test_what_tuning_costs_is_told_if_it_costs_something(fixed, counts):
+    costs = {"fixed": fixed, "baseline": 40.0}
+    rows = [replace(row, cpu_ms=costs[row.mode]) for row in every(baseline=1.25)]
+    told = "The fixed set takes 80.0 ms of CPU time a scan, 2.0 times what the baseline takes."
+    assert (told in verdict(rows)) == counts
+
+
 @pytest.mark.parametrize("ratio", [0.4, 1.0, 1.6])
 def test_without_an_interval_nothing_is_claimed(ratio):
     few = every(3, paired=ratio, paper=1.3 * ratio, even=1.1)
