@@ -159,27 +159,24 @@ def trials(
     from offline.budget import all_done
 
     warn_of_stale(loaded)
-    names = loaded.training
-    archive = Archive(loaded.folder / "trials")
+    names, archive = loaded.training, Archive(loaded.folder / "trials")
     finished = table.rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
     chosen = table.select(finished, where, sort, top)
+    labels = loaded.odometry.space.labels
     if csv:
         sys.stdout.write(report.csv_text(chosen))
     else:
         title = f"{len(chosen)} of {len(finished)} trials"
-        console.print(
-            report.table(title, table.with_units(chosen, names, loaded.odometry.space.labels))
-        )
+        console.print(report.table(title, table.with_units(chosen, names, labels)))
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
         for sentence in estimates_in_words(loaded, names):
             say(sentence)
         if all_done(loaded.config.offline, loaded.folder, (row["trial"] for row in finished)):
-            several = len(loaded.training) > 1
-            say_next_of_trained(several, loaded.config.test, study, override, folder)
+            say_next_of_trained(len(names) > 1, loaded.config.test, study, override, folder)
         else:
             why = "run the trials that are left, fit"
             say_next_of_study(why, "offline", study, override, folder)

@@ -55,7 +55,7 @@ def test_trials_have_their_charts(study):
     ]
     assert [note.split(":")[0] for note in notes] == ["No costs of trials"]
     # The most important one comes first.
-    assert charts[-1].panels[0].x.label == "keyframe_interval"
+    assert charts[-1].panels[0].x.label == "keyframe_interval [m]"
 
 
 def test_few_trials_say_what_is_missing(study):
