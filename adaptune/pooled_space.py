@@ -65,12 +65,12 @@ class PooledSpace(ParameterSpace):
 
     @property
     def labels(self) -> dict[str, str]:
-        """See `ParameterSpace.labels`; the unit only if it is that of every odometry's."""
+        """See `ParameterSpace.labels`; with a unit only where all odometries have the same."""
         every: dict[str, set[str]] = {name: set() for name in self.names}
         for space in self.spaces.values():
-            for name, label in space.labels.items():
-                every[name].add(label)
-        return {name: of.pop() if len(of) == 1 else name for name, of in every.items()}
+            for name, said in space.labels.items():
+                every[name].add(said)
+        return {name: said.pop() if len(said) == 1 else name for name, said in every.items()}
 
     @property
     def baselines(self) -> list[ParameterSet]:

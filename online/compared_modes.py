@@ -68,7 +68,7 @@ def compared_modes(study: Study) -> ComparedModes:
     Raises
     ------
     StoredReplayError
-        If neither the fixed set, nor baseline and untrained bank were replayed on all of them.
+        If the fixed set was replayed on none of them, and baseline and untrained bank not on all.
     """
     setup = ReplaySetup.of(study)
     names, without_model = study.config.test, sequences_without_model(study)

@@ -31,6 +31,7 @@ class ComparedReplays(NamedTuple):
     # A row for every sequence and mode; over several sequences, a row for every mode follows.
     rows: list[ComparisonRow]
     words: list[str]  # sentences: what was gained, and what must be known to trust it
+    unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
 
 
 def compare(study: Study, write: bool = True) -> ComparedReplays:
@@ -92,7 +93,7 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
         report.write_rows(folder, "comparison", [row.columns() for row in rows])
         made = tables(rows, study.config.sub_trajectory)
         report.write_tables(folder, study.name, made, words)
-    return ComparedReplays(rows, words)
+    return ComparedReplays(rows, words, compared.unfinished)
 
 
 def _equal_cost(model: ErrorModel | None) -> list[str]:

@@ -158,11 +158,8 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
         for mode, values in chosen.items():
             y = [_place(value, names) for value in values]
             drawn.append(Line(single[mode].span, [*y, y[-1]], mode, steps=True))
-        log, label = (
-            name in replayed.space.logarithmic and names is None,
-            replayed.space.labels[name],
-        )
-        axis = Axis(label, log=log, names=names)
+        log = name in replayed.space.logarithmic and names is None
+        axis = Axis(replayed.space.labels[name], log=log, names=names)
         yield Panel(TIME, axis, tuple(drawn), name)
 
 

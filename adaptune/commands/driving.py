@@ -16,6 +16,7 @@ from adaptune.terminal import begin_work, console, progress, say
 
 if TYPE_CHECKING:
     from offline.offline_study import OfflineStudy
+    from online.comparison import ComparedReplays
     from online.comparison_row import ComparisonRow
 
 log = logging.getLogger(__name__)
@@ -252,16 +253,15 @@ def compare(
 def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
     from adaptune.study.driven import MIN_RECORDINGS
     from offline.budget import TRIALS, more_trials
-    from online.compared_modes import compared_modes
 
     loaded = load(study, override, folder)
-    rows = _compared(loaded)
+    found = _compared(loaded)
     say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
-    if rows[0].yardstick == "baseline":
+    if found.rows[0].yardstick == "baseline":
         say_next_of_study("look for better sets", "offline", study, override, folder)
         return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
-    if compared_modes(loaded).unfinished:
+    if found.unfinished:
         say_next_of_study("replay what is missing", "online", study, override, folder)
         return
     n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
@@ -276,7 +276,7 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
         say_next_of_study("all of it as a page to look at", "report", study, override, folder)
 
 
-def _compared(loaded: "OfflineStudy") -> list["ComparisonRow"]:
+def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
     """Compare a study's replays, and print words and tables."""
     from adaptune import report
     from online.comparison import compare as compare_replays
@@ -284,12 +284,12 @@ def _compared(loaded: "OfflineStudy") -> list["ComparisonRow"]:
 
     loaded.check()
     begin_work()
-    rows, words = compare_replays(loaded)
-    for said in words:
+    found = compare_replays(loaded)
+    for said in found.words:
         say(said)
-    for made in tables(rows, loaded.config.sub_trajectory):
+    for made in tables(found.rows, loaded.config.sub_trajectory):
         console.print(*report.tables_within(made, console.width), sep="\n")
-    return rows
+    return found
 
 
 def _compare_several(studies: list[Path], override: list[str], to: Path | None) -> None:
@@ -307,7 +307,7 @@ def _compare_several(studies: list[Path], override: list[str], to: Path | None) 
     rows: dict[str, list[ComparisonRow]] = {}
     for one in loaded:
         console.rule(one.name)
-        rows[one.name] = _compared(one)
+        rows[one.name] = _compared(one).rows
     console.rule("side by side")
     made = side_by_side(rows)
     for listing in made:

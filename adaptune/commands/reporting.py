@@ -100,7 +100,7 @@ def _comparison(study: "OfflineStudy") -> "PageSection":
 
     title = "What adapting gained"
     try:
-        rows, said = compare(study, write=False)
+        rows, said, _ = compare(study, write=False)
     except AdaptuneError as error:
         words = _so_far(study)
         return PageSection(title, tuple(words), (f"No comparison: {error}.",))
@@ -146,10 +146,7 @@ def _search(study: "OfflineStudy") -> "PageSection":
     best = trials.select([row for row in finished if row["mean"] is not None], [], "mean", _BEST)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
     listed = trials.with_units(best, study.training, study.odometry.space.labels)
-    return replace(
-        section,
-        tables=(Listing(title, listed),),
-    )
+    return replace(section, tables=(Listing(title, listed),))
 
 
 def _surroundings(study: "OfflineStudy") -> "PageSection":
