@@ -1,3 +1,4 @@
+from contextlib import contextmanager
 from itertools import islice
 
 import numpy as np
@@ -55,6 +56,28 @@ def test_each_scan_is_prepared_once_for_all_that_are_alike():
     assert passes(shared, alike, other) == [[i, i] for i in range(N)]
     assert (one.count, other.count, read.count) == (N, N, N)
     assert shared.nbytes == 2 * N * SIZE
+
+
+def test_clouds_that_trials_prepare_are_kept_apart_too(monkeypatch):
+    inside = []
+
+    @contextmanager
+    def apart():
+        inside.append(True)
+        yield
+        inside.pop()
+
+    class Watched(Preparer):
+        def prepare(self, scan):
+            assert inside == [True]
+            return super().prepare(scan)
+
+    monkeypatch.setattr("offline.prepared.apart", apart)
+    shared = SharedScans(Read(), 1e6)
+    one = Watched("a")
+    passes(shared, one)
+    passes(shared, one)
+    assert (one.count, inside) == (N, [])
 
 
 def test_what_memory_does_not_hold_is_read_again():
