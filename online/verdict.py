@@ -134,7 +134,7 @@ def _how_surely(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
         surely = ""
         if row.surely_better is not None:
             known = sum(r.ratio_interval is not None for r in of)
-            which = "" if known == len(of) else f" of the {known} that are long enough to tell"
+            which = "" if known == len(of) else f", of {known} long enough to tell"
             surely = f"; surely better on {row.surely_better}, surely worse on {row.surely_worse}"
             surely += which
         less = f"By more than 1 %, it has less error on {row.better} of {len(of)} sequences"

@@ -174,6 +174,15 @@ def test_losses_costs_controls_and_rivals_are_told():
     assert any(s.startswith("Tuning alone gained 33 % of the baseline's error") for s in said)
 
 
+def test_on_how_many_sequences_it_can_be_sure_is_told():
+    sure = {"better": 12, "worse": 0, "surely_better": 10, "surely_worse": 0}
+    rows = [replace(r, **sure) if r.sequence == ALL else r for r in every(paired=0.7)]
+    short = ("s0", "s1")
+    rows = [replace(r, ratio_interval=None) if r.sequence in short else r for r in rows]
+    told = "and more on none; surely better on 10, surely worse on 0, of 10 long enough to tell."
+    assert any(said.endswith(told) for said in verdict(rows))
+
+
 def test_a_rival_is_compared_once_in_error_and_cost_also_where_the_fixed_set_is_kept():
     for paired, switches in ((0.8, 3), (1.0, 0)):
         against = {"best_default": Ratio(paired / 1.25, (0.5, 0.9))}
