@@ -85,7 +85,7 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
         )
     twins = compared.twins
     rows = [replace(row, twin=twins.get(row.mode, "")) for row in _rows(judged, oracles)]
-    words = [*remarks(rows), *_equal_cost(model), *compared.words(study)]
+    words = [*remarks(rows), *_equal_cost(model, modes), *compared.words(study)]
     words += _missing_repeats(judged, study.config.online.repeats)
     words += _without_oracle(judged, oracles) if model is not None else []
     if write:
@@ -96,9 +96,9 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
     return ComparedReplays(rows, words, compared.unfinished)
 
 
-def _equal_cost(model: ErrorModel | None) -> list[str]:
-    """That the fixed set is its own rival, if it is."""
-    if model is None or model.rivals.get(EQUAL_COST) != model.fixed:
+def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:
+    """That the fixed set is its own rival, if it is and is compared."""
+    if model is None or "fixed" not in modes or model.rivals.get(EQUAL_COST) != model.fixed:
         return []
     return [
         "`equal_cost` is the fixed set: in training, no single set that costs no more than what is "

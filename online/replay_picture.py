@@ -197,7 +197,8 @@ def _draw_parameter(
     axes.margins(y=0.15)
     if name in space.logarithmic:
         log_scale(axes)
-    axes.set_ylabel(space.labels[name].replace("_", "\n"), fontsize="small")
+    unit = space.labels[name].removeprefix(name)
+    axes.set_ylabel(name.replace("_", "\n") + unit, fontsize="small")
 
 
 def _name(value: Any) -> str:

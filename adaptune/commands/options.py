@@ -48,6 +48,9 @@ def load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStudy
     """Load the study of a YAML file, or of the folder of a study that has begun."""
     from offline.offline_study import load_study
 
+    if not path.exists():
+        what = "give the YAML of a study, or the folder of one that has begun"
+        raise AdaptuneError(f"{path}: there is no such file or folder; {what}")
     if path.is_dir():
         if not (path / "study.yaml").exists():
             raise AdaptuneError(f"{path}: is no study's folder: there is no study.yaml in it")

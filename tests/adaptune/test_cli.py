@@ -198,7 +198,7 @@ def test_the_whole_way(study_file, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["offline", "none.yaml"], "none.yaml: there is no such file"),
+        (["offline", "none.yaml"], "none.yaml: there is no such file or folder; give the YAML"),
         (["offline", "STUDY", "-o", "offline.sampler=best"], "offline.sampler"),
         (["simulate", "STUDY"], "there is none to simulate; add one"),
         (["online", "STUDY"], "model.safetensors: there is no such model"),

@@ -148,11 +148,13 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
         "Not compared, because replays are missing: four (`fixed`, `paper`); `adaptune online` "
         "makes them."
     ) in compare(both).words
+    assert any("`equal_cost` is the fixed set" in said for said in compare(both).words)
     shutil.rmtree(both.folder / "replays/three/fixed")
     assert {(row.mode, row.yardstick) for row in compare(both).rows} == {
         ("baseline", "baseline"),
         ("untrained", "baseline"),
     }
+    assert not any("`equal_cost` is the fixed set" in said for said in compare(both).words)
     (said,) = compared_modes(both).words(both)
     assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
     shutil.rmtree(both.folder / "replays/four/untrained")

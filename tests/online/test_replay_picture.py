@@ -28,7 +28,7 @@ def track(**changed):
 
 SPACE = ParameterSpace.of(
     odometry=Categorical(choices=("gicp", "ndt"), baseline="gicp"),
-    max_distance=Float(low=0.1, high=2.0, baseline=1.0, log=True, unit="m"),
+    max_distance=Float(low=0.1, high=2.0, baseline=1.0, log=True, unit="m_x"),
     kernel=Categorical(choices=("none", "huber"), baseline="none"),
 )
 
@@ -46,7 +46,7 @@ def test_all_modes_are_seen_where_they_are_equal(tmp_path):
         assert share_of(path, LINES[mode]["color"], above=0.9) > 0.05, mode  # the legend is below
     for label in ("RTE over the next 15 m [%]", "time [s]", "x [m]", "y [m]", "reference", "start"):
         assert said.count(label) == 1, label
-    for tick in ("0.7", "0.8", "none", "huber", "distance [m]"):
+    for tick in ("0.7", "0.8", "none", "huber", "distance [m_x]"):
         assert tick in said
     assert is_white(path)
 
