@@ -18,8 +18,9 @@ _INTERVALS = 11
 """Newest intervals between scans whose median is the usual one."""
 _MOST_JITTER = 0.5
 """The largest share of an interval that counts as jitter of its stamps."""
-_SETTLED = 0.5
-"""Seconds after which an odometry knows how fast it is: a recording may begin in motion."""
+_SETTLED = 1.0
+"""Seconds after which an odometry knows how fast it is: a recording may begin in motion. KISS-ICP in
+a car at 12 m/s finds it after half a second, and then catches up at twice that speed."""
 _RECENT = 0.5
 """Seconds of healthy motion whose mean goes on where the odometry restarts: one step is noisy."""
 _PATIENCE = 1.0
