@@ -20,7 +20,7 @@ _MOST_JITTER = 0.5
 """The largest share of an interval that counts as jitter of its stamps."""
 _SETTLED = 1.0
 """Seconds after which an odometry knows how fast it is: a recording may begin in motion. KISS-ICP in
-a car at 12 m/s finds it after half a second, and then catches up at twice that speed."""
+a car at 12 m/s moves after half a second, and then catches up for 0.3 s at twice that speed."""
 _RECENT = 0.5
 """Seconds of healthy motion whose mean goes on where the odometry restarts: one step is noisy."""
 _PATIENCE = 1.0
@@ -41,7 +41,8 @@ class HealthCheck(StrictModel):
     max_acceleration : float
         Metres a second squared, of the step's mean velocity against the last healthy one's;
         generous enough for the noise of two differentiations. Irregular stamps widen it. What
-        counts is the mean velocity over up to a second: what is taken back within it does not.
+        counts is the mean velocity over up to a second: what is taken back within it does not. In
+        the first second of a recording it does not count.
     max_turn_rate : float
         Degrees a second.
     max_freeze : float

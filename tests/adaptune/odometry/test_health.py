@@ -132,7 +132,7 @@ def test_scans_that_do_not_register(in_a_row, said):
 
 def test_a_jump_that_came_back_is_not_undone_where_scans_do_not_register():
     guard = Guard(HealthCheck(max_unregistered=2))
-    for _ in range(8):
+    for _ in range(12):
         guard.check(moved(1.0), 0.1)
     assert guard.check(moved(1.6), 0.1, registered=False) is None  # a doubtful step
     assert guard.check(moved(0.4), 0.1, registered=False) == "max_unregistered"
@@ -168,7 +168,7 @@ def test_a_step_is_not_excused_by_jitter(elapsed):
 def test_a_jump_that_is_taken_back_at_once_is_no_fault(seconds):
     """As a noisy odometry makes them in a garden; where scans are rare, nobody can wait."""
     jump = 1.2 * 30.0 * seconds**2
-    steps = 10.0 * seconds + jump * np.array([0, 0, 0, 0, 0, 0, 1, -1, 0, -1, 1, 0])
+    steps = 10.0 * seconds + jump * np.array([*[0] * 12, 1, -1, 0, -1, 1, 0])
     said = drive([seconds] * len(steps), steps)
     assert (set(said) == {None}) == (seconds < 1.0)
 
