@@ -19,8 +19,8 @@ _INTERVALS = 11
 _MOST_JITTER = 0.5
 """The largest share of an interval that counts as jitter of its stamps."""
 _SETTLED = 1.0
-"""Seconds after which an odometry knows how fast it is: a recording may begin in motion. KISS-ICP in
-a car at 12 m/s moves after half a second, and then catches up for 0.3 s at twice that speed."""
+"""Seconds after which an odometry knows how fast it is: a recording may begin in motion. KISS-ICP
+in a car at 12 m/s moves after half a second, and then catches up for 0.3 s at twice that speed."""
 _RECENT = 0.5
 """Seconds of healthy motion whose mean goes on where the odometry restarts: one step is noisy."""
 _PATIENCE = 1.0
