@@ -154,9 +154,9 @@ def test_an_impossible_turn_restarts():
 
 def test_a_platform_that_did_change_its_motion_is_believed_in_the_end():
     # From 0.1 to 0.45 m a scan is 3.5 m/s at once; the bound grows with the time unseen.
-    odometry = Scripted([*[0.1] * 6, *[0.45] * 18])
-    result = replay(scans(np.arange(25) / 10), InProcess(odometry), HEALTH)
-    assert np.flatnonzero(result.restarted).tolist() == [16]  # it might have been taken back
+    odometry = Scripted([*[0.1] * 12, *[0.45] * 18])
+    result = replay(scans(np.arange(31) / 10), InProcess(odometry), HEALTH)
+    assert np.flatnonzero(result.restarted).tolist() == [22]  # it might have been taken back
     assert np.diff(result.trajectory.T_world_sensor[:, 0, 3])[-1] == pytest.approx(0.45)
 
 
