@@ -15,7 +15,7 @@ def main() -> None:
     """Run the command line."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
-    from adaptune import cli
+    from adaptune.commands import cli
 
     cli.main()
 

@@ -1,14 +1,20 @@
 """Write files whole or not at all."""
 
+import ctypes
 import errno
 import os
+import re
 import shutil
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from typing import Any, Self
+
+import yaml
 
 from adaptune.errors import AdaptuneError
 
@@ -104,3 +110,208 @@ def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` in UTF-8, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+# YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers.
+
+
+class YamlError(AdaptuneError):
+    """Text that is not YAML, or gives a key twice."""
+
+
+_TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
+
+
+class _Loader(yaml.SafeLoader):
+    """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string.
+
+    Nothing but plain data is made: no dates, no bytes, no sets.
+    """
+
+    yaml_constructors = {  # noqa: RUF012 - that is how PyYAML keeps them
+        tag: constructor
+        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in _TAGS
+    }
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 - that is how PyYAML keeps them
+        first: [(tag, regexp) for tag, regexp in resolvers if tag.rpartition(":")[2] == "null"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping; refuse a key that comes twice."""
+        seen: dict[Any, int] = {}
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            line = key_node.start_mark.line + 1
+            if not isinstance(key, str | int | float | bool):
+                raise YamlError(f"line {line}: a key must be a word or a number")
+            if key in seen:
+                raise YamlError(f"line {line}: {key!r} was given before, in line {seen[key]}")
+            seen[key] = line
+        return super().construct_mapping(node, deep)
+
+
+_PREFIX = "tag:yaml.org,2002:"
+_INT = re.compile(r"^[-+]?[0-9]+$")
+_FLOAT = re.compile(
+    r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+_BOOL = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
+_Loader.add_implicit_resolver(_PREFIX + "int", _INT, list("-+0123456789"))
+_Loader.add_implicit_resolver(_PREFIX + "float", _FLOAT, list("-+0123456789."))
+_Loader.add_implicit_resolver(_PREFIX + "bool", _BOOL, list("tTfF"))
+
+
+_NO_CHARACTER = re.compile("[\0\ud800-\udfff]")
+_LONGEST_INT = 1000
+"""Digits."""
+_MOST = 100_000
+"""Values in a document. Aliases of aliases make more out of a few lines than fit in memory."""
+
+
+def _int(loader: Any, node: Any) -> int:
+    text = loader.construct_scalar(node)
+    if len(text) > _LONGEST_INT:
+        line = node.start_mark.line + 1
+        raise YamlError(f"line {line}: a number of {len(text):,} digits; give a smaller one")
+    return int(text)
+
+
+def _str(loader: Any, node: Any) -> str:
+    text: str = loader.construct_scalar(node)
+    if _NO_CHARACTER.search(text):
+        line = node.start_mark.line + 1
+        raise YamlError(f"line {line}: a text holds a null character or half of one; remove it")
+    return text
+
+
+_Loader.add_constructor(_PREFIX + "int", _int)
+_Loader.add_constructor(_PREFIX + "str", _str)
+
+
+def _count(node: Any, counted: dict[int, int]) -> int:
+    """Number of values in a node, with those that aliases repeat."""
+    if isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in counted:
+        counted[id(node)] = _MOST  # if met again in itself
+        parts = node.value
+        if isinstance(node, yaml.MappingNode):
+            parts = [part for pair in parts for part in pair]
+        counted[id(node)] = 1 + sum(_count(part, counted) for part in parts)
+    return counted[id(node)]
+
+
+class Document:
+    """A YAML text as plain data (`data`), and where in the text each part of it stands.
+
+    A YamlError names the line that is wrong.
+    """
+
+    def __init__(self, text: str):
+        try:
+            loader = _Loader(text)
+            self._node = loader.get_single_node()
+            if self._node is not None and _count(self._node, {}) > _MOST:
+                raise YamlError(f"holds more than {_MOST:,} values, or an alias of itself")
+            self.data = None if self._node is None else loader.construct_document(self._node)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            where = f"line {mark.line + 1}: " if mark else ""
+            what = ", ".join(part for part in (error.context, error.problem) if part)
+            raise YamlError(f"{where}{what}") from error
+        except RecursionError as error:
+            raise YamlError("is nested too deeply") from error
+        except yaml.YAMLError as error:
+            raise YamlError(" ".join(str(error).split())) from error
+        except (ValueError, LookupError, AttributeError) as error:
+            # PyYAML's constructors raise these.
+            raise YamlError("a tag (!!...) does not fit its value; leave tags out") from error
+
+    @classmethod
+    def of_file(cls, path: Path) -> Self:
+        """Read a file; a YamlError that names it if it cannot be read."""
+        try:
+            return cls(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise YamlError(f"{path}: there is no such file") from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise YamlError(f"{path}: cannot be read as text ({error})") from error
+        except YamlError as error:
+            raise YamlError(f"{path}: {error}") from error
+
+    def span(self, path: Sequence[str | int]) -> tuple[int, int] | None:
+        """Where in the text a single value begins and ends; None if there is none."""
+        node = self._node
+        for part in path:
+            if isinstance(node, yaml.MappingNode):
+                found = [value for key, value in node.value if key.value == str(part)]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+                found = node.value[part : part + 1]
+            else:
+                return None
+            if not found:
+                return None
+            node = found[0]
+        if not isinstance(node, yaml.ScalarNode):
+            return None
+        return node.start_mark.index, node.end_mark.index
+
+    def line(self, path: Sequence[str | int]) -> int | None:
+        """Line of the deepest part of `path` that is there; none for an empty document."""
+        node, line = self._node, None
+        for part in path:
+            found: list[tuple[Any, Any]] = []
+            if isinstance(node, yaml.MappingNode):
+                found = [entry for entry in node.value if entry[0].value == str(part)]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+                found = [(value, value) for value in node.value[part : part + 1]]
+            if not found:
+                break
+            begin, node = found[0]
+            line = begin.start_mark.line + 1
+        return line
+
+
+def scalar(text: str) -> Any:
+    """Value of one line of YAML from the command line."""
+    return Document(text).data
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what YAML 1.1 or 1.2 does not read back as a string, and repeats lists."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        """Write everything out."""
+        return True
+
+
+for _tag, _regexp, _first in (("int", _INT, "-+0123456789"), ("float", _FLOAT, "-+0123456789.")):
+    _Dumper.add_implicit_resolver(_PREFIX + _tag, _regexp, list(_first))
+
+
+def dump(data: Any) -> str:
+    """Plain data as YAML, keys in their order."""
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return text
+
+
+# Open3D, imported where it is used and on machines without libusb.
+
+
+@cache
+def load() -> Any:
+    """Import ``open3d``, which takes about a second, and let it report errors only.
+
+    Its compiled part needs ``libusb-1.0.so.0``, which a fresh machine does not have.
+    """
+    import libusb_package
+
+    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    import open3d
+
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d

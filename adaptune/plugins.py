@@ -5,8 +5,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from adaptune.errors import AdaptuneError
-from adaptune.space import nearest
+from adaptune.errors import AdaptuneError, nearest
 
 
 class PluginError(AdaptuneError):

@@ -1,31 +1,39 @@
 """Selection while the robot drives: from scans to the parameter set, or the weights, to apply."""
 
 import logging
+import threading
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.descriptor.base import Describer, DescriptorError, lowest_elevation
-from adaptune.descriptor.motion import MOTION, SECOND, fill_in, speed_and_turn_rate
 from adaptune.geometry import Poses
-from adaptune.live.live_evidence import LiveEvidence
+from adaptune.live.evidence import LiveEvidence
 from adaptune.metrics import FAILURE
 from adaptune.model import RULES, BankRule, ErrorModel, make_rule
-from adaptune.model.bank_weights import (
+from adaptune.model.descriptor import (
+    MOTION,
+    SECOND,
+    Describer,
+    DescriptorError,
+    fill_in,
+    lowest_elevation,
+    speed_and_turn_rate,
+)
+from adaptune.model.rules import NOVEL, PairedExpectedRatio
+from adaptune.model.weights import (
     SMOOTHING,
     among,
     measured_weights,
     smooth_weights,
     weighted_selection,
 )
-from adaptune.model.evidence import NOVEL
-from adaptune.model.paired import PairedExpectedRatio
 from adaptune.odometry.base import Motions
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
+from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace
 
 SCANS_TO_KNOW = 10
 """The sensor is recognised by the median over this many scans that selections are made from."""
@@ -360,3 +368,289 @@ class Selector:
             )
         self._warned = True
         return True
+
+
+# A selector in a loop that must not stop: one call a scan, and a selection when one is due.
+
+
+BACK = 10**9
+"""Nanoseconds. Stamps that go back by more are of another drive: a clock was set, or a bag began
+anew."""
+
+
+class Selects(Protocol):
+    """What chooses parameters on the way; see `Selector`."""
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan."""
+
+    def select(self) -> Selection:
+        """Choose what to apply."""
+
+    def measure(self) -> None:
+        """Measure how wrong the odometry was, for the next selections."""
+
+
+class AnySelector(Selects, Protocol):
+    """What a drive may rely on: it can begin anew, and knows what to apply where it fails."""
+
+    def reset(self) -> None:
+        """Forget all scans and selections."""
+
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen."""
+
+
+class Schedule:
+    """Says when a selection is due: at the first scan, and at the first of every further period.
+
+    Parameters
+    ----------
+    period
+        In the unit of what `due` is asked, such as nanoseconds or metres.
+    """
+
+    def __init__(self, period: float):
+        self._period = period
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._first: float | None = None
+        self._n_periods = 0
+
+    def due(self, now: float) -> bool:
+        """Whether to select; `now` rises from call to call."""
+        if self._first is None:
+            self._first = now
+        since = now - self._first
+        if since < self._n_periods * self._period:
+            return False
+        self._n_periods = int(since // self._period) + 1
+        return True
+
+
+class TimedSelector:
+    """Selects once a period, and never raises nor reads a file or a clock.
+
+    Call `update` with every scan, from any thread. What goes wrong costs a selection and not the
+    drive: the odometry then gets the fixed set, once, and the next period begins anew.
+
+    Parameters
+    ----------
+    selector : Selector, UntrainedSelector, or what has their methods
+        Nothing else may use it.
+    period
+        Seconds between selections, by the scans' stamps.
+    distance
+        Metres between selections; the period then does not count.
+
+    Attributes
+    ----------
+    ignored : int
+        Scans that were not newer than the one before.
+    failed : int
+        Scans at which the selector raised an error, which is logged.
+    """
+
+    def __init__(
+        self,
+        selector: AnySelector,
+        period: float = 1.0,
+        distance: float | None = None,
+    ):
+        if not (period if distance is None else distance) > 0:
+            raise ValueError("period and distance must be above 0")
+        self.ignored = self.failed = 0
+        self._selector = selector
+        self._by_distance = distance is not None
+        self._schedule = Schedule(period * 1e9 if distance is None else distance)
+        self._lock = threading.Lock()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._selector.reset()
+        self._schedule.reset()
+        self._stamp: int | None = None
+        self._metres = 0.0
+        self._unmeasured = self._failing = False
+        self._owed: Selection | None = None  # for the next update to return
+
+    def update(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
+        """See a scan, before it is registered, and select if that is due.
+
+        A selection takes some milliseconds. After each, `measure` takes some tens of milliseconds;
+        the next update does that first if nobody has done it.
+
+        Parameters
+        ----------
+        stamp
+            Nanoseconds. Scans that are not newer than the one before are ignored; if the stamp goes
+            back by more than `BACK`, all is forgotten as before another drive.
+        scan
+            The scan.
+        motions
+            What the odometry moved over the scan before, see
+            `adaptune.odometry.base.OdometryInstance`.
+
+        Returns
+        -------
+        Selection or None
+            What to apply before the scan is registered; None to leave the odometry as it is.
+        """
+        with self._lock:
+            if self._stamp is not None and stamp <= self._stamp:
+                if self._stamp - stamp <= BACK:
+                    self.ignored += 1
+                    return None
+                _log.warning(
+                    "the clock went back by %.1f s: the selector begins anew",
+                    (self._stamp - stamp) * 1e-9,
+                )
+                self._begin()
+            self._stamp = stamp
+            if (owed := self._owed) is not None:
+                self._owed = None
+                return owed
+            try:
+                return self._selected(stamp, scan, motions)
+            except Exception:
+                return self._after_failure()
+
+    def measure(self) -> None:
+        """Measure how wrong the odometry was, for the next selections; else the next update does.
+
+        Nothing is measured twice.
+        """
+        with self._lock:
+            try:
+                self._measure()
+            except Exception:
+                self._owed = self._after_failure()
+
+    def _measure(self) -> None:
+        if self._unmeasured:
+            self._unmeasured = False
+            self._selector.measure()
+
+    def _selected(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
+        self._measure()
+        self._selector.observe(stamp, scan, motions)
+        moved = float(np.linalg.norm(motions.T_previous_current[:3, 3]))
+        self._metres += moved if np.isfinite(moved) else 0.0
+        if not self._schedule.due(self._metres if self._by_distance else stamp):
+            return None
+        selection = self._selector.select()
+        self._unmeasured, self._failing = True, False
+        return selection
+
+    def _after_failure(self) -> Selection | None:
+        """The fixed set, unless the odometry has it since the last failure."""
+        self.failed += 1
+        self._unmeasured = False
+        self._selector.reset()
+        if self._failing:
+            return None
+        self._failing = True
+        _log.exception("no parameters can be selected; the fixed set is used")
+        return self._selector.fall_back()
+
+
+# A bank without a model: parameter sets that nobody has tried, and weights for them.
+
+
+CANDIDATES = 16
+"""Sets that the members of a bank are chosen from; a power of two, as Sobol's points want it."""
+
+
+def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
+    """The baseline, and sets around it that are far from each other.
+
+    Of several odometries, the baselines of all come first, then sets of the first one. The
+    candidates are points of a scrambled Sobol sequence, moved half-way to the baseline: what
+    the odometry's authors chose is the best guess there is. Each next set is the one that is
+    farthest from those chosen before.
+
+    Parameters
+    ----------
+    space
+        The parameters.
+    n
+        How many sets.
+
+    Returns
+    -------
+    ParameterSets
+        Numbered from 0, the baseline; fewer than `n` if the candidates have fewer values.
+    """
+    chosen = space.baselines[:n]
+    if isinstance(space, PooledSpace):
+        first = next(iter(space.spaces.items()))
+        around = untrained_sets(first[1], n - len(chosen) + 1).parameters[1:]
+        chosen += [{ODOMETRY: first[0], **own} for own in around]
+    elif len(space):
+        from scipy.stats import qmc  # slow to import
+
+        sobol = qmc.Sobol(len(space), rng=np.random.default_rng(0))
+        centre = space.to_unit(chosen)
+        candidates = space.from_unit(0.5 * (centre + sobol.random(CANDIDATES)))
+        # Rounded, so that sets are apart by what they are, not by what they were drawn as.
+        unit = space.to_unit(candidates)
+        apart = np.linalg.norm(unit - centre, axis=1)
+        while len(chosen) < n and apart.max() > 0.0:
+            farthest = int(apart.argmax())
+            chosen.append(candidates[farthest])
+            apart = np.minimum(apart, np.linalg.norm(unit - unit[farthest], axis=1))
+    return ParameterSets(space, tuple(range(len(chosen))), tuple(chosen))
+
+
+class UntrainedSelector:
+    """Weighs the members of a bank of which nothing is known in advance.
+
+    It has the methods of `adaptune.selector.Selector`, and needs no model. The baseline has all the
+    weight until live evidence confirms other members.
+
+    Parameters
+    ----------
+    sets
+        Of the members, the baseline first; see `untrained_sets`.
+    length
+        Metres of a sub-trajectory: what the estimated error stands for.
+
+    Attributes
+    ----------
+    fixed : int
+        Number of the set to begin with.
+    members : tuple of int
+        Numbers of the bank's members.
+    """
+
+    def __init__(self, sets: ParameterSets, length: float):
+        self.members = sets.trials
+        self.fixed = self.members[0]
+        self._sets = sets
+        self._live = LiveEvidence(self.members, length)
+
+    def reset(self) -> None:
+        """Forget all scans and selections, as before a new recording."""
+        self._live.reset()
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan, before it is registered; see `adaptune.selector.Selector.observe`."""
+        self._live.observe(stamp, scan, motions)
+
+    def select(self) -> Selection:
+        """Choose the weights to apply before the newest scan is registered."""
+        weights = measured_weights(len(self.members), self._live.squares())
+        weights = among(weights, self._live.present())
+        of_members = dict(zip(self.members, weights.tolist(), strict=True))
+        return self._live.estimated(weighted_selection(self._sets, of_members))
+
+    def fall_back(self) -> Selection:
+        """See `adaptune.selector.Selector.fall_back`."""
+        weights = {member: float(member == self.fixed) for member in self.members}
+        return Selection(self.fixed, self._sets[self.fixed], weights)
+
+    def measure(self) -> None:
+        """See `adaptune.selector.Selector.measure`."""
+        self._live.measure()

@@ -11,7 +11,7 @@ the bare loop's time with one worker, 1.8 times faster with two, where two bare 
 
 *memory* lets a worker, which may keep 0.4 GB of prepared scans, run a trial on each of four caves,
 ROUNDS (4) times. Each cave makes room for the next one. It prints the worker's memory at the end,
-as a ratio to what it keeps, and its CPU time: as it is, and without `adaptune.cores.apart`.
+as a ratio to what it keeps, and its CPU time: as it is, and without `adaptune.processes.apart`.
 Limit: 2 times what it keeps.
 
 *size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are random numbers, and prints
@@ -38,13 +38,13 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import drives
 
-from adaptune import yaml
+from adaptune import files
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
-from adaptune.simulation.recording import record
-from offline import prepared, workers
+from adaptune.simulation.record import record
 from offline import train as training
-from offline.offline_study import OfflineStudy, load_study
+from offline import trial, workers
+from offline.config import OfflineStudy, load_study
 from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Task, TaskResult
 
@@ -60,7 +60,7 @@ N_FRAMES = 600
 def bare(study: OfflineStudy, sets: Sequence[dict[str, Any]]) -> None:
     """What any program would have to do."""
     settings: Any = study.odometry.settings
-    prepared = [
+    trial = [
         small_gicp.preprocess_points(
             crop(scan, settings.min_range), downsampling_resolution=settings.downsampling
         )
@@ -68,7 +68,7 @@ def bare(study: OfflineStudy, sets: Sequence[dict[str, Any]]) -> None:
     ]
     for parameters in sets:
         bare_gicp(
-            prepared,
+            trial,
             parameters["max_correspondence_distance"],
             parameters["keyframe_interval"],
             settings.iterations,
@@ -139,7 +139,7 @@ def speed(trials: int, scans: int) -> None:
 def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     """Memory of a worker's process after some rounds, over what it keeps, and its CPU seconds."""
     if not as_it_is:
-        workers.apart = prepared.apart = contextlib.nullcontext  # type: ignore[assignment]
+        workers.apart = trial.apart = contextlib.nullcontext  # type: ignore[assignment]
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
     sequences = workers.Sequences(setup, 0.4e9)
     before, begin = _memory(), time.process_time()
@@ -158,7 +158,7 @@ def memory(n: int) -> None:
         caves = {f"cave_{i}": {"scenes": ["cave"], "length": 40, "seed": i} for i in range(4)}
         odometry = {"name": "gicp"}
         study = {"odometry": odometry, "courses": caves, "training": list(caves)}
-        file.write_text(yaml.dump(study))
+        file.write_text(files.dump(study))
         loaded = load_study(file, [], Path(temporary) / "caves")
         for name in caves:
             loaded.sequences.recording(name).parent.mkdir(parents=True, exist_ok=True)

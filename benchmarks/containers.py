@@ -30,11 +30,11 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 import kills
 import needs
 
-from adaptune import yaml
+from adaptune import files
 from adaptune.odometry.docker.engine import OWNER, engine, is_orphan
 from adaptune.simulation import Course
-from adaptune.simulation.recording import record
-from offline.offline_study import load_study
+from adaptune.simulation.record import record
+from offline.config import load_study
 
 
 @contextmanager
@@ -67,8 +67,8 @@ def study_file() -> Iterator[Path]:
             "common": {"points_topic": "/velodyne_points"},
             "gicp": {"max_correspondence_distance": 4.0, "downsampling": 0.5},
         }
-        (folder / "params.yaml").write_text(yaml.dump(template))
-        (folder / "study.yaml").write_text(yaml.dump(given))
+        (folder / "params.yaml").write_text(files.dump(template))
+        (folder / "study.yaml").write_text(files.dump(given))
         yield folder / "study.yaml"
 
 
@@ -169,7 +169,7 @@ def kill(path: Path, n: int, seed: int) -> None:
 def main(what: str, n: int, seed: int) -> None:
     """Measure one of the three."""
     logging.basicConfig(format="%(message)s")
-    logging.getLogger("adaptune.odometry.docker.played_bag").setLevel(logging.INFO)
+    logging.getLogger("adaptune.odometry.docker.rustle").setLevel(logging.INFO)
     with study_file() as path:
         if what == "cost":
             cost(path, n)

@@ -17,12 +17,10 @@ from adaptune.model import (
     PairedSettings,
     Rule,
     TrainingData,
-    bank_weights,
     make_rule,
+    weights,
 )
-from adaptune.model.base import complementary
-from adaptune.model.evidence import Evidence
-from adaptune.model.paired import Near
+from adaptune.model.rules import Evidence, Near, complementary
 from adaptune.selection import Selection
 from offline.labelled import LabelledData, LabelledSequence
 from offline.leave_one_out import Maker, Validation, leave_one_out
@@ -190,7 +188,7 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
 
     def simulated(
         all_familiar: bool = False,
-        smoothing: int = bank_weights.SMOOTHING,
+        smoothing: int = weights.SMOOTHING,
         **changed: Any,
     ) -> NDArray[np.float64]:
         # A bank without less expected loss is not used.
@@ -200,7 +198,7 @@ def banks(sequence: LabelledSequence, others: LabelledData, size: int) -> Errors
         near = bank_evidence(sequence, of_members, pca, its)
         if all_familiar:
             near = near._replace(evidence=familiar(near.evidence))
-        with patch.object(bank_weights, "SMOOTHING", smoothing):
+        with patch.object(weights, "SMOOTHING", smoothing):
             return bank_errors(sequence, near, its)
 
     found = {

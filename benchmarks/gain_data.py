@@ -10,25 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Frames
-from adaptune.descriptor import DESCRIPTORS, averaged, descriptor, lowest_elevation
-from adaptune.descriptor.motion import MOTION, speed_and_turn_rate
-from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
-from adaptune.live.hop import Hops
+from adaptune.live.hops import Hops
+from adaptune.model.descriptor import (
+    DESCRIPTORS,
+    MOTION,
+    N_FEATURES,
+    averaged,
+    descriptor,
+    lowest_elevation,
+    ndt_histogram,
+    speed_and_turn_rate,
+)
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.isolation import Limits
 from adaptune.odometry.registry import odometry_class
-from adaptune.parameter_sets import ParameterSets
+from adaptune.odometry.remote import Limits
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
-from adaptune.space import ParameterSpace
+from adaptune.simulation.record import simulate
+from adaptune.space import ParameterSets, ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 from offline.config import OfflineConfig
-from offline.hops import with_measured_hops
 from offline.labelled import LabelledData, LabelledSequence
-from offline.prepared import SharedScan, SharedScans
 from offline.samplers import make_sampler
-from offline.trial import TrialSettings, run_trials
+from offline.trial import SharedScan, SharedScans, TrialSettings, run_trials, with_measured_hops
 
 MEMORY = 3e9
 """Bytes of prepared scans."""

@@ -8,11 +8,11 @@ import numpy as np
 from gain_data import KINDS, PERIOD, WINDOW, training_courses
 from numpy.typing import NDArray
 
-from adaptune.descriptor import DESCRIPTORS, averaged
-from adaptune.live.hop import Hop
-from adaptune.live.own_error import Link, OwnErrors
+from adaptune.live.evidence import Link, OwnErrors
+from adaptune.live.hops import Hop
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
-from adaptune.model.bank_weights import MemberWeights, clip_errors, minimum_variance_weights
+from adaptune.model.descriptor import DESCRIPTORS, averaged
+from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.bank_simulation import chained
 from offline.curves import learning_curve
 from offline.labelled import LabelledData, LabelledSequence, periods

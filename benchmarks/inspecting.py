@@ -218,7 +218,7 @@ def main() -> None:
             write(path, options.chunks, size)
             for _ in range(2):
                 start = time.perf_counter()
-                command = [sys.executable, "-m", "adaptune.cli", "inspect", str(path)]
+                command = [sys.executable, "-m", "adaptune.commands.cli", "inspect", str(path)]
                 subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
                 seconds = time.perf_counter() - start
             what = f"{name}, {path.stat().st_size / 1e9:.0f} GB, {options.chunks:,} chunks"

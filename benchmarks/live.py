@@ -15,17 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import cores
-from adaptune.live.live_evidence import LiveEvidence
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.tracker import Tracker
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.scan import Scan
+from adaptune import processes
+from adaptune.live.evidence import LiveEvidence
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.tracker import HealthCheck, Tracker
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 
 SECONDS = 30
 
@@ -57,7 +56,7 @@ def measure(name: str, scans: Iterable[Scan]) -> None:
 
 def main() -> None:
     """Measure on recorded and on simulated scans."""
-    cores.pin(1)
+    processes.pin(1)
     bag = Path(os.environ["ADAPTUNE_TEST_DATA"]) / "town.bag"
     measure("town.bag", open_sequence(SequenceConfig(bag=str(bag), points="/velodyne_points")))
     for scene in ("cave", "street"):

@@ -22,19 +22,19 @@ from typing import Any
 import numpy as np
 import small_gicp
 
-from adaptune import cores, open3d
+from adaptune import files, processes
+from adaptune.bank.hand_over import HandOver
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry import InProcess, OdometryInstance, WarmUp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
+from adaptune.odometry.remote import Isolated, Limits
+from adaptune.recording import Scan, SequenceError
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.views import WithImu
 from adaptune.selection import Selection
-from adaptune.sequence import Scan, SequenceError
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.views import WithImu
 from adaptune.simulation import Course
-from adaptune.simulation.rig import as_sequence
+from adaptune.simulation.course import as_sequence
 
 LENGTH = 25.0
 WARM_UPS = (
@@ -119,9 +119,9 @@ def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     odometry: Any = odometry_class(name)()
     odometry.start(odometry.prepare(scans[0]), np.eye(4))
     originals = small_gicp.align, small_gicp.preprocess_points
-    registration = open3d.load().pipelines.registration
+    registration = files.load().pipelines.registration
     ndt = registration.registration_ndt
-    cloud = open3d.load().geometry.PointCloud
+    cloud = files.load().geometry.PointCloud
     downsample = cloud.voxel_down_sample
     small_gicp.align, small_gicp.preprocess_points = map(clock.wrap, originals)
     registration.registration_ndt = clock.wrap(ndt)
@@ -240,7 +240,7 @@ def faults() -> None:
 
 
 if __name__ == "__main__":
-    cores.pin(1)
+    processes.pin(1)
     if len(sys.argv) in (3, 4) and sys.argv[1] == "adapters":
         adapters(Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else LENGTH)
     elif sys.argv[1:] == ["faults"]:

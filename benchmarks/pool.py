@@ -30,23 +30,23 @@ from numpy.typing import NDArray
 from pool_data import LENGTH, pool, pooled_data, run_course
 from replays import ORDERS, mean_error
 
-from adaptune.descriptor.ndt_histogram import N_FEATURES
-from adaptune.hosting import server
+from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
-from adaptune.odometry.bank import Bank
+from adaptune.model.descriptor import N_FEATURES
 from adaptune.odometry.base import WarmUp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.isolation import SERVICE
+from adaptune.odometry.remote import SERVICE
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.processes import server
+from adaptune.recording.scan import Scan
 from adaptune.selector import Selector
-from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import SimulatedScan, simulate
+from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, RIVALS, named
-from offline.expected_loss import figures
-from offline.fit import fit, tuned
+from adaptune.study.study import BEST_DEFAULT, EQUAL_COST, RIVALS, named
 from offline.labelled import LabelledData
 from offline.leave_one_out import PAIRED, Validation, leave_one_out
+from offline.train import fit, tuned
+from offline.tuning import figures
 from online.replay import Replay, replay
 
 DRIVEN_LENGTH = 40.0

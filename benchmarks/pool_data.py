@@ -11,24 +11,19 @@ from gain_data import PERIOD, WINDOW, SharedCourse, training_courses
 from numpy.typing import NDArray
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
-from adaptune.descriptor import averaged, lowest_elevation
-from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
 from adaptune.files import replacing
-from adaptune.live.hop import Hops
-from adaptune.model.costs import Costs, SetCost
-from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.pool import OdometryPool
+from adaptune.live.hops import Hops
+from adaptune.model.descriptor import N_FEATURES, averaged, lowest_elevation, ndt_histogram
+from adaptune.model.rules import Costs, SetCost
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
-from adaptune.parameter_sets import ParameterSets
-from adaptune.pooled_space import ODOMETRY
-from adaptune.simulation.simulate import simulate
-from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.odometry.remote import Limits
+from adaptune.simulation.record import simulate
+from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
-from offline.hops import with_measured_hops
 from offline.labelled import LabelledData, LabelledSequence
-from offline.samplers.points import sobol_points
-from offline.trial import TrialSettings, run_trials
+from offline.samplers.samplers import sobol_points
+from offline.trial import TrialSettings, run_trials, with_measured_hops
 
 POINTS: dict[str, tuple[int, ...]] = {
     "gicp": tuple(range(16)),

@@ -16,7 +16,7 @@ from gain_data import factory_of, labelled, training_courses, trials
 from replays import bank_of, mean_error, model_of, of_world, replays_of
 
 from adaptune.metrics import cap
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 from offline.labelled import LabelledData, LabelledSequence
 from offline.tuning import Policy, bank_data, bank_errors, bank_evidence
 

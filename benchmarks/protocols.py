@@ -27,16 +27,14 @@ from types import MappingProxyType
 import numpy as np
 
 from adaptune.geometry import Poses, invert
-from adaptune.sequence.compensation import compensate
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.export import T_CAMERA_LIDAR, write_kitti_poses, write_kitti_sequence
-from adaptune.sequence.folder import ELEVATION, turn_up
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.part import read_part
-from adaptune.sequence.scan import Scan
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.export import T_CAMERA_LIDAR, write_kitti_poses, write_kitti_sequence
+from adaptune.recording.folder import ELEVATION, turn_up
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import compensate
+from adaptune.recording.scan import Scan, read_part
 from adaptune.simulation import Course
-from adaptune.simulation.recording import record, standing
-from adaptune.simulation.simulate import Drive
+from adaptune.simulation.record import Drive, record, standing
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

@@ -15,12 +15,12 @@ import tempfile
 from collections.abc import Collection
 from pathlib import Path
 
-from adaptune import yaml
+from adaptune import files
 from adaptune.archive import Archive
-from adaptune.simulation.recording import record
+from adaptune.simulation.record import record
 from offline.campaign import run_batches
+from offline.config import OfflineStudy, load_study
 from offline.objective import best_by_trials
-from offline.offline_study import OfflineStudy, load_study
 from offline.train import train
 from offline.workers import Outcome, Task, TaskResult
 
@@ -65,7 +65,7 @@ def study_file(folder: Path, seed: int, given: argparse.Namespace) -> Path:
         "offline": {"sampler": "sobol", "trials": given.trials, "batch": max(4, given.trials // 8)},
     }
     path = folder / f"pruning_{seed}.yaml"
-    path.write_text(yaml.dump(study))
+    path.write_text(files.dump(study))
     return path
 
 

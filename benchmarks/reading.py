@@ -21,9 +21,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from adaptune.sequence import SequenceConfig
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.pointcloud2 import decode
+from adaptune.recording import SequenceConfig
+from adaptune.recording.clouds import decode_cloud
+from adaptune.recording.opening import open_sequence
 
 POINTS = 29_000
 STEP = 22
@@ -117,7 +117,7 @@ def decoding() -> None:
 
     def many() -> None:
         for _ in range(50):
-            decode(data, cdr=False)
+            decode_cloud(data, cdr=False)
 
     row("decode 29,000 points, ring and time", f"{best(many, 20) / 50 * 1e3:.3f} ms", "0.3 ms")
 
@@ -155,8 +155,8 @@ def streaming(path: Path, gigabytes: float) -> None:
     """Memory of one pass over a large bag, in a process of its own."""
     write(path, round(gigabytes * 1e9 / (POINTS * STEP)))
     code = (
-        "import resource, sys; from adaptune.sequence import SequenceConfig\n"
-        "from adaptune.sequence.opening import open_sequence\n"
+        "import resource, sys; from adaptune.recording import SequenceConfig\n"
+        "from adaptune.recording.opening import open_sequence\n"
         "n = sum(1 for _ in open_sequence(SequenceConfig(bag=sys.argv[1], cache=False)))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     )

@@ -26,30 +26,26 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import cores
-from adaptune.descriptor import lowest_elevation
-from adaptune.descriptor.ndt_histogram import N_FEATURES, ndt_histogram
-from adaptune.live.untrained import untrained_sets
+from adaptune import processes
+from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
-from adaptune.odometry.bank import Bank
+from adaptune.model.descriptor import N_FEATURES, lowest_elevation, ndt_histogram
 from adaptune.odometry.base import WarmUp
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.isolation import Limits
-from adaptune.parameter_sets import ParameterSets
-from adaptune.selector import Selector
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.scan import Scan
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.remote import Limits
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.scan import Scan
+from adaptune.selector import Selector, untrained_sets
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
-from adaptune.space import ParameterSpace
+from adaptune.simulation.record import simulate
+from adaptune.space import ParameterSets, ParameterSpace
 from adaptune.study.config import RealTimeConfig
-from online.real_time import replay_in_real_time
+from online.real_time import SelectorProcess, replay_in_real_time
+from online.record import kept_up
 from online.replay import replay
-from online.selector_process import SelectorProcess
-from online.stored_replays import kept_up
 from online.switch_cost import Alternating
 
 REPEATS = 5
@@ -155,7 +151,7 @@ def main() -> None:
     )
     parser.add_argument("--seconds", type=float, default=60.0, help="of the replay in real time")
     seconds = parser.parse_args().seconds
-    unpin = cores.pin(0, alone=True)
+    unpin = processes.pin(0, alone=True)
     lockstep(Path(os.environ["ADAPTUNE_TEST_DATA"]) / "street.bag")
     spread_bank(list(simulate(Course(scenes=("street",), length=40.0, seed=1))))
     in_real_time(

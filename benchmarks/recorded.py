@@ -33,18 +33,18 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import cores, report, yaml
+from adaptune import files, processes
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.sequence.config import ESTIMATED
-from adaptune.sequence.part import part_name, read_part
+from adaptune.recording.config import ESTIMATED
+from adaptune.recording.scan import part_name, read_part
+from adaptune.report import tables
 from adaptune.study.config import ALSO
-from offline.offline_study import OfflineStudy, load_study
+from offline.config import OfflineStudy, load_study
 from offline.train import train
-from online.comparison_row import ComparisonRow
-from online.run_replays import run_replays, run_untrained
-from online.statistics import Reference, compare_modes
-from online.stored_replays import StoredReplay
+from online.record import StoredReplay
+from online.run import run_replays, run_untrained
+from online.statistics import ComparisonRow, Reference, compare_modes
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
 MODES = ("baseline", "fixed", "paired", "untrained")
@@ -170,7 +170,7 @@ def collect(folder: Path) -> None:
     found = sorted(folder.glob("*/rows.json"))
     rows = [row for path in found for row in json.loads(path.read_text(encoding="utf-8"))]
     keys = dict.fromkeys(key for row in rows for key in row)
-    report.write_rows(folder, "recorded", [{key: row.get(key) for key in keys} for row in rows])
+    tables.write_rows(folder, "recorded", [{key: row.get(key) for key in keys} for row in rows])
 
 
 def table_lines(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -218,7 +218,7 @@ def main() -> None:
     given = parser.parse_args()
     if "ADAPTUNE_TEST_DATA" not in os.environ:
         sys.exit("ADAPTUNE_TEST_DATA does not name the folder of the recordings")
-    cores.pin(os.getpid())
+    processes.pin(os.getpid())
     given.folder.mkdir(parents=True, exist_ok=True)
     for odometry in given.odometries:
         ratios: dict[str, list[float]] = {mode: [] for mode in (*MODES, *given.also)}
@@ -243,7 +243,7 @@ def directed(given: argparse.Namespace, odometry: str, name: str) -> list[Compar
         no_reference=given.no_reference,
         also=given.also,
     )
-    write_text(path, yaml.dump(defined))
+    write_text(path, files.dump(defined))
     begin = time.perf_counter()
     try:
         rows = run(load_study(path, folder=folder), given.folder / "references")

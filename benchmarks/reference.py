@@ -27,10 +27,10 @@ from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.model import PairedSettings, make_rule
 from adaptune.reference.estimate import VERSION, estimated
-from adaptune.reference.estimated import EstimateError
 from adaptune.reference.registering import pass_over
+from adaptune.reference.stored import EstimateError
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 from offline import leave_one_out
 from offline.bank_simulation import chained
 from offline.labelled import LabelledData

@@ -20,24 +20,22 @@ import numpy as np
 from gain_data import ODOMETRIES, WINDOW, factory_of, labelled, training_courses, trials
 from numpy.typing import NDArray
 
-from adaptune.descriptor.ndt_histogram import N_FEATURES
-from adaptune.live.untrained import UntrainedSelector, untrained_sets
+from adaptune.bank.bank import Bank
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.model.bank_weights import weighted_selection
-from adaptune.model.paired import ERROR_FLOOR
-from adaptune.odometry.bank import Bank
+from adaptune.model.descriptor import N_FEATURES
+from adaptune.model.rules import ERROR_FLOOR
+from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.selector import Selector
-from adaptune.sequence.scan import Scan
+from adaptune.selector import Selector, Selects, UntrainedSelector, untrained_sets
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import SimulatedScan, simulate
-from adaptune.timed_selector import Selects
-from offline.fit import fit
+from adaptune.simulation.record import SimulatedScan, simulate
 from offline.labelled import LabelledData
+from offline.train import fit
 from offline.tuning import Policy, choose
 from online.replay import Replay, replay
 

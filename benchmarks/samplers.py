@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.stats import wilcoxon
 
-from adaptune import cores, report
-from adaptune.drawing import OTHERS, as_png_and_svg, log_scale, picture
-from adaptune.simulation.recording import record
+from adaptune import processes
+from adaptune.report import tables
+from adaptune.report.paper import OTHERS, as_png_and_svg, log_scale, picture
+from adaptune.simulation.record import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
+from offline.config import OfflineConfig, load_study
 from offline.samplers import make_sampler
 from offline.trial import PreparedSequence, TrialSettings, TrialSetup
 
@@ -238,7 +238,7 @@ def thesis(folder: Path, png: Path, names: list[str]) -> None:
         axes = figure.subplots(1, len(names), squeeze=False)[0]
         for axis, name in zip(axes, names, strict=True):
             rows, curves = searches(folder, name)
-            console.print(report.table(f"{name}, {THESIS_TRIALS} trials", rows))
+            console.print(tables.table(f"{name}, {THESIS_TRIALS} trials", rows))
             for (sampler, curve), colour in zip(curves.items(), OTHERS, strict=False):
                 n = np.arange(curve.shape[1])
                 axis.plot(n, np.median(curve[..., 0], axis=0), label=sampler, color=colour)
@@ -252,7 +252,7 @@ def thesis(folder: Path, png: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    cores.pin(0)
+    processes.pin(0)
     what, *more = sys.argv[1:] or [""]
     with tempfile.TemporaryDirectory() as made:
         if what == "functions":

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
-from adaptune import cores
-from adaptune.drawing import POINTS, as_png_and_svg, log_scale, picture
+from adaptune import processes
 from adaptune.model import (
     BankRule,
     BankSettings,
@@ -38,8 +37,8 @@ from adaptune.model import (
     TrainingData,
 )
 from adaptune.model.knn import NearestNeighbours
-from adaptune.parameter_sets import ParameterSets
-from adaptune.space import Float, ParameterSpace
+from adaptune.report.paper import POINTS, as_png_and_svg, log_scale, picture
+from adaptune.space import Float, ParameterSets, ParameterSpace
 from offline.leave_one_out import BANK_SIZE
 from offline.tuning import BANK_FRAMES
 
@@ -231,7 +230,7 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
 
 def main(png: Path | None) -> None:
     """Measure everything."""
-    cores.pin(1)
+    processes.pin(1)
     threadpool_limits(1)
     with tempfile.TemporaryDirectory() as folder:
         print(f"256 sets a sequence, {len(LENGTHS)} sequences")

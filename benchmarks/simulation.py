@@ -12,7 +12,7 @@ import resource
 import time
 
 from adaptune.simulation import SCENES, Course, SceneLeg
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 
 
 def speed(course: Course) -> tuple[int, float]:

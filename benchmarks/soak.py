@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune import yaml
-from adaptune.cores import resident_megabytes
-from adaptune.sequence.scan import Scan
+from adaptune import files
+from adaptune.processes import resident_megabytes
+from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
-from offline.offline_study import load_study
-from online.live_scans import CLOUD
+from adaptune.simulation.record import simulate
+from offline.config import load_study
+from online.live import CLOUD
 from online.replay import Progressed
-from online.robot_drive import RobotDrive
+from online.robot import RobotDrive
 
 RATE = 10.0
 EVERY = 600.0
@@ -124,7 +124,7 @@ def main(folder: Path, hours: float) -> None:
     logging.disable(logging.WARNING)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "soak.yaml"
-    path.write_text(yaml.dump(STUDY))
+    path.write_text(files.dump(STUDY))
     study = load_study(path, folder=folder / "run")
     course = Course(scenes=("street",), length=60.0, seed=3, rate=RATE)
     scans = [thinned(scan) for scan in simulate(course)]

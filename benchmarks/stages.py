@@ -18,20 +18,20 @@ from typing import Any
 import numpy as np
 import small_gicp
 
-from adaptune import cores
-from adaptune.descriptor.ndt_histogram import ndt_histogram
+from adaptune import processes
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.odometry.health import HealthCheck
+from adaptune.model.descriptor import ndt_histogram
 from adaptune.odometry.keyframe import crop
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording import SequenceConfig
+from adaptune.recording.opening import open_sequence
 from adaptune.selection import Selection
 from adaptune.selector import Selector
-from adaptune.sequence import SequenceConfig
-from adaptune.sequence.opening import open_sequence
 from adaptune.space import ParameterSet
 from adaptune.trajectory import read_kitti
-from offline.offline_study import OfflineStudy, load_study
+from offline.config import OfflineStudy, load_study
 from offline.train import train
 from offline.trial import TrialSettings, TrialSetup
 from online.replay import Replay, replay
@@ -147,7 +147,7 @@ def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
 
 def main(folder: Path) -> None:
     """Measure everything."""
-    cores.pin(0)
+    processes.pin(0)
     bag = str(folder / "hilti_2022_scan.bag")
     points = next(iter(open_sequence(SequenceConfig(bag=bag)))).points
     rng = np.random.default_rng(0)

@@ -33,7 +33,7 @@ from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry import Odometry
 from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
 WINDOW, CAP, SIDE, GOOD = 25.0, 30.0, 7, 1.0

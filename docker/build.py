@@ -34,7 +34,7 @@ FILES = {"reference": ["rustle-ros"], "adaptune": []}
 """Folders beside it that go into the image."""
 TAGS = {"reference": "adaptune-reference", "adaptune": "adaptune"}
 REFERENCE_NEEDS = ("numpy", "pydantic", "scipy", "small_gicp", "typing-extensions")
-"""What `adaptune.odometry.gicp` and `adaptune.odometry.serving` import, sooner or later."""
+"""What `adaptune.odometry.keyframe` and `adaptune.odometry.serving` import, sooner or later."""
 SOURCES = ("adaptune", "offline", "online", "pyproject.toml", "README.md", "LICENSE")
 SOURCE_DATE = "1700000000"
 """The same sources make the same wheel, to the byte."""

@@ -6,15 +6,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adaptune.archive import Archive
-from adaptune.space import ParameterSet
-from offline.budget import Clock
-from offline.config import OfflineConfig
-from offline.objective import Verdict, label
-from offline.offline_study import OfflineStudy
-from offline.pruning import rungs
-from offline.search import Finished, Search, Stage, assess, best_of_each, make_stages
+from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
+from adaptune.errors import AdaptuneError
+from adaptune.odometry.program import contradiction
+from adaptune.odometry.remote import MOST_FAULTS
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+from offline.config import OfflineConfig, OfflineStudy
+from offline.objective import Verdict, judge, label, mean_value, weighted
+from offline.search import Clock, Finished, Search, Stage, assess, best_of_each, make_stages, rungs
 from offline.storage import MirrorRow, open_mirror
 from offline.workers import Pool, Task, TaskProgress, TaskResult, run
 
@@ -318,3 +320,200 @@ def _store(archive: Archive, task: Task, result: TaskResult) -> None:
         archive.write_frames(task.sequence, result.frames)
     for number, trial in zip(task.numbers, result.trials, strict=True):
         archive.write(task.sequence, number, trial, task.whole)
+
+
+# Whole runs: the sets that may become the fixed one, driven as `adaptune online` drives them.
+
+
+WholeRuns = Mapping[str, Mapping[int, Summary]]
+"""By sequence, whole runs by trial number."""
+
+
+def whole_run(archive: Archive, name: str, number: int, health: HealthCheck) -> Trial | None:
+    """The whole run of a trial; None if there is none with this health check."""
+    try:
+        trial = archive.read(name, number, whole=True)
+    except ArchiveError:
+        return None
+    return trial if trial.health == health.model_dump() else None
+
+
+def read_whole_runs(
+    archive: Archive, names: Sequence[str], numbers: Sequence[int], health: HealthCheck
+) -> dict[str, dict[int, Summary]]:
+    """The whole runs of some trials that there are with this health check."""
+    found = {name: {n: whole_run(archive, name, n, health) for n in numbers} for name in names}
+    return {
+        name: {n: summarise(trial) for n, trial in runs.items() if trial is not None}
+        for name, runs in found.items()
+    }
+
+
+def run_whole(
+    names: Sequence[str],
+    sets: Mapping[int, ParameterSet],
+    health: HealthCheck,
+    archive: Archive,
+    workers: Pool[Any],
+    progress: Progress,
+) -> dict[str, dict[int, Summary]]:
+    """Run sets on the sequences from end to end, unless that was done before."""
+    there = read_whole_runs(archive, names, list(sets), health)
+    tasks = [
+        Task(name, (n,), (parameters,), whole=True)
+        for name in names
+        for n, parameters in sets.items()
+        if n not in there[name]
+    ]
+    watch_tasks(archive, workers, tasks, "whole runs", progress)
+    return read_whole_runs(archive, names, list(sets), health) if tasks else there
+
+
+def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, float]]:
+    """By sequence, the first objective in whole runs of every candidate for the fixed set.
+
+    Candidates have whole runs on all sequences, and keep the limits there if one does.
+    """
+    numbers = set.intersection(*(set(of_sequence) for of_sequence in runs.values()))
+    verdicts = {n: judge(config, [runs[name][n] for name in runs]) for n in sorted(numbers)}
+    feasible = [n for n, verdict in verdicts.items() if verdict.feasible] or list(verdicts)
+    return {
+        name: {n: weighted(config.objective[0], of_sequence[n].metrics) for n in feasible}
+        for name, of_sequence in runs.items()
+    }
+
+
+def whole_errors(
+    archive: Archive, name: str, numbers: Iterable[int], frames: NDArray[np.intp]
+) -> dict[int, NDArray[np.float64]]:
+    """Errors in whole runs on some frames, by trial number, each of shape (n,)."""
+    return {n: archive.read(name, n, whole=True).errors[frames] for n in numbers}
+
+
+def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:
+    """Mean over the sequences of the values of those trials that have one on each."""
+    numbers = set.intersection(*map(set, values)) if values else set()
+    return {n: float(mean_value(np.array([of[n] for of in values]))) for n in sorted(numbers)}
+
+
+def rivalry(config: OfflineConfig, whole: Mapping[int, float], best: int, fixed: int) -> str | None:
+    """In words where the baseline is better than the trials suggested.
+
+    Parameters
+    ----------
+    config
+        It says what `whole` is.
+    whole
+        By trial number, the first objective in whole runs: its mean over the sequences.
+    best, fixed
+        Trial numbers of the set with the best trials, and of the fixed set.
+    """
+    if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
+        return None
+    what = label(config.objective[0])
+    beaten = (
+        f"In whole runs with the health check, the baseline is better than the trials suggested: "
+        f"its {what} is {whole[0]:.3g}, that of trial {best}, the best by its trials, "
+        f"{whole[best]:.3g}"
+    )
+    if fixed == 0:
+        return f"{beaten}. So the fixed set is the baseline."
+    return f"{beaten}. So the fixed set is trial {fixed}, with {whole[fixed]:.3g}."
+
+
+# Run the baselines before anything else: a setup in which one fails is stopped at once.
+
+
+MOST_WITHOUT_POSE = 0.1
+"""Share of the scans from which an odometry that gives no pose for them has failed."""
+
+
+class BaselineError(AdaptuneError):
+    """An odometry that fails with its own parameters."""
+
+
+def run_baseline(
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
+) -> None:
+    """Run the baseline from end to end on every training sequence, unless that was done before.
+
+    Of several odometries, the baseline of each. Nothing is stored before all have done well on all
+    sequences. Where the reference contradicts the motion of the first, a warning says what the
+    reference looks like.
+
+    Raises
+    ------
+    BaselineError
+        If one fails on one of them.
+    """
+    baselines = _by_label(study.odometry.name, study.odometry.space)
+    labels = list(baselines)
+    done = []
+    for task, result in watched(workers, _tasks(study, archive, baselines), "baseline", progress):
+        check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
+        done.append((task, result))
+    for task, result in done:
+        if result.frames is not None:
+            archive.write_frames(task.sequence, result.frames)
+    for task, result in done:
+        (number,), (run,) = task.numbers, result.trials
+        archive.write(task.sequence, number, run, whole=True)
+        T_ref_sensor = archive.read_frames(task.sequence).T_ref_sensor
+        if number == 0 and (what := contradiction(run.T_odom_sensor, T_ref_sensor)):
+            _log.warning(
+                "sequences.%s: the reference contradicts the odometry's motion nearly everywhere: "
+                "%s; check the file or topic (reference), the LiDAR's pose in its frame "
+                "(extrinsic) and its clock (clock_offset)",
+                task.sequence,
+                what,
+            )
+
+
+def _by_label(name: str, space: ParameterSpace) -> dict[str, ParameterSet]:
+    """The baselines by what the study calls their odometries, in the order of their trials."""
+    if isinstance(space, PooledSpace):
+        return dict(zip(space.spaces, space.baselines, strict=True))
+    return {name: space.baseline}
+
+
+def _tasks(
+    study: OfflineStudy, archive: Archive, baselines: Mapping[str, ParameterSet]
+) -> list[Task]:
+    """The whole runs that are lacking; the first of a sequence returns its frames, if they are."""
+    tasks: list[Task] = []
+    for name in study.training:
+        frames = not archive.has_frames(name, study.config.descriptor.names)
+        for number, parameters in enumerate(baselines.values()):
+            if whole_run(archive, name, number, study.config.health) is None:
+                tasks.append(Task(name, (number,), (parameters,), True, frames))
+                frames = False
+    return tasks
+
+
+def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
+    """Refuse a whole run of the baseline that failed; a fault now and then is only told.
+
+    Raises
+    ------
+    BaselineError
+    """
+    n, missing = len(run.errors), run.unhealthy.get("no_pose", 0)
+    if not run.faults and missing < MOST_WITHOUT_POSE * n:
+        return
+    failed = missing >= MOST_WITHOUT_POSE * n
+    gave_up = len(run.faults) >= MOST_FAULTS * max(1, len(run.repeats))
+    last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
+    if failed or gave_up:
+        raise BaselineError(
+            f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: no "
+            f"pose for {missing} of {n} scans; {last}; nothing of it is stored: mend the odometry "
+            f"(odometry in the study), or leave the sequence out, and run the same command again"
+        )
+    _log.warning(
+        "sequences.%s: %s with its own parameters, the baseline: %d fault%s, the last: %s",
+        sequence,
+        odometry,
+        len(run.faults),
+        "s" if len(run.faults) > 1 else "",
+        last,
+    )

@@ -13,13 +13,12 @@ from adaptune.archive import Archive, Frames
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.metrics import cap, sub_trajectory_rte, window_ends
-from adaptune.reference.estimated import EstimateError
-from adaptune.reference.given import MeasuredReference, common_poses, mean_difference
-from adaptune.reference.stored import CHECK, StoredEstimate
-from adaptune.sequence.config import ESTIMATED, NO_REFERENCE, SequenceConfig
-from adaptune.sequence.opening import open_sequence
+from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig
+from adaptune.recording.opening import open_sequence
+from adaptune.reference.check import MeasuredReference, common_poses, mean_difference
+from adaptune.reference.stored import CHECK, EstimateError, StoredEstimate
 from adaptune.study.references import estimated_at
-from offline.offline_study import OfflineStudy
+from offline.config import OfflineStudy
 from offline.trial import episodes
 
 Show = Callable[[str, int, int], None]

@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import __version__
-from adaptune.cores import pin
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.sequence import Scan, SequenceConfig, cache
-from adaptune.sequence.fingerprint import fingerprints
-from adaptune.sequence.imu import Imu, ImuNoise
-from adaptune.sequence.opening import sequence_files
-from adaptune.sequence.views import WithImu
+from adaptune.processes import pin
+from adaptune.recording import Scan, SequenceConfig, cache
+from adaptune.recording.cache import fingerprints
+from adaptune.recording.opening import sequence_files
+from adaptune.recording.scan import Imu, ImuNoise
+from adaptune.recording.views import WithImu
 from adaptune.study.sequences import StudySequences
 from offline.trial import TrialSetup
 from offline.workers import Death, Outcome, Sequences, Task, attempt

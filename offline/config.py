@@ -1,18 +1,27 @@
 """The configuration of a study with the settings of the offline stage."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_serializer, model_validator
 
-from adaptune.sequence.config import MOST_VIEWS, ViewConfig, expand
-from adaptune.space import ParameterSpace, nearest
-from adaptune.strict import StrictModel
+from adaptune.errors import Mistake, StrictModel, nearest, validated
+from adaptune.recording.config import MOST_VIEWS, ViewConfig, expand
+from adaptune.space import ParameterSpace
 from adaptune.study.config import StudyConfig
-from adaptune.study.mistakes import Mistake, validated
-from offline.samplers.check import check_class, check_sampler
-from offline.samplers.settings import FORGETFUL, NAMES, SETTINGS, SINGLE, SamplerError
+from adaptune.study.loading import read_study
+from adaptune.study.study import Study
+from offline.samplers.settings import (
+    FORGETFUL,
+    NAMES,
+    SETTINGS,
+    SINGLE,
+    SamplerError,
+    check_class,
+    check_sampler,
+)
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
@@ -205,3 +214,20 @@ class OfflineStudyConfig(StudyConfig):
         offline = resolved.get("offline", {})
         kept = {key: value for key in _LASTING if (value := offline.get(key))}
         return super().lasting(resolved) | {"offline": kept}
+
+
+# A study with the settings of the offline stage.
+
+
+OfflineStudy = Study[OfflineStudyConfig]
+"""A study with the settings of the offline stage."""
+
+
+def load_study(
+    path: Path | str,
+    overrides: Sequence[str] = (),
+    folder: Path | None = None,
+    runs: Path = Path("runs"),
+) -> OfflineStudy:
+    """Read and check the whole YAML of a study, see `adaptune.study.loading.read_study`."""
+    return read_study(Path(path), OfflineStudyConfig, overrides, folder, runs)

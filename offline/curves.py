@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptune.study.driven import MIN_RECORDINGS
+from adaptune.study.study import MIN_RECORDINGS
 from offline.labelled import LabelledData
 from offline.leave_one_out import (
     BANK_SIZE,

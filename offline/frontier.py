@@ -7,20 +7,14 @@ from numpy.typing import NDArray
 
 from adaptune.metrics import cap
 from adaptune.model import BankSettings
-from adaptune.model.costs import Spending
-from adaptune.model.paired import ERROR_FLOOR
-from adaptune.pooled_space import ODOMETRY
+from adaptune.model.rules import ERROR_FLOOR, Spending
+from adaptune.space import ODOMETRY
 from adaptune.study.config import MOST_MEMBERS
-from adaptune.study.driven import RIVALS
+from adaptune.study.study import RIVALS
 from offline.labelled import LabelledData, LabelledSequence, comparable
 from offline.leave_one_out import PAIRED, Progress, Validation
 from offline.pictures import CANCELLING, THRIFTY, Point
-from offline.tuning import (
-    bank_data,
-    bank_errors,
-    bank_evidence,
-    cancelling_members,
-)
+from offline.tuning import bank_data, bank_errors, bank_evidence, cancelling_members
 
 
 def frontier(

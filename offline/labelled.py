@@ -1,6 +1,6 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -8,20 +8,32 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.metrics import cap
-from adaptune.model import TrainingData
-from adaptune.model.base import mean_errors
-from adaptune.model.costs import Costs, Spending
-from adaptune.parameter_sets import ParameterSets
-from adaptune.sequence.names import origin, places, stretch_numbers
-from adaptune.study.driven import MIN_RECORDINGS
-from offline.bank_simulation import BankSimulation
-from offline.objective import affordable, choose_fixed, few, margin, mean_value
-from offline.stretches import Extent, part_of
-from offline.whole_runs import mean_values
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Summary
+from adaptune.metrics import cap, span
+from adaptune.model import ModelError, TrainingData
+from adaptune.model.descriptor import averaged
+from adaptune.model.rules import BASELINE, Costs, SetCost, Spending, mean_errors
+from adaptune.model.weights import POOL
+from adaptune.odometry.factory import Factory
+from adaptune.recording.scan import origin, places, stretch_numbers
+from adaptune.space import ParameterSets
+from adaptune.study.study import MIN_RECORDINGS
+from offline.bank_simulation import (
+    BankSimulation,
+    Extent,
+    cut,
+    error_vectors,
+    motions_from_archive,
+    part_of,
+    stretches_of_view,
+)
+from offline.campaign import mean_values, read_whole_runs, whole_errors, whole_values
+from offline.config import Metric, OfflineStudyConfig
+from offline.objective import affordable, choose_fixed, few, margin, mean_value, repeated, weighted
+from offline.search import owner
 
 if TYPE_CHECKING:
-    from adaptune.descriptor.pca import ScaledPCA
+    from adaptune.model.descriptor import ScaledPCA
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +58,7 @@ class LabelledSequence:
     # sequence is left out, they are unknown.
     own: NDArray[np.bool_] | None = None
     block: int = 1  # frames of a sub-trajectory
-    elevation: float = np.nan  # degrees, see `adaptune.descriptor.base.lowest_elevation`
+    elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     # By trial number, the objective in whole runs of the candidates for the fixed set.
@@ -258,7 +270,7 @@ class LabelledData(NamedTuple):
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
-        from adaptune.descriptor.pca import ScaledPCA  # takes long to import
+        from adaptune.model.descriptor import ScaledPCA  # takes long to import
 
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
         blocks = self.sequences[0].blocks
@@ -314,3 +326,219 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
     """
     _, first, number = np.unique(period, return_index=True, return_inverse=True)
     return first, number
+
+
+# What the sets of a study cost, as it was measured in their trials.
+
+
+def measured_costs(
+    archive: Archive, run: Mapping[str, Iterable[int]], sets: ParameterSets, odometry: Factory
+) -> Costs:
+    """Mean costs of sets over the sequences on which they were run.
+
+    Parameters
+    ----------
+    archive
+        The trials.
+    run
+        For each sequence, the trials that count there.
+    sets
+        The sets.
+    odometry
+        It tells which sets share prepared scans.
+
+    Returns
+    -------
+    Costs
+        Not a number where an older adaptune ran the trials, which did not measure them.
+    """
+    numbers: dict[Hashable, int] = {}
+    found: dict[int, SetCost] = {}
+    counted = {name: set(trials) for name, trials in run.items()}
+    for trial in sets:
+        where = [name for name, trials in counted.items() if trial in trials]
+        runs = [archive.finished(name)[trial] for name in where]
+        register, prepare = (
+            float(np.mean([one.others.get(key, np.nan) for one in runs])) if runs else np.nan
+            for key in (REGISTER_MS, PREPARE_MS)
+        )
+        key = odometry(sets[trial]).preparation
+        found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
+    evidence = [archive.read_frames(name).evidence_ms for name in counted]
+    return Costs(found, float(np.mean(evidence)))
+
+
+# Reads the labelled data set of a study from its archive.
+
+
+def labelled_data(
+    archive: Archive,
+    run: Mapping[str, Sequence[int]],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+    window: int,
+    recorded_in: Callable[[str], str],
+    odometry: Factory,
+) -> LabelledData:
+    """Read the labelled data set of a study.
+
+    Parameters
+    ----------
+    archive
+        The trials.
+    run
+        For each training sequence, the trials that count there.
+    sets
+        The sets to read about.
+    config
+        Of the study.
+    window
+        Number of descriptors that are averaged.
+    recorded_in
+        The recording of a sequence, by its name.
+    odometry
+        Of the study.
+
+    Raises
+    ------
+    ModelError
+        If a trial is missing.
+    """
+    _check_finished(archive, run)
+    read = [_labelled(archive, name, set(run[name]), sets, config, window) for name in run]
+    number = np.repeat(np.arange(len(read)), [len(s.errors) for s, _, _ in read])
+    means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
+    # With a sequence left out, others than now may be among the best. To read the poses of
+    # thousands of trials would take long.
+    order = np.argsort(means, kind="stable")[: 2 * POOL]
+    best = [sets.trials[c] for c in order]
+    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
+    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
+    eligible |= {trial for trial in named if trial is not None}
+    slots = archive.slots()
+    owners = [owner(slots, trial) for trial in sets]
+    labelled = []
+    for sequence, frames, known in read:
+        name, length = sequence.name, config.sub_trajectory
+        vectors = {
+            trial: error_vectors(frames, archive.read(name, trial), length)[known]
+            for trial in eligible.intersection(sets).intersection(run[name])
+        }
+        own = [one is not None and origin(one) == origin(name) for one in owners]
+        found = replace(sequence, own=np.array(own, bool), vectors=vectors)
+        labelled.append(replace(found, recorded_in=recorded_in(name)))
+    cut_up = _with_cuts(_with_whole_runs(archive, labelled, sets, config))
+    costs = measured_costs(archive, run, sets, odometry)
+    return LabelledData(cut_up, sets, costs, config.online.budget)
+
+
+def _check_finished(archive: Archive, run: Mapping[str, Sequence[int]]) -> None:
+    """Refuse an archive that lacks a trial."""
+    for name, counted in run.items():
+        if missing := set(counted) - set(archive.finished(name)):
+            raise ModelError(
+                f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
+                f"fitted to; run `adaptune offline` again"
+            )
+
+
+def _with_whole_runs(
+    archive: Archive,
+    labelled: Sequence[LabelledSequence],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+) -> list[LabelledSequence]:
+    """Add what is known of the whole runs of the candidates for the fixed set."""
+    rivals = [*few(LabelledData(labelled, sets).bounds()), *sets.defaults]
+    runs = read_whole_runs(archive, [s.name for s in labelled], rivals, config.health)
+    whole = whole_values(config.offline, runs)
+    # Whether the objective on some frames follows from the errors there.
+    by_frames = set(config.offline.objective[0]) == {"rte"}
+    found = []
+    for s in labelled:
+        of = whole[s.name]
+        if by_frames and s.extent is not None:
+            errors = whole_errors(archive, s.name, of, s.extent.frames)
+            found.append(replace(s, whole=of, whole_errors=errors, by_frames=True))
+        else:
+            found.append(replace(s, whole=of))
+    return found
+
+
+def _with_cuts(sequences: Sequence[LabelledSequence]) -> list[LabelledSequence]:
+    """Cut recordings into stretches, and views as their recordings are."""
+    cuts: dict[str, NDArray[np.intp]] = {}
+    extents: dict[str, Extent] = {}
+    for s in sequences:
+        if s.extent is not None and s.simulation is not None:
+            cuts[s.name] = cut(s.simulation.T_ref_sensor, s.extent)
+            extents[s.name] = s.extent
+    found = []
+    for s in sequences:
+        of = origin(s.name)
+        if of == s.name or of not in cuts:
+            # A view without its recording is cut by itself.
+            found.append(replace(s, cuts=cuts.get(s.name)))
+        else:
+            numbers = stretches_of_view(extents[s.name], extents[of], cuts[of])
+            found.append(replace(s, cuts=numbers))
+    return found
+
+
+def _labelled(
+    archive: Archive,
+    name: str,
+    run: Collection[int],
+    sets: ParameterSets,
+    config: OfflineStudyConfig,
+    window: int,
+) -> tuple[LabelledSequence, Frames, NDArray[np.bool_]]:
+    """A labelled sequence without error vectors, its frames, and which of them are labelled."""
+    frames = archive.read_frames(name)
+    errors = archive.read_errors(name, list(sets))
+    # Trials that were run for another budget do not count.
+    errors[:, [trial not in run for trial in sets]] = np.nan
+    # Whether there is a sub-trajectory depends on the reference alone.
+    known = np.asarray(~np.isnan(errors).all(axis=1))
+    period, objective = config.online.period, config.offline.objective[0]
+    described = averaged(frames.descriptors, frames.stamps, window, period)
+    periods_since = ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64)
+    summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
+    values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
+    simulation = BankSimulation(
+        frames.stamps,
+        frames.T_ref_sensor,
+        described,
+        periods_since,
+        config.sub_trajectory,
+        config.lost_track,
+        frames.hops,
+        motions_from_archive(archive, name, frames),
+    )
+    labelled = LabelledSequence(
+        name,
+        periods_since[known],
+        described[known],
+        errors[known],
+        blocks=frames.blocks,
+        baseline=archive.read(name, 0).errors[known],
+        values=np.array(values),
+        repeats=_repeats(summaries, objective, config.offline.repeats),
+        block=span(frames.T_ref_sensor, config.sub_trajectory),
+        elevation=float(np.nanmedian(frames.elevations)),
+        simulation=simulation,
+        extent=Extent.of(frames.T_ref_sensor, known, config.sub_trajectory),
+    )
+    return labelled, frames, known
+
+
+def _repeats(
+    summaries: Sequence[Summary | None], objective: Mapping[Metric, float], n_repeats: int
+) -> NDArray[np.float64] | None:
+    """The objective in every run of repeated trials, of shape (n_sets, n_repeats), or None."""
+    if n_repeats == 1:
+        return None
+    missing = [np.nan] * n_repeats
+    # Of the baseline, there may be more runs.
+    rows = [missing if s is None else repeated(objective, s.repeats) for s in summaries]
+    return np.array([row[:n_repeats] for row in rows])

@@ -7,11 +7,11 @@ from typing import NamedTuple, Self
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
 from adaptune.space import ParameterSet, Value
-from adaptune.study.driven import BANK, ONE_SET, ModeError, driven, expected_in_words
-from adaptune.study.learned import LearnedDrives
+from adaptune.study.loading import LearnedDrives
 from adaptune.study.new_drive import NewDrive
+from adaptune.study.study import BANK, ONE_SET, ModeError, driven, expected_in_words
 from offline.campaign import Progress
-from offline.offline_study import OfflineStudy
+from offline.config import OfflineStudy
 from offline.train import Training, train
 
 

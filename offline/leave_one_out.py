@@ -13,13 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.descriptor.pca import ScaledPCA
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
-from adaptune.model.base import complementary
-from adaptune.model.paired import ERROR_FLOOR
-from adaptune.study.driven import (
+from adaptune.model.descriptor import ScaledPCA
+from adaptune.model.rules import ERROR_FLOOR, complementary
+from adaptune.study.study import (
     MIN_RECORDINGS,
     ONE_SET,
     PER_STRETCH,
@@ -27,16 +26,19 @@ from adaptune.study.driven import (
     RIVALS,
     expected_in_words,
 )
-from offline.expected_loss import Figures, figures, log_ratios
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
-from offline.rivals import driven_cost, rivals
 from offline.tuning import (
     MOST_FOLDS,
+    Figures,
     Policy,
     bank_data,
     bank_errors,
     bank_evidence,
     choose,
+    driven_cost,
+    figures,
+    log_ratios,
+    rivals,
     weights_along,
 )
 

@@ -26,7 +26,7 @@ from adaptune.archive import Frames, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert
 from adaptune.metrics import absolute_error, kitti_error, relative_error
-from adaptune.model.costs import ROUNDING, Costs
+from adaptune.model.rules import ROUNDING, Costs
 from adaptune.space import ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 

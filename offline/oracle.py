@@ -10,13 +10,19 @@ from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
-from adaptune.model.base import TrainingData, complementary, mean_errors
-from adaptune.sequence.config import NO_REFERENCE
-from adaptune.study.inputs import FILE, check_model
-from adaptune.study.oracle_runs import OracleErrors, oracle_archive, oracle_changes, read_oracle
+from adaptune.model.rules import TrainingData, complementary, mean_errors
+from adaptune.recording.config import NO_REFERENCE
+from adaptune.study.inputs import (
+    FILE,
+    OracleErrors,
+    check_model,
+    oracle_archive,
+    oracle_changes,
+    read_oracle,
+)
 from adaptune.study.references import ensure_references
 from offline.campaign import Missing, Progress, trial_tasks, watch_tasks
-from offline.offline_study import OfflineStudy
+from offline.config import OfflineStudy
 from offline.train import trial_workers
 
 _log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.drawing import LINES, OTHERS, POINTS, as_png_and_svg, log_scale, picture
+from adaptune.report.paper import LINES, OTHERS, POINTS, as_png_and_svg, log_scale, picture
 from offline.objective import pareto_front
 
 RATIO = "error over the fixed set's [-]"

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Frames, Summary
-from adaptune.model.bank_weights import clip_errors, minimum_variance_weights
-from adaptune.model.paired import ERROR_FLOOR
+from adaptune.model.rules import ERROR_FLOOR
+from adaptune.model.weights import clip_errors, minimum_variance_weights
 from offline.bank_simulation import error_vectors
 
 MOST_FRAMES = 200

@@ -1,21 +1,254 @@
 """Searches for parameter sets: one over all training sequences, one for each, or both."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import json
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property, partial
 from itertools import count, islice, zip_longest
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from adaptune.archive import OF_SLOT, Archive, Summary
+from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
-from offline.budget import max_trials, spent
 from offline.config import OfflineConfig, OfflineStudyConfig
 from offline.objective import Verdict, best_by_trials, judge, sampler_results, weighted
 from offline.portfolio import Portfolio
-from offline.pruning import estimate, survivors
 from offline.samplers import make_sampler
-from offline.samplers.base import Sampler, key
+from offline.samplers.samplers import Sampler, key
+
+# Pruning: which trials of a batch continue on more sequences, and which stop.
+#
+# The first batch runs in full. It shows which sequences are hard, and these come first from then
+# on:
+# sets fail on them, if anywhere. Trials of later batches run on growing shares of the sequences.
+# The
+# model also uses what a trial saw before it stopped. The choice depends on the batches before and
+# on
+# the batch so far, and on nothing else.
+#
+# - ``halving``: the best third continues on three times as many sequences (successive halving,
+#   Jamieson and Talwalkar, AISTATS 2016): the best third of all trials that came so far.
+# - ``hyperband``: the same, but batches begin with three, nine... sequences in turn (Li et al.,
+# JMLR
+#   2018), for studies in which a few sequences say little about the others.
+# - ``wilcoxon``: one sequence after the other. A trial stops if a signed-rank test finds it worse
+#   than the best trial on the same sequences (Optuna's pruner).
+#
+# All rules stop a trial that cannot win any more. Values are never negative, so a trial whose sum
+# over some sequences exceeds the best trial's sum over all sequences is worse.
+
+
+Pruning = Literal["none", "halving", "hyperband", "wilcoxon"]
+
+REDUCTION = 3
+"""One of so many trials continues, on so many times the sequences."""
+FEWEST = 3
+"""The least number of sequences that may stand for the others."""
+SIGNIFICANCE = 0.1
+"""A difference counts as more than chance if the test's p is below this."""
+
+Values = Sequence[float]
+"""A trial's objective on the sequences on which it was run, in their order."""
+
+
+def rungs(pruning: Pruning, batch: int, n: int) -> list[int]:
+    """Numbers of sequences after which trials of a batch may stop; the last one is `n`, all."""
+    if pruning == "none" or batch == 0:
+        return [n]
+    if pruning == "wilcoxon":
+        return [*range(2, n), n] if n > 2 else [n]
+    sizes = [n]
+    while sizes[0] > FEWEST:
+        sizes.insert(0, max(FEWEST, -(-sizes[0] // REDUCTION)))
+    return sizes[batch % len(sizes) :] if pruning == "hyperband" else sizes
+
+
+def survivors(
+    pruning: Pruning, m: int, batch: Mapping[int, Values], before: Mapping[int, Values]
+) -> list[int]:
+    """Numbers of the trials of a batch that continue.
+
+    Parameters
+    ----------
+    pruning
+        The rule.
+    m
+        Number of sequences on which the trials of the batch were run.
+    batch, before
+        Values by trial number: of the trials of this batch that are left, and of all trials before.
+        Only trials that keep all limits.
+    """
+    if not before:
+        return list(batch)
+    n_sequences = max(map(len, before.values()))
+    best = min((v for v in before.values() if len(v) == n_sequences), key=sum)
+    can_win = {n: values for n, values in batch.items() if sum(values) <= sum(best)}
+    if pruning == "wilcoxon":
+        return [n for n, values in can_win.items() if not _worse(values, best)]
+    means = {n: float(np.mean(v[:m])) for n, v in {**before, **batch}.items() if len(v) >= m}
+    best_ones = sorted(means, key=lambda n: (means[n], n))[: -(-len(means) // REDUCTION)]
+    return [n for n in can_win if n in best_ones]
+
+
+def _worse(values: Values, best: Values) -> bool:
+    import optuna  # takes a second, and few studies need it
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        pruner = optuna.pruners.WilcoxonPruner(p_threshold=SIGNIFICANCE)
+    study = optuna.create_study(pruner=pruner)
+    steps = {i: float(value) for i, value in enumerate(best)}
+    mean = float(np.mean(best))
+    study.add_trial(optuna.trial.create_trial(value=mean, intermediate_values=steps))
+    trial = study.ask()
+    for i, value in enumerate(values):
+        trial.report(value, i)
+    return trial.should_prune()
+
+
+def estimate(values: Values, baseline: Values) -> float:
+    """Estimate the mean of a stopped trial from its ratio so far to the whole baseline."""
+    seen = float(np.mean(baseline[: len(values)]))
+    return float(np.mean(values)) * (float(np.mean(baseline)) / seen if seen > 0.0 else 1.0)
+
+
+# When a search stops.
+
+
+TRIALS = 64
+"""Trials of a search without a budget."""
+BUDGETS = ("trials", "hours", "stagnation", "target")
+"""Settings that may change when a study is resumed."""
+
+
+def max_trials(config: OfflineConfig) -> int | None:
+    """Number of trials after which the search stops; None if another budget stops it."""
+    if config.budgeted or config.sampler == "grid":
+        return config.trials
+    return TRIALS
+
+
+def spent(
+    config: OfflineConfig, verdicts: Sequence[Verdict], best: int, hours: float, number: int
+) -> str | None:
+    """Why a search stops after a batch.
+
+    Parameters
+    ----------
+    config
+        The budgets.
+    verdicts
+        Verdicts of all its trials.
+    best
+        Index of the best of them.
+    hours
+        Hours that their batches took.
+    number
+        Trial number of the best of them.
+
+    Returns
+    -------
+    str or None
+        The budget that is used up; None if the search continues.
+    """
+    limit = max_trials(config)
+    if limit is not None and len(verdicts) >= limit:
+        return f"{limit} trials are done"
+    if config.hours is not None and hours >= config.hours:
+        return f"{hours:.2f} hours have passed"
+    if not verdicts:
+        return None
+    if config.target is not None and (
+        verdicts[best].feasible and verdicts[best].values[0] <= config.target
+    ):
+        return f"trial {number} has reached the target of {config.target:g}"
+    since = len(verdicts) - 1 - best
+    if config.stagnation is not None and since >= config.stagnation:
+        return f"none of {since} trials was better than trial {number}"
+    return None
+
+
+def all_done(config: OfflineConfig, folder: Path, numbers: Iterable[int]) -> bool:
+    """Whether a study has no trials left, and the model is fitted to those that it has.
+
+    Parameters
+    ----------
+    config
+        The budgets.
+    folder
+        The study's. ``trials.csv``, which a run writes at its end, is newer than all trials then.
+    numbers
+        Numbers of the finished trials.
+    """
+    table, limit = folder / "trials.csv", max_trials(config)
+    if not table.exists():
+        return False
+    ended = table.stat().st_mtime_ns
+    if any(path.stat().st_mtime_ns > ended for path in (folder / "trials").glob("*/*.npz")):
+        return False
+    if limit is None or config.sampler == "grid":
+        return True
+    if any((config.hours, config.stagnation, config.target)):
+        return True
+    # Every search shares trial 0.
+    searches = Counter(n // OF_SLOT for n in numbers if n)
+    return min(searches.values(), default=0) + 1 >= limit
+
+
+def more_trials(config: OfflineConfig, override: Sequence[str]) -> list[str] | None:
+    """Values to run as many trials with as without a budget; None if the budget allows as many."""
+    limit = max_trials(config)
+    if limit is None or limit >= TRIALS or config.sampler == "grid":
+        return None
+    rest = [text for text in override if not text.startswith("offline.trials=")]
+    return rest if len(rest) < len(override) else [*rest, f"offline.trials={TRIALS}"]
+
+
+class Clock:
+    """The time that batches took, kept in a file, so that a resumed search continues counting.
+
+    The last batch of a killed process does not count.
+
+    Raises
+    ------
+    AdaptuneError
+        If the file is damaged.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._seconds: dict[str, float] = {}
+        if path.exists():
+            try:
+                read = json.loads(path.read_text(encoding="utf-8"))
+                self._seconds = {str(int(batch)): float(s) for batch, s in read.items()}
+            except (ValueError, TypeError, AttributeError) as error:
+                raise AdaptuneError(
+                    f"{path}: is damaged ({error}); remove it, and offline.hours restarts at 0"
+                ) from error
+
+    def hours(self, n_batches: int) -> float:
+        """Hours that the first batches took."""
+        return sum(s for batch, s in self._seconds.items() if int(batch) < n_batches) / 3600.0
+
+    @contextmanager
+    def running(self, batch: int) -> Iterator[None]:
+        """Count the time in this block for a batch."""
+        begin = time.monotonic()
+        try:
+            yield
+        finally:
+            took = time.monotonic() - begin
+            self._seconds[str(batch)] = self._seconds.get(str(batch), 0.0) + took
+            write_text(self._path, json.dumps(self._seconds) + "\n")
+
 
 Finished = Mapping[str, Mapping[int, Summary]]
 """By sequence, the finished trials by their numbers."""

@@ -10,16 +10,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import report, yaml
+from adaptune import files
 from adaptune.archive import Archive, Summary
-from adaptune.cores import available
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
-from adaptune.parameter_sets import ParameterSets, in_words
-from adaptune.sequence.config import NO_REFERENCE
-from adaptune.sequence.names import origin
-from adaptune.space import ParameterSpace
+from adaptune.processes import available
+from adaptune.recording.config import NO_REFERENCE
+from adaptune.recording.scan import origin
+from adaptune.report import tables
+from adaptune.space import ParameterSets, ParameterSpace, in_words
+from adaptune.study.config import SwitchingConfig
 from adaptune.study.inputs import InputNotes, digest, resume
 from adaptune.study.references import (
     ensure_references,
@@ -27,11 +28,19 @@ from adaptune.study.references import (
     estimates_beside_intervals,
     estimates_of,
 )
-from offline.baseline import run_baseline
-from offline.budget import BUDGETS
-from offline.campaign import Progress, run_batches
+from offline.campaign import (
+    Progress,
+    WholeRuns,
+    mean_values,
+    rivalry,
+    run_baseline,
+    run_batches,
+    run_whole,
+    whole_values,
+)
 from offline.cluster import Cluster
-from offline.config import TIMED, Metric, OfflineConfig
+from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy
+from offline.labelled import LabelledData, measured_costs
 from offline.objective import (
     Verdict,
     affordable,
@@ -43,12 +52,10 @@ from offline.objective import (
     label,
     pareto_front,
 )
-from offline.offline_study import OfflineStudy
 from offline.pictures import draw_front
-from offline.search import Finished
+from offline.search import BUDGETS, Finished
 from offline.trial import TrialSettings, TrialSetup
-from offline.trial_costs import measured_costs
-from offline.whole_runs import WholeRuns, mean_values, rivalry, run_whole, whole_values
+from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Workers
 
 COARSE = 0.6
@@ -177,13 +184,13 @@ def train(
     model = _fitted(study, archive, verdicts, fixed)
     finished = _finished(study, archive, verdicts)
     means = {name: _means(trials, verdicts) for name, trials in finished.items()}
-    write_text(study.folder / "fixed.yaml", yaml.dump(verdicts[fixed].parameters))
+    write_text(study.folder / "fixed.yaml", files.dump(verdicts[fixed].parameters))
     table = _trial_rows(config, study.odometry.space, verdicts, finished)
-    report.write_rows(study.folder, "trials", list(table.values()))
+    tables.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     rows = _training_rows(study, verdicts, finished, fixed, whole)
-    report.write_rows(study.folder, "training", rows)
+    tables.write_rows(study.folder, "training", rows)
     judged = estimates_beside_intervals(study, study.training)
     spread = baseline_words(config, [trials[0] for trials in finished.values()])
     return Training(model, means, fixed, rows, remark, judged, spread)
@@ -322,8 +329,7 @@ def _fit(
 ) -> ErrorModel:
     """Fit the error model to the trials of all sets that keep the limits."""
     # They import scikit-learn and compiled code.
-    from offline.fit import fit, tuned
-    from offline.labelling import labelled_data
+    from offline.labelled import labelled_data
 
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
     sets = _every_set(study, feasible)
@@ -417,7 +423,7 @@ def _write_pareto(
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
     values = np.array([verdicts[n].values for n in feasible])
     front = sorted((feasible[i] for i in pareto_front(values)), key=lambda n: verdicts[n].values)
-    report.write_rows(folder, "pareto", [trials[n] for n in front])
+    tables.write_rows(folder, "pareto", [trials[n] for n in front])
     draw_front(
         folder / "pareto.png",
         [label(weights, units=True) for weights in objective],
@@ -425,3 +431,104 @@ def _write_pareto(
         np.array([verdicts[n].values for n in front]),
         {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
     )
+
+
+# Fit the error model to the labelled data set.
+
+
+def fit(
+    data: LabelledData,
+    fixed: int,
+    odometry: dict[str, Any],
+    length: float,
+    window: int,
+    provenance: dict[str, Any],
+) -> ErrorModel:
+    """Make the error model, which does not adapt yet.
+
+    Sets have no errors (NaN) on the sequences that they were not run on.
+
+    Parameters
+    ----------
+    data
+        Of all trials that keep the limits.
+    fixed
+        Trial number of the fixed set.
+    odometry
+        Its name and settings.
+    length
+        Metres of a sub-trajectory.
+    window
+        Number of descriptors that are averaged.
+    provenance
+        Where the model comes from, for people.
+    """
+    sequences = data.sequences
+    return ErrorModel(
+        odometry=odometry,
+        sets=data.sets,
+        fixed=fixed,
+        length=length,
+        sequences=[s.name for s in sequences],
+        blocks=dict(sequences[0].blocks or {}),
+        window=window,
+        descriptors=np.concatenate([s.descriptors for s in sequences]),
+        sequence=np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences]),
+        errors=np.concatenate([s.errors for s in sequences]),
+        elevations=[s.elevation for s in sequences],
+        provenance=provenance,
+        stretch=np.concatenate([s.stretch for s in sequences]),
+        paired=DO_NOT_ADAPT,
+        bank_settings=NO_BANK,
+        budget=data.budget,
+        costs=data.costs,
+    )
+
+
+def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
+    """Choose what is driven: the rule's settings, the bank and those of its weights.
+
+    Parameters
+    ----------
+    model
+        Fitted to `data`.
+    data
+        The labelled data set.
+    switching
+        Size of the bank, or its members.
+    """
+    complete = data.complete()
+    bank = named_members(model, switching, complete) or switching.size
+    chosen = choose(complete, bank, fixed=model.fixed)
+    members = chosen.members or [model.fixed]
+    # Where the user names the members, there are no others.
+    besides = reserve(members, complete) if isinstance(bank, int) else []
+    members = [*members, *besides]
+    return replace(
+        model,
+        paired=chosen.one_set,
+        bank=members,
+        vectors=complete.vectors(members),
+        bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
+        # As they are read back, so that the same model is the same file.
+        expected={
+            way: {key: float(value) for key, value in figures._asdict().items()}
+            for way, figures in chosen.expected.items()
+        },
+        rivals=rivals(complete, driven_cost(complete, chosen, model.fixed)),
+    )
+
+
+def named_members(
+    model: ErrorModel, switching: SwitchingConfig, complete: LabelledData
+) -> list[int]:
+    """Trial numbers of the members that the study names; empty if they cannot be a bank."""
+    named = [model.trial(n) for n in switching.sets or ()]
+    members = [trial for trial in named if trial is not None and trial in complete.sets]
+    if len(set(members)) == len(named):
+        return members
+    _log.warning(
+        "online.switching.sets: one of them was not run on every training sequence, or is named "
+        "twice; the bank is chosen without them (trials.csv lists the sets)"
+    )
+    return []

@@ -1,34 +1,324 @@
 """One parameter set on one sequence, or several at once on one pass over it."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import time
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
+from itertools import count, islice
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import sequence
+from adaptune import recording
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames, Trial
-from adaptune.descriptor import Describer, DescriptorError, lowest_elevation
-from adaptune.descriptor.motion import fill_in, speed_and_turn_rate
-from adaptune.errors import AdaptuneError, in_a_line
+from adaptune.errors import AdaptuneError, UnavailableError, in_a_line
 from adaptune.geometry import Poses, invert, steps
+from adaptune.live.evidence import hops_along
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
-from adaptune.odometry.base import OdometryInstance
-from adaptune.odometry.health import HealthCheck, unhealthy
-from adaptune.odometry.pool import Factory
-from adaptune.sequence.recorded import RecordedSequence
+from adaptune.model.descriptor import (
+    Describer,
+    DescriptorError,
+    fill_in,
+    lowest_elevation,
+    speed_and_turn_rate,
+)
+from adaptune.odometry.base import OdometryInstance, Usage, prepared_bytes
+from adaptune.odometry.factory import Factory
+from adaptune.odometry.tracker import HealthCheck, Tracker, unhealthy
+from adaptune.processes import apart
+from adaptune.recording.recording import RecordedSequence
+from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
 from adaptune.study.sequences import StudySequences
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
-from offline.hops import with_measured_hops
 from offline.objective import trajectory_metrics
-from offline.prepared import SharedScan, SharedScans
-from offline.trial_run import DrivenRun, TrialRun
+
+# Scans that are prepared once for all trials of a worker.
+
+
+@dataclass
+class _Kept:
+    """What a sequence was prepared to in one way."""
+
+    first: OdometryInstance  # prepares for all with the same preparation
+    scans: dict[int, Any] = field(default_factory=dict)  # by number
+    nbytes: int = 0
+    seconds: float = 0.0  # of CPU time for `n_prepared` scans
+    n_prepared: int = 0
+
+
+class SharedScans:
+    """The scans of a sequence, each prepared once for all instances with the same preparation.
+
+    Iterating yields a `SharedScan` for every scan, and does not end.
+
+    Prepared scans that exceed `memory` bytes are read and prepared again on every pass. Of several
+    preparations, those that a pass does not use make room.
+
+    """
+
+    def __init__(self, scans: Iterable[Scan], memory: float):
+        self._scans, self._memory = scans, memory
+        self._kept: dict[Hashable, _Kept] = {}
+        self._used: set[Hashable] = set()  # in the present pass
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the prepared scans take."""
+        return sum(kept.nbytes for kept in self._kept.values())
+
+    def __iter__(self) -> Iterator["SharedScan"]:
+        self._used = set()
+        reader = _Reader(self._scans)
+        for i in count():
+            yield SharedScan(self, i, partial(reader.read, i))
+
+    def prepared(self, i: int, read: Callable[[], Scan], instance: OdometryInstance) -> Any:
+        """Scan `i`, which `read` returns, as an instance takes it."""
+        key = instance.preparation
+        self._used.add(key)
+        kept = self._kept.setdefault(key, _Kept(instance))
+        if i in kept.scans:
+            return kept.scans[i]
+        # Also those that a pass makes while it runs: a worker once grew to five times its share.
+        with apart():
+            scan, begin = read(), time.process_time()
+            prepared = kept.first.prepare(scan)
+            kept.seconds += time.process_time() - begin
+        kept.n_prepared += 1
+        if self._has_room(size := prepared_bytes(prepared), i):
+            kept.scans[i] = prepared
+            kept.nbytes += size
+        return prepared
+
+    def n_kept(self, instance: OdometryInstance) -> int:
+        """How many scans are kept as such an instance takes them."""
+        kept = self._kept.get(instance.preparation)
+        return 0 if kept is None else len(kept.scans)
+
+    def milliseconds(self, instance: OdometryInstance) -> float:
+        """Mean CPU time that it took to prepare a scan for such an instance."""
+        kept = self._kept.get(instance.preparation)
+        return 1e3 * kept.seconds / kept.n_prepared if kept and kept.n_prepared else 0.0
+
+    def _has_room(self, size: int, i: int) -> bool:
+        """Whether so many bytes more are allowed at scan `i`; where they are not, make room."""
+        # Which preparations a pass uses is known after its first scan.
+        for key in [key for key in self._kept if i and key not in self._used]:
+            if self.nbytes + size <= self._memory:
+                break
+            self._kept[key].scans.clear()
+            self._kept[key].nbytes = 0
+        return self.nbytes + size <= self._memory
+
+
+class SharedScan:
+    """A scan of `SharedScans`; `by` gives it as an instance takes it."""
+
+    def __init__(self, scans: SharedScans, i: int, read: Callable[[], Scan]):
+        self._scans, self._i, self._read = scans, i, read
+
+    def by(self, instance: OdometryInstance) -> Any:
+        """The scan as an instance takes it."""
+        return self._scans.prepared(self._i, self._read, instance)
+
+
+class _Reader:
+    """Reads scans in order, and only if it is asked for one."""
+
+    def __init__(self, scans: Iterable[Scan]):
+        self._scans = scans
+        self._iterator: Iterator[Scan] | None = None
+        self._at = -1
+
+    def read(self, i: int) -> Scan:
+        """Scan `i`, which is no earlier than the one before."""
+        if self._iterator is None:
+            self._iterator = iter(self._scans)
+        while self._at < i:
+            self._scan = next(self._iterator)
+            self._at += 1
+        return self._scan
+
+
+# Runs of an odometry on frames whose reference is known.
+
+
+class TrialRun:
+    """A run of an odometry on a piece of a sequence, from frame `begin` to before `end`.
+
+    An exception of the odometry is a fault, after which there is no pose.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], OdometryInstance],
+        frames: Frames,
+        lost_track: float | None,
+        begin: int,
+        end: int,
+    ):
+        n = len(frames.stamps)
+        self.begin, self.end = begin, end
+        self.T_odom_sensor = np.empty((n, 4, 4))
+        self.restarted = np.zeros(n, bool)
+        self.registered = np.ones(n, bool)
+        self.seconds = np.zeros(n)
+        self.lost_steps: dict[int, Poses] = {}
+        self._make = make
+        self._odometry: OdometryInstance | None = None
+        self._failure: tuple[str, ...] = ()
+        self._T_ref_sensor = frames.T_ref_sensor
+        self._T_ref_steps = steps(frames.T_ref_sensor)
+        self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """See `Trial`."""
+        return (*(() if self._odometry is None else self._odometry.faults), *self._failure)
+
+    @property
+    def usage(self) -> Usage:
+        """What the odometry used."""
+        return Usage(0.0, None) if self._odometry is None else self._odometry.usage
+
+    def prepare_ms(self, scans: SharedScans) -> float:
+        """Mean CPU time that it took to prepare a scan."""
+        return 0.0 if self._odometry is None else scans.milliseconds(self._odometry)
+
+    def step(self, i: int, scan: SharedScan) -> None:
+        """Register the scan of frame `i`."""
+        if not self._failure:
+            try:
+                self._step(i, scan)
+            except UnavailableError:
+                raise
+            except Exception as error:
+                self._failure = (in_a_line(error),)
+        if self._failure:
+            self._step_without_pose(i)
+
+    def close(self) -> None:
+        """End the odometry's processes; what they used stays known."""
+        if self._odometry is not None:
+            self._odometry.close()
+
+    def _started(self) -> OdometryInstance:
+        self._odometry = self._make()
+        return self._odometry
+
+    def _step(self, i: int, scan: SharedScan) -> None:
+        if i == self.begin:
+            T = self._T_ref_sensor[i]
+            T = np.eye(4) if np.isnan(T[0, 0]) else T
+            odometry = self._started()
+            odometry.start(scan.by(odometry), T)
+            self.T_odom_sensor[i] = T
+            return
+        assert self._odometry is not None
+        odometry = self._odometry
+        prepared = scan.by(odometry)
+        begin = time.perf_counter()
+        T, self.registered[i] = odometry.register(prepared)
+        self.seconds[i] = time.perf_counter() - begin
+        finite = np.isfinite(T).all()
+        # An odometry without a pose counts as not moved.
+        T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
+        if self._lost(i, T_step if finite else None):
+            self.lost_steps[i] = T_step
+            T = self._T_ref_sensor[i]
+            odometry.start(prepared, T, self._T_ref_steps[i - 1])
+            self.restarted[i] = True
+        elif not finite:
+            # There is no reference at which to restart.
+            T = self.T_odom_sensor[i - 1]
+            odometry.start(prepared, T)
+        self.T_odom_sensor[i] = T
+
+    def _step_without_pose(self, i: int) -> None:
+        self.registered[i] = False
+        if self._lost(i, None):
+            self.T_odom_sensor[i], self.restarted[i] = self._T_ref_sensor[i], True
+            self.lost_steps[i] = np.eye(4)
+        else:
+            self.T_odom_sensor[i] = np.eye(4) if i == self.begin else self.T_odom_sensor[i - 1]
+
+    def _lost(self, i: int, T_step: Poses | None) -> bool:
+        if i == self.begin:
+            return False
+        T_ref_step = self._T_ref_steps[i - 1]
+        if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
+            return False
+        if T_step is None:
+            return True
+        departure = T_step[:3, 3] - T_ref_step[:3, 3]
+        return bool(np.linalg.norm(departure) > self._bounds[i - 1])
+
+
+class DrivenRun(TrialRun):
+    """A run from end to end as a replay drives it: with the health check, without reference."""
+
+    def __init__(self, make: Callable[[], OdometryInstance], frames: Frames, health: HealthCheck):
+        super().__init__(make, frames, None, 0, len(frames.stamps))
+        self.unhealthy = Counter[str]()
+        self._stamps, self._health = frames.stamps.tolist(), health
+
+    def _step(self, i: int, scan: SharedScan) -> None:
+        if i == 0:
+            self._tracker = Tracker(self._started(), self._health)
+        prepared = scan.by(self._tracker.odometry)
+        found = self._tracker.register_prepared(self._stamps[i], prepared)
+        self.T_odom_sensor[i], self.registered[i] = found.T_odom_sensor, found.registered
+        self.seconds[i] = found.register_seconds if i else 0.0
+        self.unhealthy.update([found.unhealthy] if found.unhealthy else [])
+
+    def _step_without_pose(self, i: int) -> None:
+        super()._step_without_pose(i)
+        self.unhealthy["no_pose"] += 1
+
+
+# Hops along a training sequence: what a bank will measure there while it drives.
+
+
+def with_measured_hops(
+    scans: Iterable[Scan], frames: Frames, advance: Callable[[int, int], None] = lambda *_: None
+) -> Frames:
+    """Register scans directly to those some metres before, see `hops_along`.
+
+    Parameters
+    ----------
+    scans
+        Of the sequence.
+    frames
+        Of the same scans; their reference takes the odometry's place.
+    advance
+        Called with how many scans are done, and how many there are.
+
+    Returns
+    -------
+    Frames
+        The same with the hops, and with the CPU time that they took.
+    """
+    n, reading = len(frames.stamps), 0.0
+
+    def read() -> Iterator[Scan]:
+        nonlocal reading
+        begin = time.process_time()
+        for scan in scans:
+            reading += time.process_time() - begin
+            yield scan
+            begin = time.process_time()
+
+    begin = time.process_time()
+    with_poses = zip(read(), frames.T_ref_sensor, strict=True)
+    hops = hops_along(with_poses, lambda done: advance(done, n))
+    seconds = time.process_time() - begin - reading
+    return replace(frames, hops=hops, evidence_ms=1e3 * seconds / n)
+
 
 Advance = Callable[[int, int], None]
 """Called with how many scans of a sequence are done, and how many there are."""
@@ -89,7 +379,7 @@ class PreparedSequence:
     def __init__(
         self,
         name: str,
-        scans: sequence.Sequence,
+        scans: recording.Recording,
         odometry: Factory,
         settings: TrialSettings,
         memory: float,
@@ -140,7 +430,7 @@ class PreparedSequence:
     def __iter__(self) -> Iterator[SharedScan]:
         yield from islice(self.shared, len(self.frames.stamps))
 
-    def _prepare(self, i: int, scan: sequence.Scan) -> bool:
+    def _prepare(self, i: int, scan: recording.Scan) -> bool:
         """Prepare a scan for the baseline; whether there is no room for another."""
         try:
             if self._odometry is None:
@@ -172,7 +462,7 @@ def _of_sequence(name: str) -> Iterator[None]:
         raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
-def _reference(key: str, scans: sequence.Sequence, settings: TrialSettings) -> Trajectory:
+def _reference(key: str, scans: recording.Recording, settings: TrialSettings) -> Trajectory:
     """The reference; an AdaptuneError if it alone shows that no error can be measured."""
     reference = scans.reference()
     if reference is None:
@@ -186,7 +476,7 @@ def _reference(key: str, scans: sequence.Sequence, settings: TrialSettings) -> T
     return reference
 
 
-def _during(scans: sequence.Sequence, reference: Trajectory) -> NDArray[np.bool_]:
+def _during(scans: recording.Recording, reference: Trajectory) -> NDArray[np.bool_]:
     """Which poses of a reference may be of the scans' time, of shape (n,)."""
     span = scans.source.span() if isinstance(scans, RecordedSequence) else None
     if span is None or not isinstance(scans, RecordedSequence):

@@ -1,13 +1,15 @@
 """Charts of trials: where they lie, what they found, and which parameters matter."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import OF_SLOT
-from adaptune.charts.chart import (
+from adaptune import files
+from adaptune.archive import OF_SLOT, Archive, Summary
+from adaptune.report.chart import (
     Axis,
     Band,
     Bars,
@@ -16,12 +18,121 @@ from adaptune.charts.chart import (
     Line,
     Mark,
     Panel,
+    Parameter,
     Points,
+    on_axis,
+    parameter_axis,
 )
-from adaptune.charts.parameter_axis import Parameter, on_axis, parameter_axis
-from adaptune.space import Categorical, Integer
-from offline.objective import pareto_front
-from offline.trial_table import TrialTable
+from adaptune.space import ODOMETRY, Categorical, Integer, ParameterSet, ParameterSpace
+from adaptune.study.study import Study
+from offline.config import OfflineConfig, OfflineStudy
+from offline.objective import judge, label, pareto_front, weighted
+from offline.storage import distribution
+
+# The finished trials of a study as columns, for charts.
+
+
+@dataclass(frozen=True, eq=False)
+class TrialTable:
+    """Trials, in the order of their numbers."""
+
+    space: ParameterSpace
+    numbers: NDArray[np.int64]  # (n,)
+    sets: Sequence[ParameterSet]
+    # By training sequence (n,): the first objective, NaN where a trial was not run.
+    by_sequence: Mapping[str, NDArray[np.float64]]
+    values: NDArray[np.float64]  # (n,): its mean over all sequences, NaN if not run on all
+    feasible: NDArray[np.bool_]  # (n,): whether the trial keeps all limits
+    costs: NDArray[np.float64]  # (n,): milliseconds of CPU time a scan, NaN if unknown
+    objective: str = "RTE [%]"  # name of the first objective, with its unit
+    fixed: int | None = None  # trial number of the fixed set, once it is chosen
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def column(self, name: str) -> list[Any]:
+        """Values of one of `space.parameters`; None where a set has none."""
+        return [self.space.flat(of_set).get(name) for of_set in self.sets]
+
+    def on(self, sequence: str) -> NDArray[np.float64]:
+        """First objective on a sequence, of shape (n,)."""
+        return self.by_sequence[sequence]
+
+    def some(self, kept: NDArray[np.bool_]) -> "TrialTable":
+        """The same of some of the trials."""
+        return replace(
+            self,
+            numbers=self.numbers[kept],
+            sets=[own for own, its in zip(self.sets, kept, strict=True) if its],
+            by_sequence={name: of[kept] for name, of in self.by_sequence.items()},
+            values=self.values[kept],
+            feasible=self.feasible[kept],
+            costs=self.costs[kept],
+        )
+
+    def shared(self) -> "TrialTable":
+        """The same of the trials whose sets all sequences share."""
+        return self.some(self.numbers < OF_SLOT)
+
+    def odometries(self) -> dict[str, "TrialTable"]:
+        """By the name of an odometry its trials; of the only one by no name."""
+        names = [str(of_set.get(ODOMETRY, "")) for of_set in self.sets]
+        return {name: self.some(np.array(names) == name) for name in dict.fromkeys(names)}
+
+
+def read_trials(study: OfflineStudy) -> TrialTable:
+    """Read the finished trials of a study on its training sequences; there may be none."""
+    archive = Archive(study.folder / "trials")
+    finished = {name: archive.finished(name) for name in study.training}
+    return trial_table(study.config.offline, study.odometry.space, finished, fixed_set(study))
+
+
+def trial_table(
+    config: OfflineConfig,
+    space: ParameterSpace,
+    finished: Mapping[str, Mapping[int, Summary]],
+    fixed: ParameterSet | None = None,
+) -> TrialTable:
+    """Finished trials as columns.
+
+    Parameters
+    ----------
+    config
+        Its first objective and its limits count.
+    space
+        The parameters.
+    finished
+        By training sequence the finished trials by their numbers.
+    fixed
+        The fixed set, if it is chosen.
+    """
+    numbers = sorted({number for trials in finished.values() for number in trials})
+    n, objective = len(numbers), config.objective[0]
+    values, costs, feasible = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool)
+    by_sequence = {name: np.full(n, np.nan) for name in finished}
+    sets: list[ParameterSet] = []
+    for i, number in enumerate(numbers):
+        runs = {name: trials[number] for name, trials in finished.items() if number in trials}
+        verdict = judge(config, list(runs.values()))
+        sets.append(verdict.parameters)
+        costs[i] = np.mean([run.cost for run in runs.values()])
+        feasible[i] = verdict.feasible
+        for name, run in runs.items():
+            by_sequence[name][i] = weighted(objective, run.metrics)
+        if len(runs) == len(finished):
+            values[i] = verdict.values[0]
+    named = "RTE [%]" if objective == {"rte": 1.0} else label(objective, units=True)
+    chosen = next((k for k, own in zip(numbers, sets, strict=True) if own == fixed), None)
+    return TrialTable(
+        space, np.array(numbers, int), sets, by_sequence, values, feasible, costs, named, chosen
+    )
+
+
+def fixed_set(study: Study) -> ParameterSet | None:
+    """The fixed set that the offline stage has chosen; None before."""
+    path = study.folder / "fixed.yaml"
+    return files.Document.of_file(path).data if path.exists() else None
+
 
 BEST = 0.1
 """Share of the trials that are the best."""
@@ -334,4 +445,85 @@ def cost_chart(table: TrialTable) -> Chart | None:
         (Panel(x, y, drawn),),
         "Each point is a trial, in the mean over the training sequences. No trial has less of both "
         "than those on the Pareto front.",
+    )
+
+
+# Which parameters matter: importances by Optuna, and what is drawn of them.
+
+
+FOREST: Any = {"n_trees": 16, "max_depth": 8, "seed": 0}
+"""Size of the forest, which bounds the time that it takes."""
+
+
+def importances(table: TrialTable) -> dict[str, float]:
+    """Share of each parameter in the variance of the error's logarithm, by falling share.
+
+    It is functional ANOVA, Optuna's default, on a small forest: Optuna's own takes minutes for some
+    thousand trials, and gives the same shares.
+
+    Parameters
+    ----------
+    table
+        Trials of one odometry.
+
+    Returns
+    -------
+    dict
+        Empty with fewer than `FEW` finished trials, one parameter, or equal errors.
+    """
+    known = table.some(np.isfinite(table.values) & (table.values > 0.0))
+    parameters = {
+        name: p
+        for name, p in table.space.parameters.items()
+        if all(value is not None for value in known.column(name))
+        and len(set(map(repr, known.column(name)))) > 1
+    }
+    logs = np.log(known.values)
+    if len(known) < FEW or len(parameters) < 2 or np.ptp(logs) < 1e-9:
+        return {}
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    distributions = {name: distribution(p) for name, p in parameters.items()}
+    columns = {name: known.column(name) for name in parameters}
+    study = optuna.create_study()
+    study.add_trials(
+        optuna.trial.create_trial(
+            params={name: column[i] for name, column in columns.items()},
+            distributions=distributions,
+            value=float(log),
+        )
+        for i, log in enumerate(logs)
+    )
+    evaluator = optuna.importance.FanovaImportanceEvaluator(**FOREST)
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: float(share) for name, share in found.items()}
+
+
+def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | None:
+    """Importance of each parameter, a panel for each odometry.
+
+    Parameters
+    ----------
+    by_odometry
+        What `importances` found, by the name of the odometry; "" if there is only one.
+    """
+    panels = []
+    for odometry, shares in by_odometry.items():
+        if not shares:
+            continue
+        names = tuple(reversed(list(shares)))
+        percent = [100.0 * shares[name] for name in names]
+        bars = Bars(np.arange(len(names)), percent, "", flat=True)
+        x = Axis("share of the error's variance [%]", limits=(0.0, 100.0))
+        panels.append(Panel(x, Axis("", names=names), (bars,), odometry))
+    if not panels:
+        return None
+    return Chart(
+        "importance",
+        "Which parameters matter",
+        tuple(panels),
+        "How much of the variance of the error (of its logarithm) over all trials a parameter "
+        "explains (functional ANOVA). Where the search has hardly varied a parameter, it seems "
+        "less important than it is. Few trials say little.",
     )

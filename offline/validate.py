@@ -9,27 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import report
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
-from adaptune.study.driven import Driven, driven
+from adaptune.report import tables
 from adaptune.study.inputs import check_model
 from adaptune.study.references import estimates_beside_intervals
+from adaptune.study.study import Driven, driven
+from offline.campaign import rivalry
+from offline.config import OfflineStudy
 from offline.curves import bank_curve, learning_curve
 from offline.frontier import frontier
-from offline.labelled import LabelledData
-from offline.labelling import labelled_data
-from offline.leave_one_out import (
-    PAIRED,
-    Interval,
-    Validation,
-    ValidationError,
-    leave_one_out,
-)
-from offline.offline_study import OfflineStudy
+from offline.labelled import LabelledData, labelled_data
+from offline.leave_one_out import PAIRED, Interval, Validation, ValidationError, leave_one_out
 from offline.pictures import LeftOutResults, draw_frontier, draw_validation
 from offline.tuning import BANK_SETTINGS
-from offline.whole_runs import rivalry
 
 _log = logging.getLogger(__name__)
 
@@ -83,15 +76,15 @@ def validate(
     except ValidationError as error:
         raise ValidationError(f"{error}. {online.words}") from error
     rows = _rows(validation, _rate(data))
-    report.write_rows(study.folder, "validation", rows)
-    report.write_rows(study.folder, "stretches", _stretch_rows(validation))
+    tables.write_rows(study.folder, "validation", rows)
+    tables.write_rows(study.folder, "stretches", _stretch_rows(validation))
     learning = banks = []
     if curve:
         learning = learning_curve(data, progress=partial(progress, "learning curve"), bank=bank)
-        report.write_rows(study.folder, "learning", learning)
+        tables.write_rows(study.folder, "learning", learning)
     if sizes:
         banks = bank_curve(data, partial(progress, "sizes of banks"))
-        report.write_rows(study.folder, "banks", banks)
+        tables.write_rows(study.folder, "banks", banks)
     _draw(study, validation, learning, banks)
     _write_frontier(study, model, data, validation, progress)
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
@@ -114,7 +107,7 @@ def _write_frontier(
         settings = model.bank_settings if model.bank_adapts else BANK_SETTINGS[0]
     points = frontier(data, validation, settings, partial(progress, "banks of other sizes"))
     if points:
-        report.write_rows(study.folder, "costs", [point.row() for point in points])
+        tables.write_rows(study.folder, "costs", [point.row() for point in points])
         draw_frontier(study.folder / "costs.png", study.name, points, study.config.online.budget)
 
 

@@ -15,9 +15,8 @@ from multiprocessing.context import ForkServerProcess
 from typing import Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 
 from adaptune.archive import Frames, Trial
-from adaptune.cores import apart, pin
 from adaptune.errors import AdaptuneError
-from adaptune.hosting import verdict
+from adaptune.processes import apart, pin, verdict
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
@@ -266,7 +265,7 @@ class Workers:
         # A process forked from one with threads may deadlock. A small server that has imported
         # what workers need forks them in milliseconds.
         self._context = mp.get_context("forkserver")
-        self._context.set_forkserver_preload(["offline.preload"])
+        self._context.set_forkserver_preload(["offline.trial", "adaptune.model.descriptor"])
         self._workers: dict[int, _Worker] = {}
         self._busy: set[int] = set()
 

@@ -1,30 +1,113 @@
 """The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and those on demand."""
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from adaptune.controls import SEED, EvenSelector, RandomSelector, random_seed
-from adaptune.cores import together
-from adaptune.drawing import LINES
-from adaptune.live.untrained import UntrainedSelector, untrained_sets
+from adaptune.bank.bank import Bank
+from adaptune.bank.hand_over import HandOver
 from adaptune.model import ErrorModel
-from adaptune.odometry.bank import Bank
-from adaptune.odometry.base import OdometryInstance, WarmUp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.pool import Factory
-from adaptune.parameter_sets import ParameterSets
-from adaptune.selector import Selector
-from adaptune.sequence.part import part_name
-from adaptune.space import ParameterSet
+from adaptune.model.weights import weighted_selection
+from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
+from adaptune.odometry.factory import Factory
+from adaptune.processes import together
+from adaptune.recording.scan import Scan, part_name
+from adaptune.report.paper import LINES
+from adaptune.selection import Selection
+from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
+from adaptune.space import ParameterSet, ParameterSets
 from adaptune.study.config import RealTimeConfig, SwitchingConfig
-from adaptune.study.driven import RIVALS, ModeError, bank_members, mechanism_of
 from adaptune.study.inputs import check_model
-from adaptune.study.study import Mechanism, Study
-from adaptune.timed_selector import AnySelector
+from adaptune.study.study import RIVALS, Mechanism, ModeError, Study, bank_members, mechanism_of
+
+# Controls: selectors that look at nothing, and that adapting has to beat.
+
+
+SEED = 0
+"""Of random choices, together with the sequence's name and the number of the repeat."""
+
+
+class _Control:
+    """It has the methods of `adaptune.selector.Selector`, and neither sees nor measures."""
+
+    def reset(self) -> None:
+        """Forget all selections, as before a new recording."""
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan; nothing depends on it."""
+
+    def measure(self) -> None:
+        """Measure nothing."""
+
+
+class EvenSelector(_Control):
+    """Gives all members of a bank the same weight, always.
+
+    Parameters
+    ----------
+    sets
+        The parameter sets.
+    members
+        Trial numbers of the bank's members.
+    """
+
+    def __init__(self, sets: ParameterSets, members: Sequence[int]):
+        even = dict.fromkeys(members, 1.0 / len(members))
+        self._selection = weighted_selection(sets, even)
+
+    def select(self) -> Selection:
+        """Even weights."""
+        return self._selection
+
+    def fall_back(self) -> Selection:
+        """Even weights, too."""
+        return self._selection
+
+
+class RandomSelector(_Control):
+    """Chooses a random set among a few, at every selection.
+
+    Parameters
+    ----------
+    sets
+        The parameter sets.
+    candidates
+        Trial numbers of the sets to choose among; all are equally likely.
+    fixed
+        Trial number of the set to begin with, and to return to where an odometry fails.
+    seed
+        Of the choices, which are the same with the same seed; see `random_seed`.
+    """
+
+    def __init__(
+        self, sets: ParameterSets, candidates: Sequence[int], fixed: int, seed: Sequence[int]
+    ):
+        self._sets, self._candidates, self._fixed = sets, tuple(candidates), fixed
+        self._seed = list(seed)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin the same choices anew, as before a new recording."""
+        self._rng = np.random.default_rng(self._seed)
+
+    def select(self) -> Selection:
+        """A random set."""
+        trial = self._candidates[int(self._rng.integers(len(self._candidates)))]
+        return Selection(trial, self._sets[trial])
+
+    def fall_back(self) -> Selection:
+        """The fixed set."""
+        return Selection(self._fixed, self._sets[self._fixed])
+
+
+def random_seed(sequence: str, repeat: int = 1) -> tuple[int, int, int]:
+    """The seed of `RandomSelector` on a sequence: the same on every machine."""
+    return SEED, zlib.crc32(sequence.encode()), repeat
+
 
 BASELINE, UNTRAINED = "baseline", "untrained"
 LEARNED, EVEN, RANDOM = "bank_learned", "even", "random"

@@ -4,9 +4,9 @@ import csv
 from pathlib import Path
 from typing import Any
 
+from adaptune.errors import import_extra
 from adaptune.files import replacing
-from adaptune.odometry.base import import_extra
-from online.stored_replays import damaged
+from online.record import damaged
 
 _WORDS = ("why_not", "fallen_back")
 TABLES = ("selections", "frames")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.drawing import LINES, OTHERS, as_png_and_svg, log_scale, picture, plain
+from adaptune.report.paper import LINES, OTHERS, as_png_and_svg, log_scale, picture, plain
 from adaptune.space import ParameterSpace
 from adaptune.study.config import ALSO
 

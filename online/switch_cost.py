@@ -7,23 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adaptune.bank.bank import Bank
+from adaptune.bank.hand_over import HandOver
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.model import ErrorModel
-from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.pool import Factory
+from adaptune.odometry.factory import Factory
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
 from adaptune.space import ParameterSet
-from adaptune.study.driven import driven
 from adaptune.study.inputs import check_inputs
 from adaptune.study.references import ensure_references
-from adaptune.study.study import Study
+from adaptune.study.study import Study, driven
 from online.replay import replay
 
 Progress = Callable[[str, int, int], None]

@@ -9,7 +9,7 @@ import drives
 import pytest
 from needs import lacking
 
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
 
 Factory = pytest.TempPathFactory
@@ -21,7 +21,7 @@ SLOW = [
     "offline/test_cluster.py",
     "online/test_comparison.py",
     "online/test_compared_modes.py",
-    "adaptune/test_cli.py",
+    "adaptune/commands/test_cli.py",
     "offline/test_campaign.py",
     "adaptune/odometry/test_conformance_isolated.py",
     "adaptune/odometry/test_gicp.py",
@@ -32,8 +32,8 @@ SLOW = [
     "adaptune/odometry/docker/test_docker_process.py",
     "adaptune/odometry/docker/test_engine.py",
     "adaptune/odometry/test_protocol.py",
-    "adaptune/test_survey.py",
-    "adaptune/test_inspect.py",
+    "adaptune/recording/test_survey.py",
+    "adaptune/recording/test_inspect.py",
     "offline/test_learn.py",
     "offline/test_resume.py",
     "adaptune/odometry/test_command.py",
@@ -73,8 +73,8 @@ SLOW = [
     "adaptune/test_interrupt.py",
     "online/test_replay_picture.py",
     "offline/test_pictures.py",
-    "adaptune/charts/test_page_in_browser.py",
-    "adaptune/charts/test_paper.py",
+    "adaptune/report/test_page_in_browser.py",
+    "adaptune/report/test_paper.py",
     "adaptune/odometry/test_guarded.py",
     "adaptune/reference/test_picture.py",
     "adaptune/test_mistakes.py",

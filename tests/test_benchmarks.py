@@ -11,17 +11,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from adaptune import yaml
+from adaptune import files
+from adaptune.errors import ConfigurationError
 from adaptune.geometry import invert
 from adaptune.odometry.docker import rustle
-from adaptune.sequence import SequenceError
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
-from adaptune.simulation.simulate import Drive
-from adaptune.study.mistakes import ConfigurationError
+from adaptune.recording import SequenceError
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
+from adaptune.simulation.record import Drive
 from adaptune.study.references import to_estimate
-from offline.offline_study import OfflineStudy, load_study
-from online.comparison_row import ComparisonRow
+from offline.config import OfflineStudy, load_study
+from online.statistics import ComparisonRow
 
 
 def benchmark(name):
@@ -57,7 +57,7 @@ def test_directions_of_recorded_data_are_studies(recorded, tmp_path, monkeypatch
     roles = {"training": set(), "test": set()}
     for name, direction in module.DIRECTIONS.items():
         path = tmp_path / f"{name}.yaml"
-        path.write_text(yaml.dump(module.definition(direction, "gicp", 3, 0)))
+        path.write_text(files.dump(module.definition(direction, "gicp", 3, 0)))
         config = load_study(path, folder=tmp_path / name).config
         for role, names in roles.items():
             names.update(getattr(config, role))
@@ -77,7 +77,7 @@ def test_without_reference_only_the_test_knows_poses(recorded, tmp_path, monkeyp
     for name in ("hall_1", "cars", "campus"):
         path = tmp_path / f"{name}.yaml"
         given = module.definition(module.DIRECTIONS[name], "ndt", 3, 0, no_reference=True)
-        path.write_text(yaml.dump(given))
+        path.write_text(files.dump(given))
         study = load_study(path, folder=tmp_path / name)
         assert to_estimate(study, study.config.training) == list(study.config.training)
         assert to_estimate(study, study.config.test) == ["street"] * (name == "cars")
@@ -105,7 +105,7 @@ def test_recorded_prints_every_mode_and_resumes(
     shutil.copytree(trained_folder, tmp_path / "gicp-small-10-3")
     text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
     online = {"rules": ["paired"], "switching": {"mechanism": "bank"}}
-    given = {**yaml.Document(text).data, "online": online}
+    given = {**files.Document(text).data, "online": online}
     monkeypatch.setattr(module, "DIRECTIONS", {"small": None, "other": None})
     monkeypatch.setattr(module, "definition", lambda *_, **__: given)
     monkeypatch.setattr(module.cores, "pin", lambda _: None)
@@ -183,7 +183,7 @@ def test_gardens_have_what_the_study_names(tmp_path, monkeypatch):
     module = benchmark("protocols")
     monkeypatch.setattr(module, "GARDENS", ("1005_00",))
     module.simulate_gardens(tmp_path, metres=10.0)
-    entry = yaml.Document.of_file(module.CONFIGS / "botanic_garden_gicp.yaml").data["sequences"]
+    entry = files.Document.of_file(module.CONFIGS / "botanic_garden_gicp.yaml").data["sequences"]
     monkeypatch.setenv("BOTANIC_GARDEN", str(tmp_path))
     sequence = open_sequence(SequenceConfig.model_validate(entry["1005_00"]))
     assert sequence.reference() is not None
@@ -221,5 +221,5 @@ def mistakes_of(path, overrides, folder):
 def test_grids_fill_the_searches_that_they_are_compared_with():
     module = benchmark("protocols")
     for grid, points in ((module.GICP_GRID, 30), (module.DOCKER_GRID, 18)):
-        counts = [axis["count"] for axis in yaml.scalar(grid).values()]
+        counts = [axis["count"] for axis in files.scalar(grid).values()]
         assert np.prod(counts) == points

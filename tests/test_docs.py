@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from adaptune.cli import app
+from adaptune.commands.cli import app
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])

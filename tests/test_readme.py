@@ -10,9 +10,9 @@ import pytest
 
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.trajectory import read_tum
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
-from online.run_replays import run_replays
+from online.run import run_replays
 
 README = Path(__file__).parent.parent / "README.md"
 (EXAMPLE,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)

@@ -9,11 +9,10 @@ import pytest
 import small_bag
 from needs import reference_image
 
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.process import Process, ProcessSettings
-from adaptune.sequence.scan import Scan
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.remote import Limits, Process, ProcessSettings
+from adaptune.recording.scan import Scan
 from adaptune.trajectory import read_tum
 
 USER = "1234:1234"

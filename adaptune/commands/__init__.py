@@ -1,1 +1,1 @@
-"""The commands that work on a study; with `adaptune.cli`, the only code that sees both stages."""
+"""The commands: the only code that sees both stages."""

@@ -1,11 +1,9 @@
 """The error model: from the descriptor of a scan to the parameter set with the least error."""
 
-from adaptune.model.bank_weights import BankRule, BankSettings
-from adaptune.model.base import Rule, TrainingData
-from adaptune.model.error_model import ErrorModel
-from adaptune.model.model_file import ModelError
-from adaptune.model.paired import PairedExpectedRatio, PairedSettings
-from adaptune.space import nearest
+from adaptune.errors import nearest
+from adaptune.model.error_model import ErrorModel, ModelError
+from adaptune.model.rules import PairedExpectedRatio, PairedSettings, Rule, TrainingData
+from adaptune.model.weights import BankRule, BankSettings
 
 RULES = ("paired", "paper")
 """Names of the selection rules; the first is the default."""

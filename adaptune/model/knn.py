@@ -9,7 +9,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
 from adaptune.metrics import FAILURE
-from adaptune.model.base import Rule, TrainingData
+from adaptune.model.rules import Rule, TrainingData
 from adaptune.selection import Selection
 
 

@@ -1,12 +1,27 @@
 """Odometries as black boxes: scans and parameters in, poses out."""
 
-from adaptune.odometry.base import BaseSettings as BaseSettings
-from adaptune.odometry.base import Description as Description
-from adaptune.odometry.base import Motions as Motions
-from adaptune.odometry.base import Odometry as Odometry
-from adaptune.odometry.base import OdometryError as OdometryError
-from adaptune.odometry.base import OdometryInstance as OdometryInstance
-from adaptune.odometry.base import Registration as Registration
-from adaptune.odometry.base import Usage as Usage
-from adaptune.odometry.base import WarmUp as WarmUp
-from adaptune.odometry.in_process import InProcess as InProcess
+from adaptune.errors import OdometryError
+from adaptune.odometry.base import (
+    BaseSettings,
+    Description,
+    InProcess,
+    Motions,
+    Odometry,
+    OdometryInstance,
+    Registration,
+    Usage,
+    WarmUp,
+)
+
+__all__ = [
+    "BaseSettings",
+    "Description",
+    "InProcess",
+    "Motions",
+    "Odometry",
+    "OdometryError",
+    "OdometryInstance",
+    "Registration",
+    "Usage",
+    "WarmUp",
+]

@@ -1,35 +1,22 @@
 """What every odometry offers, and the base class of adapters."""
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import cache
-from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import OdometryError, StrictModel, nearest
 from adaptune.geometry import Poses, invert
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
-from adaptune.space import ParameterSet, ParameterSpace, nearest
-from adaptune.strict import StrictModel
+from adaptune.space import ParameterSet, ParameterSpace
 
 MIN_POINTS = 20
 """An adapter does not register scans with fewer points in range."""
-
-
-class OdometryError(AdaptuneError):
-    """An odometry that cannot do what is asked of it."""
-
-
-class UnavailableError(OdometryError):
-    """What runs an odometry is gone, whatever its parameters: a trial says nothing then."""
-
-
-class NotInstalledError(OdometryError):
-    """An odometry whose package is not installed."""
 
 
 class BaseSettings(StrictModel):
@@ -356,16 +343,6 @@ class Odometry(ABC):
 
 
 @cache
-def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
-    """Import modules of a package that one of adaptune's extras installs; an error without it."""
-    try:
-        return tuple(map(import_module, modules))
-    except ImportError as error:
-        install = f"pip install 'adaptune[{extra}]'"
-        what = f"{extra} cannot be imported ({error}); run `{install}`"
-        raise NotInstalledError(what) from error
-
-
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
     if isinstance(prepared, Scan):
@@ -376,3 +353,113 @@ def prepared_bytes(prepared: Any) -> int:
     if isinstance(prepared, tuple):
         return sum(map(prepared_bytes, prepared))
     return 0 if prepared is None or isinstance(prepared, int) else 1_000_000
+
+
+# Prepared scans that several instances share.
+
+
+class Preparations:
+    """Prepares scans for several instances, once for all with the same preparation.
+
+    The first instance with each preparation prepares for all of them: they share what it learned
+    from the first scan's layout.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[Hashable, OdometryInstance] = {}
+
+    def of(self, scan: Scan) -> "PreparedScan":
+        """A scan that is prepared for whoever asks."""
+        return PreparedScan(scan, self)
+
+    def prepare(self, scan: Scan, instance: OdometryInstance) -> tuple[Hashable, Any]:
+        """Prepare a scan for an instance; what it was prepared by, and the result."""
+        key = instance.preparation
+        return key, self._first.setdefault(key, instance).prepare(scan)
+
+
+class PreparedScan:
+    """A scan with what it was prepared to.
+
+    Attributes
+    ----------
+    scan : Scan
+    """
+
+    def __init__(self, scan: Scan, preparations: Preparations):
+        self.scan = scan
+        self._preparations = preparations
+        self._prepared: dict[Hashable, Any] = {}
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds."""
+        return self.scan.stamp
+
+    def by(self, instance: OdometryInstance) -> Any:
+        """The scan as an instance takes it; it is prepared where nobody has asked before."""
+        if (key := instance.preparation) not in self._prepared:
+            self._prepared |= [self._preparations.prepare(self.scan, instance)]
+        return self._prepared[key]
+
+    def with_scan(self, scan: Scan) -> "PreparedScan":
+        """Another scan, which the same instances prepare."""
+        return PreparedScan(scan, self._preparations)
+
+
+# An odometry in this process, as an instance that can be driven.
+
+
+class InProcess(OdometryInstance):
+    """Runs an adapter in this process, and records its motion and its CPU time.
+
+    Parameters
+    ----------
+    odometry
+        The adapter, which nothing else may use.
+    """
+
+    faults: Sequence[str] = ()
+
+    def __init__(self, odometry: Odometry):
+        self.odometry = odometry
+        self._cpu = 0.0
+        self._last_motion = LastMotion()
+
+    @property
+    def usage(self) -> Usage:
+        """CPU time of the registrations; the memory is that of this process."""
+        return Usage(self._cpu, None)
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
+
+    @property
+    def preparation(self) -> Hashable:
+        return self.odometry.preparation
+
+    def prepare(self, scan: Scan) -> Any:
+        return self.odometry.prepare(scan)
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self.odometry.start(prepared, T_odom_sensor, T_previous_current)
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+
+    def submit(self, prepared: Any) -> None:
+        self._submitted = prepared
+
+    def collect(self) -> Registration:
+        begin = time.process_time()
+        registration = Registration(*self.odometry.register(self._submitted))
+        self._cpu += time.process_time() - begin
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def apply(self, selection: Selection) -> None:
+        self.odometry.configure(selection.parameters)
+
+    def close(self) -> None:
+        pass  # there is no other process

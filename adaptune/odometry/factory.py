@@ -1,19 +1,415 @@
 """Make an odometry from its name, wherever it runs."""
 
-from collections.abc import Callable
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from functools import cache, cached_property, partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
 
-from adaptune.odometry.base import Description, OdometryInstance
-from adaptune.odometry.content import Content, odometry_content
-from adaptune.odometry.declaration import declare
-from adaptune.odometry.guarded import Guarded
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.odometry.program_input import ProgramInput
-from adaptune.odometry.registry import CONTAINERS, PROGRAMS, is_user_class, odometry_class, versions
-from adaptune.space import ParameterSet, ParameterSpace
+import numpy as np
+from pydantic import BaseModel, ConfigDict, RootModel
+
+from adaptune import processes
+from adaptune.errors import AdaptuneError, Mistake, OdometryError, in_a_line, validated
+from adaptune.geometry import Poses
+from adaptune.model.descriptor import DESCRIPTORS
+from adaptune.model.descriptor import ENTRY_POINTS as DESCRIPTOR_ENTRY_POINTS
+from adaptune.odometry.base import (
+    Description,
+    InProcess,
+    Odometry,
+    OdometryInstance,
+    Registration,
+    Usage,
+    WarmUp,
+)
+from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.registry import (
+    CONTAINERS,
+    ENTRY_POINTS,
+    ODOMETRIES,
+    PROGRAMS,
+    is_user_class,
+    odometry_class,
+    package_of,
+    versions,
+)
+from adaptune.odometry.remote import SERVICE, Faulting, Isolated, Limits, pose_fault
+from adaptune.odometry.wire import unpacked
+from adaptune.recording.cache import fingerprint
+from adaptune.recording.scan import Scan
+from adaptune.selection import Selection
+from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+
+# A class of the user in this process: where it goes wrong, this is a fault and nothing else.
+
+
+T = TypeVar("T")
+
+
+class _Unprepared:
+    """What stands for a scan that could not be prepared."""
+
+    nbytes = 0
+
+    def __init__(self, fault: str):
+        self.fault = fault
+
+
+class _LateError(BaseException):
+    """A call has taken too long; not an exception that user code would handle."""
+
+
+class _FaultError(Exception):
+    """What a class of the user has raised."""
+
+
+class Guarded(Faulting):
+    """A clean class of the user in this process, with the faults that `Isolated` would have.
+
+    Parameters
+    ----------
+    name, parameters
+        The odometry.
+    settings
+        Its checked settings.
+    seconds
+        Time for one scan. It holds for Python code in the main thread; other code is trusted.
+    """
+
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):
+        super().__init__(name, parameters)
+        self._class: Any = odometry_class(name)
+        self._seconds = seconds
+        self._settings = settings.model_dump(mode="json")
+        self._odometry: Odometry | None = None
+        self._cpu = 0.0
+        self._running = False
+
+    @property
+    def ended(self) -> bool:
+        return not self._running
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(self._cpu, None)
+
+    @property
+    def preparation(self) -> Hashable:
+        try:
+            preparation = self._guarded(lambda: self._made().preparation)
+            hash(preparation)
+        except (_FaultError, TypeError):
+            return self  # it shares with nobody
+        return preparation
+
+    def prepare(self, scan: Scan) -> Any:
+        try:
+            return self._guarded(lambda: self._made().prepare(scan))
+        except _FaultError as fault:
+            return _Unprepared(str(fault))
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+        self._running = False
+        if self.given_up:
+            return
+        try:
+            motion = None if T_previous_current is None else T_previous_current.copy()
+            started = _checked(prepared)
+            self._guarded(lambda: self._made().start(started, T_odom_sensor.copy(), motion))
+            self._running = True
+        except _FaultError as fault:
+            self.note_fault(str(fault))
+
+    def submit(self, prepared: Any) -> None:
+        self._submitted = prepared
+
+    def collect(self) -> Registration:
+        registration = Registration(np.full((4, 4), np.nan), registered=False)
+        if self._running:
+            begin = time.process_time()
+            try:
+                registration = self._registered(_checked(self._submitted))
+            except _FaultError as fault:
+                registration = self.note_fault(str(fault))
+            self._cpu += time.process_time() - begin
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _registered(self, prepared: Any) -> Registration:
+        found = self._guarded(lambda: unpacked(self._made().register(prepared)))
+        T_odom_sensor = self._guarded(lambda: np.array(found.T_odom_sensor, np.float64))
+        if wrong := pose_fault(T_odom_sensor):
+            raise _FaultError(f"it gave a pose {wrong}")
+        return Registration(T_odom_sensor, bool(found.registered))
+
+    def apply(self, selection: Selection) -> None:
+        self.parameters |= selection.parameters
+        try:
+            self._guarded(lambda: self._made().configure(selection.parameters))
+        except _FaultError as fault:
+            self.note_fault(str(fault))
+
+    def close(self) -> None:
+        self._odometry, self._running = None, False
+
+    def _made(self) -> Odometry:
+        if self._odometry is None:
+            settings = self._class.settings_type.model_validate(self._settings)
+            self._odometry = self._class(self.parameters, settings)
+        assert self._odometry is not None
+        return self._odometry
+
+    def _guarded(self, call: Callable[[], T]) -> T:
+        """What a call of user code returns; a `_FaultError` with the place where it raised."""
+        try:
+            with _limited(self._seconds):
+                return call()
+        except AdaptuneError:
+            raise
+        except _LateError as error:
+            what = f"a scan took longer than isolation.seconds = {self._seconds:g}"
+            raise _FaultError(what) from error
+        except BaseException as error:
+            raise _FaultError(in_a_line(error)) from error
+
+
+def _checked(prepared: Any) -> Any:
+    if isinstance(prepared, _Unprepared):
+        raise _FaultError(prepared.fault)
+    return prepared
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise a `_LateError` in the block after so long, where there is a way."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(_: int, __: object) -> None:
+        raise _LateError
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+# What an odometry says of itself. A class of the user is asked in a process of its own.
+
+
+class UserSettings(RootModel[dict[str, Any]]):
+    """Checked settings of a class of the user, with nothing left to defaults."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """An odometry with given settings.
+
+    Attributes
+    ----------
+    settings : BaseModel or None
+        The checked settings; None if they have mistakes.
+    mistakes : list of Mistake
+        Mistakes in the settings.
+    description : Description or None
+        None if the odometry cannot be described without sound settings.
+    clean : bool
+        Whether instances in one process know nothing of each other, see `Odometry`.
+    module : str
+        Module in which its class is written.
+    """
+
+    settings: Any
+    mistakes: list[Mistake]
+    description: Description | None
+    clean: bool
+    module: str
+
+    def sound(self, name: str) -> tuple[Any, Description]:
+        """Settings and description.
+
+        Raises
+        ------
+        OdometryError
+            If the settings have mistakes.
+        """
+        if self.settings is None or self.description is None:
+            said = "; ".join(f"{'.'.join(map(str, m.key))}: {m.message}" for m in self.mistakes)
+            raise OdometryError(f"{name}: settings: {said}")
+        return self.settings, self.description
+
+
+def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration:
+    """Let an odometry check its settings and describe itself.
+
+    Parameters
+    ----------
+    name
+        The odometry, see `adaptune.odometry.registry.odometry_class`.
+    settings
+        A mapping, or a model.
+    folder
+        Where relative paths in the settings begin.
+
+    Raises
+    ------
+    OdometryError
+        If there is no such odometry, or it does not answer.
+    """
+    if not is_user_class(name):
+        return declare_here(name, settings, folder)
+    given = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
+    answer = _ask(name, json.dumps(given, default=str), str(folder or ""))
+    space, warm_up = ParameterSpace.load(answer["space"]), WarmUp(*answer["warm_up"])
+    complete = answer["settings"]
+    return Declaration(
+        None if complete is None else UserSettings(complete),
+        [Mistake(tuple(key), message) for key, message in answer["mistakes"]],
+        Description(space, answer["live"], answer["needs_imu"], warm_up, answer["whole"]),
+        answer["clean"],
+        answer["module"],
+    )
+
+
+def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declaration:
+    """Do `declare` in this process."""
+    cls: Any = odometry_class(name)
+    mistakes: list[Mistake] = []
+    context = None if folder is None else {"folder": folder}
+    found: Any = validated(cls.settings_type, settings, (), mistakes, context)
+    is_class = issubclass(cls, Odometry)
+    described = cls.describe(found) if is_class or found is not None else None
+    return Declaration(found, mistakes, described, is_class and cls.clean, cls.__module__)
+
+
+@cache
+def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
+    process = processes.Hosted(
+        SERVICE, name, "describe", processes.Bounds(processes.IMPORT_SECONDS)
+    )
+    try:
+        message = {"type": "describe", "settings": json.loads(settings), "folder": folder}
+        return process.ask(message).header
+    except processes.HostError as error:
+        raise OdometryError(str(error)) from error
+    finally:
+        process.close()
+
+
+# What an odometry or a descriptor is, by its content: versions, sources, programs.
+#
+# Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
+# an
+# address are not part of it.
+
+
+Content = dict[str, str]
+"""By what it is of, in words, a version or the hash of a file."""
+
+
+def odometry_content(name: str, settings: Any, module: str = "") -> Content:
+    """What the poses of an odometry depend on besides its name, settings and parameters.
+
+    Parameters
+    ----------
+    name
+        See `adaptune.odometry.registry.odometry_class`.
+    settings
+        Its settings, which name the files of a program.
+    module
+        Module in which the class is written, if another one exports it.
+    """
+    if name in PROGRAMS:
+        return _program(settings)
+    if name in ODOMETRIES:
+        package = package_of(name)
+        return {f"version of {package}": _version(package)}
+    return _python(name, ENTRY_POINTS, module)
+
+
+def descriptor_content(names: Iterable[str]) -> Content:
+    """What the descriptors of these names depend on; nothing for those of adaptune."""
+    found: Content = {}
+    for name in names:
+        if name not in DESCRIPTORS:
+            found |= _python(name, DESCRIPTOR_ENTRY_POINTS)
+    return found
+
+
+def _python(name: str, group: str, written_in: str = "") -> Content:
+    """Source of a module, and version of the distribution that it is from."""
+    versions: Content = {}
+    if ":" not in name:
+        for point in metadata.entry_points(group=group, name=name):
+            name = point.value
+            if point.dist is not None:
+                versions[f"version of {point.dist.name}"] = point.dist.version
+    module = name.partition(":")[0]
+    file = module_file(module)
+    if file is None:
+        return versions
+    if not versions and "site-packages" in file.parts:
+        # This takes half a second.
+        for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
+            versions[f"version of {package}"] = _version(package)
+    files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
+    return versions | {f"module {m}": fingerprint(f) for m, f in files.items()}
+
+
+def module_file(name: str) -> Path | None:
+    """File of a module, found without importing it or what it is in; None if there is none."""
+    where, origin, parts = None, None, name.split(".")
+    for i in range(len(parts)):
+        full = ".".join(parts[: i + 1])
+        specs = (finder.find_spec(full, where) for finder in sys.meta_path)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None:
+            return None
+        where, origin = spec.submodule_search_locations, spec.origin
+    return Path(origin) if origin is not None and os.path.isfile(origin) else None  # noqa: PTH113
+
+
+def _program(settings: Any) -> Content:
+    if (image := getattr(settings, "image", None)) is not None:
+        from adaptune.odometry.docker.engine import image_digest
+
+        found = {f"image {image}": image_digest(image)}
+        files: tuple[str | None, ...] = ()
+    else:
+        program, *arguments = settings.command or ("",)
+        found, files = {}, (shutil.which(program), *arguments)
+    for name in (*files, getattr(settings, "template", None)):
+        # Arguments may be anything, also too long for a path.
+        for file in (name or "", *(name or "").split("=", 1)[1:]):
+            if os.path.isfile(file):  # noqa: PTH113
+                found[file] = fingerprint(Path(file))
+    return found
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 @dataclass(frozen=True)
@@ -136,3 +532,117 @@ class OdometryFactory:
             return Guarded(self.name, given, self.settings, self.limits.seconds)
         cls: Any = odometry_class(self.name)
         return InProcess(cls(given, self.settings))
+
+
+# Several odometries in one study: a parameter set says which of them it is for.
+
+
+@dataclass(frozen=True)
+class OdometryPool:
+    """Makes instances of several odometries, in any process: it pickles.
+
+    It offers what `OdometryFactory` does. Parameter sets are those of a `PooledSpace`.
+
+    Attributes
+    ----------
+    factories : dict
+        By label, what makes each odometry.
+    """
+
+    factories: Mapping[str, OdometryFactory]
+    space: PooledSpace = field(init=False)
+
+    def __post_init__(self) -> None:
+        spaces = {label: factory.space for label, factory in self.factories.items()}
+        object.__setattr__(self, "space", PooledSpace(spaces))
+
+    @property
+    def name(self) -> str:
+        """All labels."""
+        return ", ".join(self.factories)
+
+    @cached_property
+    def description(self) -> Description:
+        """What a study must know of all together.
+
+        No instance changes from one odometry to another, so none is live. The longest warm-up is
+        long enough for all.
+        """
+        every = [factory.description for factory in self.factories.values()]
+        return Description(
+            self.space,
+            live=False,
+            needs_imu=any(one.needs_imu for one in every),
+            warm_up=WarmUp(
+                max(one.warm_up.seconds for one in every),
+                max(one.warm_up.full_rate for one in every),
+                min(one.warm_up.stride for one in every),
+            ),
+            whole=any(one.whole for one in every),
+        )
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The labels, and by label name and settings, by which a model knows what it is of."""
+        settings = {label: factory.identity for label, factory in self.factories.items()}
+        return {"name": self.name, "settings": settings}
+
+    @property
+    def user_code(self) -> bool:
+        """See `OdometryFactory`."""
+        return any(factory.user_code for factory in self.factories.values())
+
+    @property
+    def has_user_class(self) -> bool:
+        """See `OdometryFactory`."""
+        return any(factory.has_user_class for factory in self.factories.values())
+
+    @property
+    def apart(self) -> bool:
+        """Whether any of them runs in processes of its own, which have limits."""
+        return any(factory.apart for factory in self.factories.values())
+
+    @property
+    def one_by_one(self) -> bool:
+        """See `OdometryFactory`."""
+        return any(factory.one_by_one for factory in self.factories.values())
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of the packages that the poses depend on."""
+        every = (factory.versions for factory in self.factories.values())
+        return {package: version for one in every for package, version in sorted(one.items())}
+
+    @property
+    def content(self) -> Content:
+        """See `OdometryFactory`."""
+        return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
+
+    def allowing(self, user_code: bool) -> "OdometryPool":
+        """The same where classes of the user may, or may not, run in this process."""
+        return OdometryPool({k: replace(f, user_code=user_code) for k, f in self.factories.items()})
+
+    def reading(self, program_input: Any) -> "OdometryPool":
+        """The same with another source of whole recordings."""
+        given = {k: f.reading(program_input) for k, f in self.factories.items()}
+        return OdometryPool(given)
+
+    def alone(self, parameters: ParameterSet) -> tuple[OdometryFactory, ParameterSet]:
+        """See `OdometryFactory.alone`."""
+        label, own = self.space.split(parameters)
+        return self.factories[label].alone(own)
+
+    def __call__(
+        self,
+        parameters: ParameterSet | None = None,
+        sequence: str | None = None,
+        isolated: bool = False,
+    ) -> OdometryInstance:
+        """Make a new instance of the odometry that the set names, see `OdometryFactory`."""
+        whole = self.space.baseline if parameters is None else parameters
+        label, own = self.space.split(whole)
+        return self.factories[label](own, sequence, isolated)
+
+
+Factory = OdometryFactory | OdometryPool
+"""What makes instances of one odometry, or of several."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import MIN_POINTS, Odometry, RangeSettings, Registration
 from adaptune.odometry.scan_time import END, MIDDLE, AtStamp, duration_of
-from adaptune.sequence.scan import Scan
+from adaptune.recording.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 
 

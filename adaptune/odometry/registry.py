@@ -2,40 +2,45 @@
 
 from contextlib import suppress
 from importlib import metadata
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
 
 from adaptune import plugins
-from adaptune.odometry.base import Odometry, OdometryError
+from adaptune.errors import OdometryError, in_one_line
+from adaptune.odometry.base import Description, Odometry
+from adaptune.odometry.wire import Served
+from adaptune.space import ParameterSet
 
 if TYPE_CHECKING:
     from adaptune.odometry.docker.rustle import Rustle
-    from adaptune.odometry.isolation import Isolated
-    from adaptune.odometry.whole_run import WholeRun
+    from adaptune.odometry.program import WholeRun
+    from adaptune.odometry.remote import Isolated
 
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
 
 ODOMETRIES = {
-    "ct_icp": "adaptune.odometry.evalio.lidar:CtIcp",
-    "dlio": "adaptune.odometry.evalio.lidar_inertial:Dlio",
-    "evalio_kiss_icp": "adaptune.odometry.evalio.lidar:KissIcp",
-    "form": "adaptune.odometry.evalio.lidar:Form",
-    "genz_icp": "adaptune.odometry.evalio.lidar:GenzIcp",
-    "gicp": "adaptune.odometry.gicp:KeyframeGicp",
+    "ct_icp": "adaptune.odometry.evalio:CtIcp",
+    "dlio": "adaptune.odometry.evalio:Dlio",
+    "evalio_kiss_icp": "adaptune.odometry.evalio:KissIcp",
+    "form": "adaptune.odometry.evalio:Form",
+    "genz_icp": "adaptune.odometry.evalio:GenzIcp",
+    "gicp": "adaptune.odometry.keyframe:KeyframeGicp",
     "kiss_icp": "adaptune.odometry.kiss_icp:Kiss",
-    "lio_sam": "adaptune.odometry.evalio.lidar_inertial:LioSam",
-    "loam": "adaptune.odometry.evalio.lidar:Loam",
-    "mad_icp": "adaptune.odometry.evalio.lidar:MadIcp",
-    "ndt": "adaptune.odometry.ndt:KeyframeNdt",
+    "lio_sam": "adaptune.odometry.evalio:LioSam",
+    "loam": "adaptune.odometry.evalio:Loam",
+    "mad_icp": "adaptune.odometry.evalio:MadIcp",
+    "ndt": "adaptune.odometry.keyframe:KeyframeNdt",
     "rko_lio": "adaptune.odometry.rko_lio:RkoLio",
-    "vgicp": "adaptune.odometry.gicp:KeyframeVgicp",
+    "vgicp": "adaptune.odometry.keyframe:KeyframeVgicp",
 }
 
 PROGRAMS = {
-    "command": "adaptune.odometry.command:Command",
-    "docker_command": "adaptune.odometry.docker.docker_command:DockerCommand",
-    "docker_process": "adaptune.odometry.docker.docker_process:DockerProcess",
-    "process": "adaptune.odometry.process:Process",
+    "command": "adaptune.odometry.program:Command",
+    "docker_command": "adaptune.odometry.docker.programs:DockerCommand",
+    "docker_process": "adaptune.odometry.docker.programs:DockerProcess",
+    "process": "adaptune.odometry.remote:Process",
     "rustle": "adaptune.odometry.docker.rustle:Rustle",
 }
 """Programs of the user."""
@@ -43,8 +48,8 @@ PROGRAMS = {
 CONTAINERS = ("docker_command", "docker_process", "rustle")
 """Those of them that run in containers."""
 
-PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d"}
-"""Packages that our adapters run on, if the adapter's module has another name."""
+PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgicp": "small_gicp"}
+"""Packages that our odometries run on, where they are not named as the adapter's module is."""
 
 AnyOdometry = type[Odometry] | type["Isolated"] | type["WholeRun"] | type["Rustle"]
 
@@ -69,7 +74,7 @@ def where(name: str) -> str:
 
 
 def odometry_class(name: str) -> "AnyOdometry":
-    """Class of an odometry; see `adaptune.odometry.declaration` for a user's.
+    """Class of an odometry; see `adaptune.odometry.factory` for a user's.
 
     Parameters
     ----------
@@ -95,15 +100,37 @@ def odometry_class(name: str) -> "AnyOdometry":
     return found
 
 
+def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Served, Description]:
+    """Make an odometry in this process."""
+    cls: Any = odometry_class(check_served(name))
+    try:
+        checked = cls.settings_type.model_validate(settings)
+    except ValidationError as error:
+        raise OdometryError(f"settings: {in_one_line(error, settings)}") from error
+    return cls(parameters, checked), cls.describe(checked)
+
+
+def check_served(name: str) -> str:
+    """Refuse programs of the user."""
+    if name in PROGRAMS:
+        raise OdometryError(f"{name} is a program of the user: serve an odometry such as gicp")
+    return name
+
+
+def package_of(name: str) -> str:
+    """The package that one of our odometries runs on."""
+    module = where(name).partition(":")[0]
+    return PACKAGES.get(name, module.removeprefix(f"{__package__}.").partition(".")[0])
+
+
 def versions(name: str) -> dict[str, str]:
     """Versions of what a trial's outcome may depend on: adaptune, numpy, the odometry's package."""
     names = {"adaptune", "numpy"}
     module = where(name).partition(":")[0]
-    top = module.removeprefix(f"{__package__}.").partition(".")[0]
     if module.startswith(f"{__package__}."):
-        names.add(PACKAGES.get(top, top))
+        names.add(package_of(name))
     else:
-        names |= set(metadata.packages_distributions().get(top, ()))
+        names |= set(metadata.packages_distributions().get(module.partition(".")[0], ()))
     found = {}
     for package in sorted(names):
         with suppress(metadata.PackageNotFoundError):  # written by the user, or built in

@@ -12,18 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from adaptune.errors import OdometryError, import_extra
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import (
-    MIN_POINTS,
-    Description,
-    OdometryError,
-    RangeSettings,
-    import_extra,
-)
-from adaptune.odometry.own_frame import NO_IMU, OwnFrameOdometry
-from adaptune.odometry.scan_time import END, MIDDLE
-from adaptune.sequence.imu import Imu
-from adaptune.sequence.scan import Scan
+from adaptune.odometry.base import MIN_POINTS, Description, RangeSettings
+from adaptune.odometry.scan_time import END, MIDDLE, NO_IMU, OwnFrameOdometry
+from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, ParameterSpace
 
 _LATER = 10**9

@@ -4,18 +4,21 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from adaptune import processes
+from adaptune.bank import members as member_process
+from adaptune.errors import OdometryError
 from adaptune.odometry import wire
-from adaptune.odometry.base import Description, OdometryError, Registration
-from adaptune.odometry.declaration import declare
-from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.odometry.process import parse_address
-from adaptune.odometry.registry import is_user_class
-from adaptune.sequence.scan import Scan
+from adaptune.odometry.base import Description, Registration
+from adaptune.odometry.factory import declare, declare_here
+from adaptune.odometry.registry import check_served, is_user_class, make_here, odometry_class
+from adaptune.odometry.remote import Isolated, Limits, parse_address
+from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
 
 _log = logging.getLogger(__name__)
@@ -31,7 +34,7 @@ class _Elsewhere(Isolated):
         return registration
 
 
-def serve(reader: wire.Readable, writer: BinaryIO, name: str | None = None) -> None:
+def serve(reader: processes.Readable, writer: BinaryIO, name: str | None = None) -> None:
     """Do `wire.serve`, but let an odometry that is not clean run in a process of its own."""
     if name is not None:
         _check(name)
@@ -39,15 +42,15 @@ def serve(reader: wire.Readable, writer: BinaryIO, name: str | None = None) -> N
 
 
 def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[wire.Served, Description]:
-    declared = declare(wire.check_served(name), settings)
+    declared = declare(check_served(name), settings)
     if declared.clean and not is_user_class(name):
-        return wire.make_here(name, parameters, settings)
+        return make_here(name, parameters, settings)
     checked, described = declared.sound(name)
     return _Elsewhere(name, parameters, checked, Limits()), described
 
 
 def _check(name: str) -> None:
-    declare(wire.check_served(name), {})
+    declare(check_served(name), {})
 
 
 def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
@@ -89,7 +92,45 @@ def _converse(connection: socket.socket, name: str) -> None:
     try:
         with connection, connection.makefile("rb") as reader, connection.makefile("wb") as writer:
             serve(reader, writer, name)
-    except (OSError, wire.WireError) as error:
+    except (OSError, processes.WireError) as error:
         _log.warning("a conversation ended: %s", error)
     except Exception:
         _log.exception("a conversation ended")
+
+
+# What runs in a process of its own for an odometry, see `adaptune.processes`.
+
+
+def load(name: str) -> None:
+    """Import the odometry."""
+    odometry_class(name)
+
+
+def converse(reader: processes.Readable, writer: BinaryIO, name: str) -> None:
+    """Be an instance."""
+    wire.serve(reader, writer, name, make_here)
+
+
+def members(reader: processes.Readable, writer: BinaryIO, _: str) -> None:
+    """Be members of a bank."""
+    member_process.serve(reader, writer)
+
+
+def describe(reader: processes.Readable, writer: BinaryIO, name: str) -> None:
+    """Answer what `adaptune.odometry.factory.declare` asks."""
+    processes.answer_all(reader, writer, partial(_declared, name))
+
+
+def _declared(name: str, message: processes.Message) -> dict[str, Any]:
+    folder = message.header["folder"]
+    found = declare_here(name, message.header["settings"], Path(folder) if folder else None)
+    described = found.description
+    assert described is not None  # it is a class
+    return wire.about(described) | {
+        "warm_up": list(described.warm_up),
+        "whole": described.whole,
+        "clean": found.clean,
+        "module": found.module,
+        "settings": found.settings and found.settings.model_dump(mode="json"),
+        "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
+    }

@@ -10,11 +10,11 @@ from typing import Any
 import tomli_w
 import yaml as pyyaml
 
-from adaptune import yaml
-from adaptune.odometry.base import OdometryError
-from adaptune.space import ParameterSet, nearest
+from adaptune import files
+from adaptune.errors import OdometryError, nearest
+from adaptune.space import ParameterSet
 
-_YAML = (lambda text: yaml.Document(text).data, yaml.dump)
+_YAML = (lambda text: files.Document(text).data, files.dump)
 _FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     ".yaml": _YAML,
     ".yml": _YAML,
@@ -52,7 +52,7 @@ class Template:
             self._data = read(self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
-        except (OSError, ValueError, yaml.YamlError) as error:
+        except (OSError, ValueError, files.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
@@ -128,7 +128,7 @@ def _replaced(
     text: str, places: Iterable[_Place], changed: Iterable[_Place], data: Any
 ) -> str | None:
     """A YAML text with the new values in their places; None where that is not possible."""
-    document = yaml.Document(text)
+    document = files.Document(text)
     names = {keys for *_, keys in changed}
     spans = []
     for _, held_in, key, keys in places:
@@ -136,12 +136,12 @@ def _replaced(
         if span is None:
             continue
         if keys in names or (isinstance(value, float) and not _is_number(text[slice(*span)])):
-            spans.append((*span, yaml.dump([value]).removeprefix("- ").strip()))
+            spans.append((*span, files.dump([value]).removeprefix("- ").strip()))
     for begin, end, new in sorted(spans, reverse=True):
         text = text[:begin] + new + text[end:]
     try:
-        return text if yaml.Document(text).data == data else None
-    except yaml.YamlError:
+        return text if files.Document(text).data == data else None
+    except files.YamlError:
         return None
 
 

@@ -28,30 +28,23 @@ Points are float32 of shape (n, 3) in metres, times float32 seconds since the st
 intensities float32, poses and motions float64 of shape (4, 4), stamps integer nanoseconds. Four
 arrays hold what an IMU measured since the scan before: imu_stamps, int64; imu, float64 of shape
 (n, 6), rad/s and m/s^2; imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,),
-see `adaptune.sequence.imu.ImuNoise`. The other side ends by closing the stream.
+see `adaptune.recording.scan.ImuNoise`. The other side ends by closing the stream.
 """
 
-import contextlib
-import json
 import resource
-import socket
-import struct
-from collections.abc import Callable, Iterable, Mapping
-from multiprocessing.connection import wait
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, in_one_line, nearest
 from adaptune.geometry import Poses
 from adaptune.odometry import Description, OdometryError, Registration
-from adaptune.odometry.registry import PROGRAMS, odometry_class
-from adaptune.plain_words import in_one_line
-from adaptune.sequence.imu import Imu, ImuNoise
-from adaptune.sequence.scan import Scan
-from adaptune.space import ParameterSet, ParameterSpace, nearest
+from adaptune.processes import Message, Readable, Writable, receive, send
+from adaptune.recording.scan import Imu, ImuNoise, Scan
+from adaptune.space import ParameterSet, ParameterSpace
 
 VERSION = 2
 _HOLDS = {
@@ -62,115 +55,6 @@ _HOLDS = {
 }
 _COLUMNS = ("points", "times", "rings", "intensities")
 _IMU = ("imu", "imu_stamps", "imu_pose", "imu_noise")
-_LENGTH = struct.Struct("<I")
-_LONGEST_HEADER = 1 << 24
-
-
-class Readable(Protocol):
-    """A stream of messages."""
-
-    def read(self, size: int, /) -> bytes:
-        """Read so many bytes; fewer only at the end."""
-
-
-class Writable(Protocol):
-    """A stream that takes messages."""
-
-    def write(self, data: bytes, /) -> Any:
-        """Take bytes."""
-
-    def writelines(self, lines: Iterable[Any], /) -> None:
-        """Take several buffers."""
-
-    def flush(self) -> None:
-        """Send what was taken."""
-
-
-class SocketStream:
-    """A socket as a stream of messages, which tells whether one has come.
-
-    Nothing is read ahead, so that what has come can be seen at the socket.
-    """
-
-    def __init__(self, connection: socket.socket):
-        self._socket = connection
-        self._writer = connection.makefile("wb")
-        self.write, self.writelines = self._writer.write, self._writer.writelines
-        self.flush = self._writer.flush
-
-    def read(self, size: int, /) -> bytes:
-        """Read so many bytes; fewer only at the end."""
-        data = bytearray()
-        while len(data) < size and (more := self._socket.recv(size - len(data))):
-            data += more
-        return bytes(data)
-
-    def ready(self, seconds: float) -> bool:
-        """Whether a message, or the end, is there, or comes in so many seconds."""
-        return bool(wait([self._socket], max(seconds, 0.0)))
-
-    def close(self) -> None:
-        """Close the socket."""
-        try:
-            self._writer.close()
-        finally:
-            self._socket.close()
-
-    def limit(self, seconds: float) -> None:
-        """Raise a `TimeoutError` where a message takes longer."""
-        self._socket.settimeout(seconds)
-
-    def end(self) -> None:
-        """End the conversation, for all processes that share the socket and threads that read."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-
-
-class WireError(AdaptuneError):
-    """A stream without messages of this version."""
-
-
-class Message(NamedTuple):
-    """A message: its header, ``type`` included, and its arrays by name."""
-
-    header: dict[str, Any]
-    arrays: dict[str, NDArray[Any]]
-
-
-def send(stream: Writable, header: Mapping[str, Any], **arrays: NDArray[Any] | None) -> None:
-    """Write a message; arrays that are None are left out."""
-    given = {name: np.ascontiguousarray(a) for name, a in arrays.items() if a is not None}
-    layout = [[name, a.dtype.str, list(a.shape)] for name, a in given.items()]
-    encoded = json.dumps({**header, "arrays": layout}).encode()
-    stream.write(_LENGTH.pack(len(encoded)) + encoded)
-    stream.writelines(a.data.cast("B") for a in given.values() if a.size)
-    stream.flush()
-
-
-def receive(stream: Readable) -> Message | None:
-    """Read a message, or None where the stream has ended; else there is a `WireError`."""
-    first = stream.read(_LENGTH.size)
-    if not first:
-        return None
-    try:
-        (length,) = _LENGTH.unpack(first)
-        if length > _LONGEST_HEADER:
-            raise WireError("the stream holds no message of adaptune's: write nothing else to it")
-        header = json.loads(_exactly(stream, length))
-        arrays = {}
-        for name, kind, shape in header.pop("arrays"):
-            data = _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize)
-            arrays[name] = np.frombuffer(data, kind).reshape(shape)
-    except (struct.error, ValueError, KeyError, TypeError) as error:
-        raise WireError(f"the stream holds no message of adaptune's ({error})") from error
-    return Message(header, arrays)
-
-
-def _exactly(stream: Readable, size: int) -> bytes:
-    data = stream.read(size)
-    if len(data) < size:
-        raise WireError("the stream ends in the middle of a message")
-    return data
 
 
 def scan_arrays(scan: Scan) -> dict[str, NDArray[Any] | None]:
@@ -216,23 +100,6 @@ Make = Callable[[str, ParameterSet, Any], tuple[Served, Description]]
 """Makes an odometry by its name and settings, and describes it."""
 
 
-def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Served, Description]:
-    """Make an odometry in this process."""
-    cls: Any = odometry_class(check_served(name))
-    try:
-        checked = cls.settings_type.model_validate(settings)
-    except ValidationError as error:
-        raise OdometryError(f"settings: {in_one_line(error, settings)}") from error
-    return cls(parameters, checked), cls.describe(checked)
-
-
-def check_served(name: str) -> str:
-    """Refuse programs of the user."""
-    if name in PROGRAMS:
-        raise OdometryError(f"{name} is a program of the user: serve an odometry such as gicp")
-    return name
-
-
 def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
     """First message of a conversation; no name if the other side serves one odometry only."""
     name: dict[str, Any] = {"type": "hello", "version": VERSION, "odometry": odometry}
@@ -252,9 +119,7 @@ def announced(answer: Message) -> Description:
         raise OdometryError(f"its answer to hello does not describe it: {what}") from error
 
 
-def serve(
-    reader: Readable, writer: Writable, name: str | None = None, make: Make = make_here
-) -> None:
+def serve(reader: Readable, writer: Writable, name: str | None, make: Make) -> None:
     """Answer messages with an odometry until the stream ends; anything else is a `WireError`.
 
     Parameters

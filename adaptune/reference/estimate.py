@@ -11,15 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.bank.agreement import LEVER
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
-from adaptune.odometry.agreement import LEVER
-from adaptune.reference.consensus import HALVES
-from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
-from adaptune.reference.graph import Edge, Positions, optimised, positions
-from adaptune.reference.loops import closed, loops
-from adaptune.reference.registering import LENGTHS, SPACING, Guess, Pass, pass_over
-from adaptune.sequence.scan import Scan
-from adaptune.sequence.sequence import Sequence as Recording
+from adaptune.recording.scan import Recording, Scan
+from adaptune.reference.graph import Edge, Positions, closed, loops, optimised, positions
+from adaptune.reference.registering import HALVES, LENGTHS, SPACING, Guess, Pass, pass_over
+from adaptune.reference.stored import EstimatedReference, EstimateError, Registrations
 from adaptune.trajectory import Trajectory
 
 VERSION = 1

@@ -2,14 +2,162 @@
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.reference.estimated import EstimatedReference, EstimateError
-from adaptune.trajectory import write_tum
+from adaptune.geometry import Poses
+from adaptune.metrics import sub_trajectory_rte, travelled
+from adaptune.report.paper import log_scale, picture
+from adaptune.trajectory import Trajectory, write_tum
+
+# An estimated reference: poses, where they can be trusted, and how accurate they are.
+
+
+BREAK = 1.0
+"""Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
+HALVES_TO_WHOLE = 0.75
+"""Error of the whole reference, as a share of the difference between its two halves: half of it if
+they had nothing in common, but they share what all registrations get wrong."""
+OF_BOTH = 0.02
+"""Percent. Error that both halves share even where they agree. Both figures were found on simulated
+courses, see docs/research/without-ground-truth.md."""
+
+
+class EstimateError(AdaptuneError):
+    """A recording from which no reference can be estimated."""
+
+
+class Gap(NamedTuple):
+    """Seconds since the first scan between which a reference is unknown, and why."""
+
+    begin: float
+    end: float
+    reason: str
+
+
+class Registrations(NamedTuple):
+    """Direct registrations of scans to scans some metres before.
+
+    Attributes
+    ----------
+    start, end : ndarray of shape (m,)
+        Numbers of the scans.
+    accepted : ndarray of shape (m,)
+        Whether the pose graph agrees with it.
+    residual : ndarray of shape (m,)
+        Metres by which it differs from the pose graph; NaN if the registration failed.
+    """
+
+    start: NDArray[np.intp]
+    end: NDArray[np.intp]
+    accepted: NDArray[np.bool_]
+    residual: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedReference:
+    """A reference that was computed from the recording.
+
+    Attributes
+    ----------
+    stamps : ndarray of shape (n,)
+        Of all scans, in nanoseconds.
+    T_world_sensor : ndarray of shape (n, 4, 4)
+        The pose of every scan; the first is the identity.
+    trusted : ndarray of shape (n - 1,)
+        Whether the motion from each scan to the next can be trusted.
+    halves : ndarray of shape (2, n, 4, 4)
+        The poses from either half of the registrations alone.
+    registrations : Registrations
+        All registrations.
+    """
+
+    stamps: NDArray[np.int64]
+    T_world_sensor: Poses
+    trusted: NDArray[np.bool_]
+    halves: Poses
+    registrations: Registrations
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which poses are given, of shape (n,).
+
+        A motion that is not to be trusted leaves a gap of more than `BREAK` seconds, and of one
+        pose at least. No sub-trajectory crosses it then, whoever reads the trajectory.
+        """
+        known = np.ones(len(self.stamps), bool)
+        for i in np.flatnonzero(~self.trusted):
+            end = np.searchsorted(self.stamps, self.stamps[i] + round(BREAK * 1e9), side="right")
+            known[i + 1 : max(int(end), i + 2)] = False
+        return known
+
+    def gaps(self) -> list["Gap"]:
+        """Where the reference is unknown, and why."""
+        seconds = (self.stamps - self.stamps[0]) * 1e-9
+        edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
+        last = len(seconds) - 1
+        return [
+            Gap(
+                float(seconds[max(first - 1, 0)]),
+                float(seconds[min(stop, last)]),
+                self._reason(max(first - 1, 0), min(stop, last)),
+            )
+            for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        ]
+
+    def _reason(self, first: int, last: int) -> str:
+        """Why nothing is known between two scans."""
+        breaks = np.diff(self.stamps[first : last + 1]) * 1e-9
+        if breaks.max(initial=0.0) > BREAK + 2.0 * float(np.median(np.diff(self.stamps)) * 1e-9):
+            return f"no scans for {breaks.max():.1f} s"
+        of = self.registrations
+        across = (of.start < last) & (of.end > first) & ~of.accepted
+        if not across.any():
+            return "too few registrations"
+        differ = np.isfinite(of.residual[across]).mean()
+        return "registrations contradict each other" if differ > 0.5 else "registrations fail"
+
+    def trajectory(self) -> Trajectory:
+        """The poses that are known."""
+        known = self.known
+        return Trajectory(self.stamps[known], self.T_world_sensor[known], BREAK)
+
+    def path(self) -> float:
+        """Metres travelled, as far as it is known."""
+        T = np.where(self.known[:, None, None], self.T_world_sensor, np.nan)
+        return float(travelled(T)[-1])
+
+    def unknown_share(self) -> float:
+        """Share of the scans whose pose is unknown."""
+        return 1.0 - float(self.known.mean())
+
+    def error(self, length: float) -> float:
+        """Estimated mean RTE of the reference itself.
+
+        Parameters
+        ----------
+        length
+            Metres of the sub-trajectories.
+
+        Returns
+        -------
+        float
+            Percent; NaN where no sub-trajectory is as long.
+        """
+        known = self.known[:, None, None]
+        one, other = (np.where(known, half, np.nan) for half in self.halves)
+        errors = sub_trajectory_rte(one, other, length)
+        errors = errors[np.isfinite(errors)]
+        if not len(errors):
+            return float("nan")
+        return float(np.hypot(HALVES_TO_WHOLE * errors.mean(), OF_BOTH))
+
 
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 """Metres over which the error of a reference is noted."""
@@ -122,7 +270,6 @@ def write_estimate(
     # What is known of an estimate before is not of these poses.
     path.with_suffix(".json").unlink(missing_ok=True)
     # It imports Matplotlib.
-    from adaptune.reference.picture import draw_estimate
 
     draw_estimate(path.with_suffix(".png"), path.stem, found, stored, length)
     write_tum(path, found.trajectory())
@@ -163,3 +310,87 @@ class Refusal(NamedTuple):
         for suffix in (".json", ".tum", ".png"):
             path.with_suffix(suffix).unlink(missing_ok=True)
         write_text(path.with_suffix(".json"), json.dumps(self._asdict(), indent=1) + "\n")
+
+
+# Picture of an estimated reference.
+
+
+_KNOWN, _UNKNOWN = "#0072b2", "#d55e00"
+_MARGIN = 20.0
+"""Metres around the known path in which the unknown is drawn."""
+_LONGEST_BREAK = 20.0
+"""Seconds; longer ones are drawn as this."""
+
+
+def draw_estimate(
+    path: Path, title: str, found: EstimatedReference, stored: StoredEstimate, length: float
+) -> None:
+    """Draw the path, the residuals of the registrations, and where it is not to be trusted.
+
+    Parameters
+    ----------
+    path
+        PNG or SVG.
+    title
+        First line.
+    found, stored
+        The reference, and what is known about it.
+    length
+        Metres over which the title tells the error.
+    """
+    with picture((path,), 11.0, 4.6) as figure:
+        of_path, of_residuals = figure.subplots(1, 2, width_ratios=(1.0, 1.4))
+        figure.suptitle(f"{title}: {_in_words(stored, length)}", x=0.01, ha="left")
+        _draw_path(of_path, found)
+        _draw_residuals(of_residuals, found)
+
+
+def _in_words(stored: StoredEstimate, length: float) -> str:
+    error = stored.error(length)
+    wrong = "" if math.isnan(error) else f", wrong by {error:.2g} % over {length:g} m"
+    share = 100.0 * stored.unknown_share
+    unknown = f", unknown for {max(share, 0.1):.1f} % of the scans" if share else ""
+    return f"{stored.metres:.0f} m{wrong}{unknown}"
+
+
+def _draw_path(axes: Any, found: EstimatedReference) -> None:
+    x, y = found.T_world_sensor[:, :2, 3].T
+    known = found.known
+    if known.any():
+        # Beyond a gap, the unknown path may lead anywhere.
+        inside = [(a > a[known].min() - _MARGIN) & (a < a[known].max() + _MARGIN) for a in (x, y)]
+        shown = inside[0] & inside[1]
+        axes.plot(*(np.where(shown, a, np.nan) for a in (x, y)), color=_UNKNOWN, lw=1.0, ls=":")
+    axes.plot(*(np.where(known, a, np.nan) for a in (x, y)), color=_KNOWN, lw=1.8)
+    axes.plot(x[:1], y[:1], "o", color="black", ms=5)
+    axes.annotate("start", (x[0], y[0]), textcoords="offset points", xytext=(5, 5))
+    axes.set_aspect("equal", "datalim")
+    axes.set(title="path", xlabel="x [m]", ylabel="y [m]")
+
+
+def _draw_residuals(axes: Any, found: EstimatedReference) -> None:
+    seconds = (found.stamps - found.stamps[0]) * 1e-9
+    # A long break, as between two recordings, would hide all else.
+    drawn = np.append(0.0, np.cumsum(np.minimum(np.diff(seconds), _LONGEST_BREAK)))
+    of = found.registrations
+    at, differs = drawn[of.end], 100.0 * of.residual
+    failed = np.isnan(differs)
+    top = 2.0 * float(np.max(differs[~failed], initial=1.0))
+    for which, label, style in (
+        (of.accepted, "agree", {"marker": ".", "color": _KNOWN, "ms": 3}),
+        (~of.accepted & ~failed, "differ", {"marker": "x", "color": _UNKNOWN, "ms": 5}),
+        (failed, "failed", {"marker": "|", "color": "#999999", "ms": 6}),
+    ):
+        if which.any():
+            y = np.where(failed, top, np.maximum(differs, 0.01))[which]
+            axes.plot(at[which], y, ls="none", label=f"{int(which.sum())} {label}", **style)
+    for gap in found.gaps():
+        span = np.interp((gap.begin, gap.end), seconds, drawn)
+        axes.axvspan(*span, color=_UNKNOWN, alpha=0.15, lw=0)
+    log_scale(axes)
+    title = "registrations over 2, 5 and 10 m"
+    shortened = drawn[-1] < seconds[-1] - 1e-6
+    time = f"time [s], breaks drawn as {_LONGEST_BREAK:g} s" if shortened else "time [s]"
+    axes.set(title=title, xlabel=time, ylabel="differ from the reference by [cm], logarithmic")
+    if len(at):
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)

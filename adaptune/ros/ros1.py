@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from adaptune import processes
 from adaptune.errors import in_a_line
-from adaptune.odometry import wire
 from adaptune.ros import ros1_node
-from adaptune.ros.ros_link import LinkError
+from adaptune.ros.link import LinkError
 
 _START = 20.0
 """Seconds in which the node must be ready."""
@@ -85,7 +85,7 @@ def local_ros1(python: str | None = None) -> "Ros1":
 
 
 class Ros1:
-    """A node in a running ROS 1, see `adaptune.ros.ros_link.RosLink`.
+    """A node in a running ROS 1, see `adaptune.ros.link.RosLink`.
 
     A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
     through it as bytes.
@@ -112,14 +112,14 @@ class Ros1:
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
         self._running, self._end = running, end
-        self._stream = wire.SocketStream(connection)
+        self._stream = processes.SocketStream(connection)
         self._sending = threading.Lock()
         self._numbers = itertools.count()
         self._answers: dict[int, SimpleQueue[dict[str, Any]]] = {}
         self._takes: dict[str, tuple[str, SimpleQueue[bytes | None]]] = {}
         self._recorded: dict[str, Callable[[str, bytes], None]] = {}
         self._mistaken: set[str] = set()
-        ready = wire.receive(self._stream) if self._stream.ready(_START) else None
+        ready = processes.receive(self._stream) if self._stream.ready(_START) else None
         if ready is None or ready.header["type"] == "failed":
             self.close()
             what = "its node did not start" if ready is None else ready.header["message"]
@@ -217,7 +217,7 @@ class Ros1:
     def _send(self, header: dict[str, Any], data: Any = None) -> None:
         try:
             with self._sending:
-                wire.send(self._stream, header, data=data)
+                processes.send(self._stream, header, data=data)
         except (OSError, ValueError) as error:
             raise LinkError("ROS 1: adaptune's node has ended") from error
 
@@ -232,7 +232,7 @@ class Ros1:
     def _receive(self) -> None:
         """Pass on what the node sends, until it ends."""
         try:
-            while (message := wire.receive(self._stream)) is not None:
+            while (message := processes.receive(self._stream)) is not None:
                 header = message.header
                 if header["type"] == "answer":
                     if (waiting := self._answers.get(header["number"])) is not None:
@@ -249,5 +249,5 @@ class Ros1:
                     self._mistaken.add(header["topic"])
                     is_not = "%s is %s, not %s: its messages are ignored"
                     _log.warning(is_not, header["topic"], header["kind"], kind)
-        except (OSError, wire.WireError):
+        except (OSError, processes.WireError):
             pass  # it was closed

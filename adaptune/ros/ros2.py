@@ -15,9 +15,9 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from adaptune.odometry.base import NotInstalledError, import_extra
-from adaptune.ros.ros_link import LinkError
-from adaptune.sequence import livox
+from adaptune.errors import NotInstalledError, import_extra
+from adaptune.recording import clouds
+from adaptune.ros.link import LinkError
 
 PORT = 7447
 """On which a Zenoh router listens."""
@@ -345,7 +345,7 @@ def _packages() -> _Packages:
 def message_types() -> Typestore:
     """The messages of ROS 2 Jazzy, and those of Livox LiDARs."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in livox.DEFINITIONS.items():
+    for name, text in clouds.DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
 

@@ -1,8 +1,7 @@
 """Simulated worlds, where the truth is known."""
 
 from adaptune.simulation.course import Course, SceneLeg, SimulationError
-from adaptune.simulation.motions import MOTIONS
 from adaptune.simulation.scenes import SCENES
-from adaptune.simulation.sensors import SENSORS
+from adaptune.simulation.sensors import MOTIONS, SENSORS
 
 __all__ = ["MOTIONS", "SCENES", "SENSORS", "Course", "SceneLeg", "SimulationError"]

@@ -1,17 +1,19 @@
 """Configuration of a simulated recording."""
 
 from collections.abc import Collection
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from adaptune.errors import AdaptuneError
-from adaptune.sequence.part import Part
-from adaptune.simulation.motions import MOTIONS
+from adaptune import geometry
+from adaptune.errors import AdaptuneError, StrictModel
+from adaptune.geometry import Poses
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.scan import ImuNoise, Part
 from adaptune.simulation.scenes import SCENES
-from adaptune.simulation.sensors import SENSORS
-from adaptune.simulation.weather import WEATHERS
-from adaptune.strict import StrictModel
+from adaptune.simulation.sensors import MOTIONS, SENSORS, WEATHERS
 
 LONGEST = 20_000.0
 """Metres; a longer course is most likely a mistake."""
@@ -83,3 +85,31 @@ class Course(StrictModel):
     def turns(self) -> float:
         """Scans a second."""
         return SENSORS[self.sensor].rate if self.rate is None else self.rate
+
+
+# The sensors of a simulated recording: their topics, and the mounting of the IMU.
+
+
+POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"
+"""Topics, named as BotanicGarden names them."""
+
+T_IMU_LIDAR: Poses = np.array(
+    [
+        [0.9996789, 0.0252866, 0.0015042, 0.058487],
+        [-0.0252723, 0.9996494, -0.0078025, 0.008404],
+        [-0.0017010, 0.0077630, 0.9999700, 0.168916],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
+
+NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
+"""Noise of an Xsens MTi-680G."""
+
+
+def as_sequence(course: Course, path: Path) -> SequenceConfig:
+    """Configuration of the sequence in the bag that was recorded of a course."""
+    extrinsic = geometry.invert(T_IMU_LIDAR).tolist()
+    imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": NOISE._asdict()}
+    imu = None if course.imu is None else imu
+    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=imu, part=course.part)

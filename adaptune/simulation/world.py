@@ -1,11 +1,156 @@
 """The world around a road, in tiles that are built and dropped along the drive."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator, make_interp_spline
+from scipy.ndimage import gaussian_filter1d
 
+from adaptune.geometry import Poses
+from adaptune.simulation import scenes
 from adaptune.simulation.mesh import Mesh, grid, merge
-from adaptune.simulation.road import APRON, Road
-from adaptune.simulation.scenes.base import TILE, Tile
+from adaptune.simulation.scenes import TILE, Scene, Spots, Tile
+from adaptune.simulation.sensors import Motion
+
+# The line that a course follows over the ground.
+
+
+APRON = 40.0
+"""Metres of world before the start and after the end of the drive."""
+
+BLEND = 4.0
+"""Metres on either side of a border over which the ground of one scene turns into the next's."""
+
+_STEP = 0.25
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A stretch of road through one scene, between two stations in metres."""
+
+    scene: Scene
+    start: float
+    stop: float
+
+
+class Road:
+    """A smooth line through all scenes of a course.
+
+    Stations are metres along the line, 0 where the drive starts; offsets are metres to its left.
+    It stays within 70 degrees of the x axis and so never meets itself: each x belongs to one
+    station. Each scene comes with the metres driven in it; the seed is that of bends and slopes.
+
+    Attributes
+    ----------
+    legs : list of Leg
+        The scenes along it; neighbours of one kind are one leg.
+    length : float
+        Metres of the drive.
+    """
+
+    def __init__(self, scenes: Sequence[tuple[Scene, float]], seed: int) -> None:
+        self.seed = seed
+        self.legs = _legs(scenes)
+        self.length = self.legs[-1].stop - APRON
+        stations = np.arange(self.legs[0].start, self.legs[-1].stop + _STEP, _STEP)
+        rng = np.random.default_rng([seed, 1])
+        winding = [(leg, leg.scene.winding, leg.scene.bend) for leg in self.legs]
+        heading = _bends(winding, stations, rng)
+        slope = _bends([(leg, leg.scene.slope, 35.0) for leg in self.legs], stations, rng)
+        # No vehicle drives sharper: bends of a metre or two are rounded off.
+        heading = gaussian_filter1d(heading, 2.0 / _STEP, mode="nearest")
+        slope = gaussian_filter1d(slope, 4.0 / _STEP, mode="nearest")
+        zero = int(np.searchsorted(stations, 0.0))
+        line = np.stack([np.cos(heading), np.sin(heading), slope])
+        steps = (line[:, 1:] + line[:, :-1]) * (_STEP / 2.0)
+        line = np.hstack([np.zeros((3, 1)), np.cumsum(steps, axis=1)])
+        self._x, self._y, self._z = line - line[:, zero : zero + 1]
+        self._stations, self._heading = stations, heading
+
+    def heading(self, s: Floats) -> Floats:
+        """Radians from the x axis at each station."""
+        return np.asarray(np.interp(s, self._stations, self._heading), np.float64)
+
+    def height(self, s: Floats) -> Floats:
+        """Metres above the start at each station."""
+        return np.asarray(np.interp(s, self._stations, self._z), np.float64)
+
+    def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
+        """Coordinates x and y of a station and an offset."""
+        heading = self.heading(s)
+        x = np.interp(s, self._stations, self._x) - d * np.sin(heading)
+        y = np.interp(s, self._stations, self._y) + d * np.cos(heading)
+        return x, y
+
+    def station(self, x: Floats) -> Floats:
+        """Station at which the line passes an x."""
+        return np.asarray(np.interp(x, self._x, self._stations), np.float64)
+
+    def shares(self, s: Floats) -> list[tuple[Leg, Floats]]:
+        """Weight of each leg's scene at each station; the weights sum to one."""
+        shares = []
+        for leg in self.legs:
+            first, last = leg is self.legs[0], leg is self.legs[-1]
+            rise = np.ones_like(s) if first else _smooth((s - leg.start) / (2 * BLEND) + 0.5)
+            fall = np.ones_like(s) if last else _smooth((leg.stop - s) / (2 * BLEND) + 0.5)
+            shares.append((leg, rise * fall))
+        return shares
+
+    def ground(self, x: Floats, y: Floats) -> Floats:
+        """Height of the ground, for coordinates of any one shape."""
+        s = self.station(x)
+        d = (y - np.interp(s, self._stations, self._y)) * np.cos(self.heading(s))
+        spots = Spots(x, y, s, d)
+        z = self.height(s)
+        for leg, share in self.shares(s):
+            if share.any():
+                z = z + share * leg.scene.relief(spots, self.seed)
+        return z
+
+
+def _smooth(u: Floats) -> Floats:
+    u = np.clip(u, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+def _legs(scenes: Sequence[tuple[Scene, float]]) -> list[Leg]:
+    legs: list[Leg] = []
+    start = -APRON
+    stop = 0.0
+    for scene, length in scenes:
+        stop += length
+        if legs and legs[-1].scene is scene:
+            legs[-1] = Leg(scene, legs[-1].start, stop)
+        else:
+            legs.append(Leg(scene, start, stop))
+        start = stop
+    legs[-1] = Leg(legs[-1].scene, legs[-1].start, stop + APRON)
+    return legs
+
+
+def _bends(
+    amplitudes: Sequence[tuple[Leg, float, float]], stations: Floats, rng: np.random.Generator
+) -> Floats:
+    """Wave to and fro by each leg's amplitude, turning back every so many metres."""
+    nodes, values = [], []
+    sign = 1.0
+    s = stations[0]
+    for leg, amplitude, spacing in amplitudes:
+        while s < leg.stop:
+            nodes.append(s)
+            values.append(sign * amplitude * rng.uniform(0.4, 1.0))
+            sign = -sign
+            s += spacing * rng.uniform(0.8, 1.25)
+    nodes.append(stations[-1] + 50.0)
+    values.append(0.0)
+    return np.asarray(PchipInterpolator(nodes, values)(stations), np.float64)
+
 
 _CELL = 0.7
 """Metres between vertices of the ground near the road."""
@@ -82,3 +227,356 @@ class World:
             inside = (cells >= leg.start) & (cells <= leg.stop)
             materials[inside] = leg.scene.surface(d[inside])
         return grid(vertices, materials)
+
+
+# Cars and walkers that move about.
+
+
+_SPEED = {"car": 6.0, "walker": 1.2}
+_EVERY = {"car": 35.0, "walker": 18.0}
+"""Metres of road for each of them."""
+
+RADIUS = {"car": 2.7, "walker": 1.9}
+"""Metres around its origin within which all of it lies."""
+
+
+def model(kind: str) -> Mesh:
+    """Shape of a kind of mover, with its origin on the ground and x ahead."""
+    return scenes.car() if kind == "car" else scenes.walker()
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A car or walker that goes to and fro along the road and slows down to turn back."""
+
+    kind: str  # "car" or "walker"
+    # Station about which it moves, and metres to either side.
+    middle: float
+    swing: float
+    offset: float  # metres to the left of the road's middle
+    # Radians in a second and at the start.
+    pace: float
+    phase: float
+
+    def at(self, road: Road, t: Floats) -> tuple[Floats, Floats]:
+        """Positions of shape (n, 3) and headings of shape (n,) at `t` seconds."""
+        angle = self.pace * t + self.phase
+        s = self.middle + self.swing * np.sin(angle)
+        x, y = road.plane(s, np.full_like(s, self.offset))
+        # A car backs up; a walker turns round.
+        back = (np.cos(angle) < 0.0) & (self.kind == "walker")
+        return np.stack([x, y, road.ground(x, y)], axis=1), road.heading(s) + np.pi * back
+
+
+def populate(road: Road) -> list[Mover]:
+    """Place the movers of every leg."""
+    rng = np.random.default_rng([road.seed, 4])
+    movers = []
+    for leg in road.legs:
+        for kind, offset in leg.scene.movers:
+            for _ in range(max(int((leg.stop - leg.start) / _EVERY[kind]), 1)):
+                # At most a third of the leg, away from where another scene begins.
+                swing = min(rng.uniform(15.0, 40.0), (leg.stop - leg.start) / 3.0)
+                middle = rng.uniform(leg.start + swing + 3.0, leg.stop - swing - 3.0)
+                speed = _SPEED[kind] * rng.uniform(0.7, 1.3)
+                aside, phase = offset + rng.uniform(-0.3, 0.3), rng.uniform(0.0, 2.0 * np.pi)
+                movers.append(Mover(kind, float(middle), swing, aside, speed / swing, phase))
+    return movers
+
+
+# From rays to echoes: compiled loops over all rays of a scan.
+
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+class Cast(NamedTuple):
+    """Rays, and what they hit."""
+
+    rays: F32  # origins and directions, of shape (n, 6)
+    hits: F32  # metres to what each ray hit, infinite where nothing, of shape (n,)
+    normals: F32  # of shape (n, 3)
+    reflectivity: F32  # of shape (n,)
+
+
+class Receiver(NamedTuple):
+    """A sensor's range in metres, its standard deviation, and the share of echoes lost."""
+
+    nearest: float
+    farthest: float
+    noise: float
+    dropout: float
+
+
+@numba.njit(cache=True)
+def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
+    """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
+
+    Directions are unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3); poses are
+    one for each column. Near `origin`, that of the rays' coordinates, single precision is exact
+    enough.
+    """
+    columns, rings = directions.shape[:2]
+    rays = np.empty((columns * rings, 6), np.float32)
+    n = 0
+    for c in range(columns):
+        T = T_world_sensor[c]
+        x, y, z = T[0, 3] - origin[0], T[1, 3] - origin[1], T[2, 3] - origin[2]
+        for r in range(rings):
+            u, v, w = directions[c, r]
+            rays[n, 0], rays[n, 1], rays[n, 2] = x, y, z
+            for i in range(3):
+                rays[n, 3 + i] = T[i, 0] * u + T[i, 1] * v + T[i, 2] * w
+            n += 1
+    return rays
+
+
+@numba.njit(cache=True)
+def towards(
+    rays: F32, rings: int, centres: F64, yaw: F64, radius: float
+) -> tuple[NDArray[np.int64], F32]:
+    """Pick the rays that pass a moving object: their indices, and the rays in the object's frame.
+
+    Parameters
+    ----------
+    rays, rings
+        Of shape (n_columns * n_rings, 6), and how many there are in a column.
+    centres, yaw
+        The object's origin (n_columns, 3) and heading in radians (n_columns,) at each column.
+    radius
+        Metres around its origin within which all of it lies.
+    """
+    picked = np.empty(len(rays), np.int64)
+    local = np.empty((len(rays), 6), np.float32)
+    m = 0
+    for n in range(len(rays)):
+        c = n // rings
+        x, y = rays[n, 0] - centres[c, 0], rays[n, 1] - centres[c, 1]
+        z = rays[n, 2] - centres[c, 2]
+        u, v, w = rays[n, 3], rays[n, 4], rays[n, 5]
+        along = -(x * u + y * v + z * w)
+        if along < -radius or x * x + y * y + z * z - along * along > radius * radius:
+            continue
+        cos, sin = np.cos(yaw[c]), np.sin(yaw[c])
+        picked[m] = n
+        local[m, 0], local[m, 1], local[m, 2] = cos * x + sin * y, cos * y - sin * x, z
+        local[m, 3], local[m, 4], local[m, 5] = cos * u + sin * v, cos * v - sin * u, w
+        m += 1
+    return picked[:m], local[:m]
+
+
+@numba.njit(cache=True)
+def receive(
+    directions: F32,
+    cast: Cast,
+    sensor: Receiver,
+    air: tuple[float, float, float],
+    chance: F32,
+    normal: F32,
+) -> tuple[F32, F32, NDArray[np.int64]]:
+    """Decide which rays come back, and with what range and intensity.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors in the sensor's frame, of shape (n, 3).
+    cast, sensor
+        The rays with their hits, and the receiver.
+    air
+        Extinction, backscatter and its reach: see `adaptune.simulation.sensors.Weather`.
+    chance, normal
+        Uniform random numbers of shape (2, n), and normal ones of shape (n,).
+
+    Returns
+    -------
+    points : ndarray of shape (m, 3)
+        In the sensor's frame at the time of each ray.
+    intensities : ndarray of shape (m,)
+        From 0 to 255.
+    kept : ndarray of shape (m,)
+        Which rays came back.
+    """
+    rays, hits, normals, reflectivity = cast
+    nearest, farthest, noise, dropout = sensor
+    n = len(rays)
+    points, intensities = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    kept = np.empty(n, np.int64)
+    extinction, backscatter, air_reach = air
+    m = 0
+    for i in range(n):
+        distance, power = float(hits[i]), 0.0
+        if backscatter > 0.0:
+            echo = -np.log(1.0 - chance[1, i]) / backscatter
+            if echo < min(distance, air_reach):
+                distance, power = echo, 0.01
+        if not nearest <= distance <= farthest or chance[0, i] < dropout:
+            continue
+        if power == 0.0:
+            cosine = abs(
+                normals[i, 0] * rays[i, 3] + normals[i, 1] * rays[i, 4] + normals[i, 2] * rays[i, 5]
+            )
+            power = reflectivity[i] * cosine * np.exp(-2.0 * extinction * distance)
+            # The echo weakens with the square of the distance; a tenth is seen to the full range.
+            if distance * distance > farthest * farthest * power * 10.0:
+                continue
+        distance += noise * normal[i]
+        for j in range(3):
+            points[m, j] = distance * directions[i, j]
+        intensities[m] = np.rint(255.0 * min(power, 1.0))
+        kept[m] = i
+        m += 1
+    return points[:m], intensities[:m], kept[:m]
+
+
+# The sensor's true trajectory in continuous time.
+
+
+_KNOTS = 50.0
+"""Knots of the trajectory's spline in a second; nothing in it moves faster than a tenth of it."""
+
+
+class Ride:
+    """The sensor's trajectory in continuous time, with its derivatives.
+
+    One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
+    vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
+    of its straying, its speed and its shake.
+
+    Attributes
+    ----------
+    duration : float
+        Seconds until the end of the road's drive.
+    """
+
+    def __init__(self, road: Road, motion: Motion, seed: int) -> None:
+        rng = np.random.default_rng([seed, 2])
+        s = np.arange(-10.0, road.length + 10.0, _STEP)
+        lane = _lane(road, motion, s, rng)
+        times = _schedule(road, motion, s, lane, rng)
+        times -= np.interp(0.0, s, times)
+        self.duration = float(np.interp(road.length, s, times))
+        knots = np.arange(np.ceil(times[0] * _KNOTS), np.floor(times[-1] * _KNOTS)) / _KNOTS
+        # Smoothed over a third of a second: no vehicle changes its acceleration at once.
+        along = gaussian_filter1d(np.interp(knots, times, s), 0.15 * _KNOTS, mode="reflect")
+        values = np.stack([np.interp(along, s, column) for column in lane.T], axis=1)
+        values = gaussian_filter1d(values, 0.1 * _KNOTS, axis=0, mode="nearest")
+        roughness = np.zeros_like(along)
+        for leg, share in road.shares(along):
+            roughness += share * leg.scene.shake
+        shake = _shake(motion, knots, rng) * roughness[:, None]
+        # The mount shakes about its own axes; yaw turns what shakes along and across.
+        yaw = values[:, 5]
+        values[:, 0] += np.cos(yaw) * shake[:, 0] - np.sin(yaw) * shake[:, 1]
+        values[:, 1] += np.sin(yaw) * shake[:, 0] + np.cos(yaw) * shake[:, 1]
+        values[:, 2:] += shake[:, 2:]
+        self._spline = make_interp_spline(knots, values, k=5)
+        self._first, self._second = self._spline.derivative(1), self._spline.derivative(2)
+
+    def poses(self, t: Floats) -> Poses:
+        """Poses ``T_world_sensor`` of shape (n, 4, 4) at `t` seconds since the start."""
+        values = self._spline(t)
+        T = np.zeros((len(t), 4, 4))
+        T[:, :3, :3] = _rotations(values[:, 3:])
+        T[:, :3, 3] = values[:, :3]
+        T[:, 3, 3] = 1.0
+        return T
+
+    def velocities(self, t: Floats) -> tuple[Floats, Floats]:
+        """Velocity in the world (m/s) and angular velocity in the sensor's frame (rad/s)."""
+        angles, rates = self._spline(t)[:, 3:], self._first(t)
+        return rates[:, :3], _angular_velocity(angles, rates[:, 3:])
+
+    def accelerations(self, t: Floats) -> tuple[Floats, Floats]:
+        """Acceleration in the world (m/s^2) and angular acceleration in the sensor's frame."""
+        angles, rates, second = self._spline(t)[:, 3:], self._first(t)[:, 3:], self._second(t)
+        return second[:, :3], _angular_acceleration(angles, rates, second[:, 3:])
+
+
+def _lane(road: Road, motion: Motion, s: Floats, rng: np.random.Generator) -> Floats:
+    """Position and attitude, (n, 6), at each station of a vehicle that rolls over the ground."""
+    stray = gaussian_filter1d(rng.normal(size=len(s)), 8.0 / _STEP, mode="nearest")
+    stray *= motion.weave / max(float(stray.std()), 1e-9)
+    x, y = road.plane(s, stray)
+    length, width = motion.base
+    side = width / 2.0 * np.stack([-np.sin(road.heading(s)), np.cos(road.heading(s))])
+    left, right = road.ground(x + side[0], y + side[1]), road.ground(x - side[0], y - side[1])
+    wheels = max(length / 2.0, 0.3) / _STEP
+    left, right = gaussian_filter1d(left, wheels), gaussian_filter1d(right, wheels)
+    z = (left + right) / 2.0
+    yaw = np.unwrap(np.arctan2(np.gradient(y, s), np.gradient(x, s)))
+    yaw = gaussian_filter1d(yaw, 1.0 / _STEP, mode="nearest")
+    pitch = -np.arctan(np.gradient(z, s))
+    roll = np.arctan2(left - right, width)
+    # The sensor stands on a mast, upright on the vehicle.
+    up = np.stack([np.sin(pitch), -np.sin(roll)]) * motion.height
+    x = x + np.cos(yaw) * up[0] - np.sin(yaw) * up[1]
+    y = y + np.sin(yaw) * up[0] + np.cos(yaw) * up[1]
+    return np.stack([x, y, z + motion.height, roll, pitch, yaw], axis=1)
+
+
+def _schedule(
+    road: Road, motion: Motion, s: Floats, lane: Floats, rng: np.random.Generator
+) -> Floats:
+    """Seconds at each station, within the vehicle's speed, acceleration and turning."""
+    swing = gaussian_filter1d(rng.normal(size=len(s)), 12.0 / _STEP, mode="nearest")
+    swing *= 0.1 / max(float(swing.std()), 1e-9)
+    pace = np.zeros_like(s)
+    for leg, share in road.shares(s):
+        pace += share * leg.scene.pace
+    curvature = np.abs(np.gradient(gaussian_filter1d(lane[:, 5], 1.0 / _STEP), s))
+    bends = np.sqrt(motion.turning / np.maximum(curvature, 1e-6))
+    speed = np.minimum(motion.speed * pace * np.clip(1.0 + swing, 0.7, 1.3), bends)
+    gain = 2.0 * motion.acceleration * _STEP
+    for i in range(1, len(s)):
+        speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + gain))
+    for i in range(len(s) - 2, -1, -1):
+        speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + gain))
+    seconds = _STEP * 2.0 / (speed[1:] + speed[:-1])
+    return np.concatenate([[0.0], np.cumsum(seconds)])
+
+
+def _shake(motion: Motion, t: Floats, rng: np.random.Generator) -> Floats:
+    """Sum sinusoids within the band to the wanted deviation, of shape (n, 6)."""
+    waves = 24
+    deviation = np.array([*motion.shift, *motion.turn])
+    frequency = rng.uniform(*motion.band, (waves, 6))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (waves, 6))
+    # Lower frequencies swing further, as masses on springs do.
+    weight = 1.0 / frequency**2
+    weight *= deviation * np.sqrt(2.0 / np.sum(weight**2, axis=0))
+    shake = np.zeros((len(t), 6))
+    for f, p, w in zip(frequency, phase, weight, strict=True):
+        shake += w * np.sin(2.0 * np.pi * f * t[:, None] + p)
+    return shake
+
+
+def _rotations(angles: Floats) -> Floats:
+    """Rotation matrices of roll, pitch and yaw of shape (n, 3), applied in this order."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(angles).T, np.cos(angles).T
+    R = np.empty((len(angles), 3, 3))
+    R[:, 0, 0], R[:, 0, 1], R[:, 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    R[:, 1, 0], R[:, 1, 1], R[:, 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    R[:, 2, 0], R[:, 2, 1], R[:, 2, 2] = -sp, cp * sr, cp * cr
+    return R
+
+
+def _angular_velocity(angles: Floats, rates: Floats) -> Floats:
+    (sr, sp), (cr, cp) = np.sin(angles[:, :2]).T, np.cos(angles[:, :2]).T
+    d_roll, d_pitch, d_yaw = rates.T
+    x = d_roll - d_yaw * sp
+    y = d_pitch * cr + d_yaw * sr * cp
+    return np.stack([x, y, -d_pitch * sr + d_yaw * cr * cp], axis=1)
+
+
+def _angular_acceleration(angles: Floats, rates: Floats, second: Floats) -> Floats:
+    """Differentiate `_angular_velocity`."""
+    (sr, sp), (cr, cp) = np.sin(angles[:, :2]).T, np.cos(angles[:, :2]).T
+    d_roll, d_pitch, d_yaw = rates.T
+    dd_roll, dd_pitch, dd_yaw = second.T
+    x = dd_roll - dd_yaw * sp - d_yaw * d_pitch * cp
+    y = dd_pitch * cr - d_pitch * d_roll * sr + dd_yaw * sr * cp
+    y = y + d_yaw * d_roll * cr * cp - d_yaw * d_pitch * sr * sp
+    z = -dd_pitch * sr - d_pitch * d_roll * cr + dd_yaw * cr * cp
+    z = z - d_yaw * d_roll * sr * cp - d_yaw * d_pitch * cr * sp
+    return np.stack([x, y, z], axis=1)

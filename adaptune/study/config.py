@@ -1,20 +1,20 @@
 """The configuration of a study: the settings that both stages share."""
 
 import re
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+import types
+import typing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
 
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.isolation import Limits
-from adaptune.sequence.config import SequenceConfig, Transform, ViewConfig
+from adaptune.errors import Key, Mistake, StrictModel, nearest
+from adaptune.odometry.remote import Limits
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
+from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
-from adaptune.strict import StrictModel
-
-if TYPE_CHECKING:
-    from adaptune.study.mistakes import Mistake
 
 
 def _file_name(name: str) -> str:
@@ -49,7 +49,7 @@ class OdometryConfig(StrictModel):
 
 
 def _known_descriptor(name: str) -> str:
-    from adaptune.descriptor import DescriptorError, check_descriptor
+    from adaptune.model.descriptor import DescriptorError, check_descriptor
 
     try:
         check_descriptor(name)
@@ -292,3 +292,178 @@ class StudyConfig(StrictModel):
         sequences may change.
         """
         return {key: resolved[key] for key in ("sub_trajectory", "lost_track")}
+
+
+# The keys of a study's YAML, for the completion of `-o`.
+
+
+def complete(
+    model: type[BaseModel], incomplete: str, more: Mapping[str, Sequence[str]] | None = None
+) -> list[str]:
+    """What ``KEY=VALUE`` can become; `more` has values of keys whose type names none."""
+    key, equals, _ = incomplete.partition("=")
+    keys = {name: (more or {}).get(name, values) for name, values in _keys(model, "")}
+    if equals:
+        return [t for v in keys.get(key, ()) if (t := f"{key}={v}").startswith(incomplete)]
+    return [f"{name}=" for name in keys if name.startswith(incomplete)]
+
+
+def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, Sequence[str]]]:
+    """Every key below a section that has none below it, and its values if they are listed."""
+    for name, field in model.model_fields.items():
+        alternatives = list(_alternatives(field.annotation))
+        sections = [a for a in alternatives if isinstance(a, type) and issubclass(a, BaseModel)]
+        for section in sections:
+            yield from _keys(section, f"{prefix}{name}.")
+        if not sections:
+            yield prefix + name, [value for a in alternatives for value in _values(a)]
+
+
+def _alternatives(annotation: Any) -> Iterator[Any]:
+    """The types of a union, without what is annotated to them."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        yield from _alternatives(typing.get_args(annotation)[0])
+    elif origin in (typing.Union, types.UnionType):
+        for one in typing.get_args(annotation):
+            yield from _alternatives(one)
+    else:
+        yield annotation
+
+
+def _values(annotation: Any) -> list[str]:
+    if annotation is bool:
+        return ["true", "false"]
+    literal = typing.get_origin(annotation) is typing.Literal
+    return [str(value) for value in typing.get_args(annotation)] if literal else []
+
+
+# The sequences that a study names for training and test, and parts of them.
+
+
+ROLES = ("training", "test")
+_WHOLE = (0.0, 1.0)
+
+
+class _Named(NamedTuple):
+    """An entry of `training` or `test`."""
+
+    name: str  # of the sequence that it becomes
+    origin: str  # of the sequence that it is a part of, or the same
+    part: Fractions
+
+    def overlaps(self, other: "_Named") -> bool:
+        shared = min(self.part[1], other.part[1]) - max(self.part[0], other.part[0])
+        return self.origin == other.origin and shared > 0.0
+
+
+def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Mistake]]:
+    """Make every part that `training` and `test` name a sequence or course of its own.
+
+    Parameters
+    ----------
+    data
+        The study's data, changed in place: ``{hall: 0-60%}`` in a list becomes the name
+        ``hall_0-60`` of a new entry.
+
+    Returns
+    -------
+    origins : dict
+        Name of the sequence that each new one is a part of.
+    mistakes : list of Mistake
+        In the lists. Entries that are no names at all are left to the models.
+    """
+    mistakes: list[Mistake] = []
+    origins: dict[str, str] = {}
+    if not all(isinstance(data.get(kind, {}), dict) for kind in ("sequences", "courses")):
+        return origins, mistakes  # the models find it
+    found: dict[str, list[_Named]] = {role: [] for role in ROLES}
+    for role, key, entry in _entries(data):
+        try:
+            named = _read(data, entry, origins)
+            _check(role, named, found)
+        except ValueError as error:
+            mistakes.append(Mistake(key, str(error)))
+            data[role][key[1]] = str(next(iter(entry), "")) if isinstance(entry, dict) else entry
+            continue
+        found[role].append(named)
+        data[role][key[1]] = named.name
+        if named.name != named.origin:
+            origins[named.name] = named.origin
+            _add_part(data, named)
+    return origins, mistakes
+
+
+def role_name(entry: Any) -> str | None:
+    """Name of the sequence that an entry of `training` or `test` becomes; None if it is none."""
+    if isinstance(entry, str):
+        return entry
+    try:
+        ((name, part),) = entry.items()
+        return part_name(str(name), read_part(part))
+    except (AttributeError, ValueError):
+        return None
+
+
+def _entries(data: dict[str, Any]) -> Iterator[tuple[str, Key, Any]]:
+    for role in ROLES:
+        if isinstance(data.get(role), list):
+            data[role] = list(data[role])
+            for i, entry in enumerate(data[role]):
+                if isinstance(entry, str | dict):
+                    yield role, (role, i), entry
+
+
+def _sections(data: dict[str, Any]) -> Iterator[tuple[str, dict[Any, Any]]]:
+    for kind in ("sequences", "courses"):
+        if isinstance(section := data.get(kind), dict):
+            yield kind, section
+
+
+def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
+    """The entry of a list; a ValueError says what is wrong with it."""
+    known = {name: section[name] for _, section in _sections(data) for name in section}
+    if isinstance(entry, dict) and len(entry) != 1:
+        raise ValueError("each part is an entry of its own, as in [hall: 0-60%, town: 0-60%]")
+    name = next(iter(entry)) if isinstance(entry, dict) else entry
+    if name not in known or name in origins:
+        whole = [str(other) for other in known if other not in origins]
+        raise ValueError(f"there is no sequence {name!r}: {nearest(str(name), whole)}")
+    if isinstance(entry, str):
+        return _Named(name, name, _WHOLE)
+    try:
+        part = read_part(entry[name])
+    except ValueError as error:
+        raise ValueError(f"{entry[name]} of {name} is no part: {error}") from error
+    named = _Named(part_name(name, part), name, part)
+    if isinstance(known[name], dict) and known[name].get("part") is not None:
+        raise ValueError(f"{name} is a part already; name it without one")
+    if named.name in known and origins.get(named.name) != name:
+        raise ValueError(f"there is another sequence {named.name}; rename that one")
+    return named
+
+
+def _check(role: str, named: _Named, found: dict[str, list[_Named]]) -> None:
+    """A ValueError says that the same was named before."""
+    name = named.origin
+    split = f"to split it, write training: [{name}: 0-60%], test: [{name}: 60-100%]"
+    if named in found[role]:
+        raise ValueError(f"{named.name!r} is named twice")
+    if role == "training":
+        for other in filter(named.overlaps, found[role]):
+            raise ValueError(f"{named.name} overlaps {other.name}; name parts that share no scan")
+        return
+    for other in found["training"]:
+        if named == other:
+            raise ValueError(f"{name!r} is a training sequence, and proves nothing here; {split}")
+        if named.overlaps(other):
+            raise ValueError(
+                f"{named.name} overlaps {other.name} of training, and proves nothing here; {split}"
+            )
+
+
+def _add_part(data: dict[str, Any], named: _Named) -> None:
+    for kind, section in _sections(data):
+        if isinstance(entry := section.get(named.origin), dict):
+            of = {"of": named.origin} if kind == "courses" else {}
+            data[kind] = section | {named.name: entry | of | {"part": list(named.part)}}

@@ -1,22 +1,509 @@
 """Reading a study: its YAML, the overrides, and all mistakes with their lines."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
-from adaptune import yaml
-from adaptune.errors import AdaptuneError
-from adaptune.plain_words import Key
-from adaptune.sequence import cache
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import check_sequence
-from adaptune.study.config import StudyConfig
-from adaptune.study.learned import Added, LearnedDrives
-from adaptune.study.mistakes import ConfigurationError, Mistake, validated, validated_rest
-from adaptune.study.odometries import check_odometries, check_together
-from adaptune.study.overlaps import overlaps
-from adaptune.study.roles import settle_roles
-from adaptune.study.study import Study
+from adaptune import files
+from adaptune.errors import (
+    AdaptuneError,
+    ConfigurationError,
+    Key,
+    Mistake,
+    NotInstalledError,
+    OdometryError,
+    nearest,
+    validated,
+    validated_rest,
+)
+from adaptune.files import write_text
+from adaptune.odometry.base import Description
+from adaptune.odometry.factory import declare
+from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, where
+from adaptune.recording import cache
+from adaptune.recording.cache import MANY, fingerprint
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import check_sequence, interval_of, sequence_files
+from adaptune.space import (
+    ODOMETRY,
+    Categorical,
+    Float,
+    Integer,
+    ParameterSpace,
+    PooledSpace,
+    describe,
+)
+from adaptune.study.config import OdometryConfig, StudyConfig, role_name, settle_roles
+from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
+
+# Mistakes in the odometries of a study that only the odometries show.
+
+
+_KINDS: dict[str, type[Float | Integer | Categorical]] = {
+    "float": Float,
+    "integer": Integer,
+    "categorical": Categorical,
+}
+
+
+def check_odometries(data: Any, mistakes: list[Mistake], folder: Path) -> None:
+    """Check each odometry by itself; make paths in its settings absolute.
+
+    Parameters
+    ----------
+    data
+        What stands under `odometry`: one, or a list of several.
+    mistakes
+        Receives what is wrong.
+    folder
+        Where relative paths begin.
+    """
+    if isinstance(data, dict):
+        _check_odometry(data, ("odometry",), mistakes, folder)
+    elif isinstance(data, list):
+        for i, one in enumerate(data):
+            given = {"name": one} if isinstance(one, str) else one
+            if isinstance(given, dict):
+                _check_odometry(given, ("odometry", i), mistakes, folder)
+
+
+def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace | None]:
+    """Find what does not fit the other odometries, or the rest of the study.
+
+    Returns
+    -------
+    mistakes : list of Mistake
+    space : ParameterSpace, optional
+        The parameters that are tuned; None if an odometry cannot be described.
+    """
+    given = config.odometry
+    entries: dict[Key, OdometryConfig] = (
+        {("odometry",): given}
+        if isinstance(given, OdometryConfig)
+        else {("odometry", i): one for i, one in enumerate(given)}
+    )
+    try:
+        described = {key: describe_odometry(one) for key, one in entries.items()}
+        spaces = {key: tuned_space(one, described[key]) for key, one in entries.items()}
+    except OdometryError:
+        return [], None
+    mistakes = list(_check_each_once(entries, spaces))
+    if len(entries) > 1:
+        for key, about in described.items():
+            if about.whole:
+                message = f"{entries[key].name} runs whole recordings, and must be the only one"
+                mistakes.append(Mistake((*key, "name"), message))
+    for key, about in described.items():
+        if about.needs_imu:
+            mistakes += _check_imu(config, entries[key].name)
+    labelled = {one.label or one.name: spaces[key] for key, one in entries.items()}
+    space = PooledSpace(labelled) if len(entries) > 1 else next(iter(spaces.values()))
+    if not mistakes:
+        mistakes += _check_switching(config, list(described.values()), space)
+        mistakes += _check_pins(config.online.pin, space)
+    return mistakes, space
+
+
+def _check_each_once(
+    entries: Mapping[Key, OdometryConfig], spaces: Mapping[Key, ParameterSpace]
+) -> Iterable[Mistake]:
+    """Find odometries that would run the same sets twice, and labels that are given twice."""
+    for (first, one), (key, other) in combinations(entries.items(), 2):
+        settings, others = (declare(o.name, o.settings).settings for o in (one, other))
+        alike = one.name == other.name and settings == others
+        if alike and _have_a_common_set(spaces[first], spaces[key]):
+            yield Mistake(
+                key,
+                f"{other.name} is there already (odometry.{first[-1]}) with the same settings, and "
+                f"their parameters overlap, so sets would run twice; leave one out, or give it "
+                f"other settings or ranges",
+            )
+        elif (one.label or one.name) == (other.label or other.name):
+            yield Mistake(
+                (*key, "label"),
+                f"{one.label or one.name!r} is what odometry.{first[-1]} is called; give one of "
+                f"the two a label of its own",
+            )
+
+
+def _have_a_common_set(one: ParameterSpace, other: ParameterSpace) -> bool:
+    """Whether two spaces of the same odometry have a set in common."""
+    return all(
+        _meet(p, other.parameters[name])
+        for name, p in one.parameters.items()
+        if name in other.parameters
+    )
+
+
+def _meet(one: Any, other: Any) -> bool:
+    if isinstance(one, Categorical) and isinstance(other, Categorical):
+        return any(one.contains(choice) for choice in other.choices)
+    if isinstance(one, Categorical) or isinstance(other, Categorical):
+        return True
+    return bool(one.low <= other.high and other.low <= one.high)
+
+
+def _check_odometry(data: dict[str, Any], at: Key, mistakes: list[Mistake], folder: Path) -> None:
+    """Check all that depends on the odometry; make paths in its settings absolute."""
+    name = data.get("name")
+    if not isinstance(name, str):
+        return
+    settings, key = data.get("settings") or {}, (*at, "settings")
+    if not isinstance(settings, dict):
+        return
+    try:
+        # A class of the user is imported in a process of its own.
+        where(name) if is_user_class(name) else odometry_class(name)
+    except OdometryError as error:
+        mistakes.append(Mistake((*at, "name"), str(error)))
+        return
+    try:
+        declared = declare(name, settings, folder)
+        mistakes += (mistake.below(key) for mistake in declared.mistakes)
+        if declared.settings is not None:
+            data["settings"] = declared.settings.model_dump(mode="json", exclude_unset=True)
+        if (described := declared.description) is None:
+            return
+        found: list[Mistake] = []
+        _check_parameters(name, described.space, data.get("parameters"), found)
+        mistakes += (mistake.below(at) for mistake in found)
+        check = getattr(odometry_class(name), "check", None) if name in PROGRAMS else None
+        if check is not None and isinstance(tuned := data.get("parameters"), dict):
+            check(declared.settings, dict.fromkeys(tuned, 0))
+    except NotInstalledError as error:
+        mistakes.append(Mistake((*at, "name"), str(error)))
+    except OdometryError as error:
+        mistakes.append(Mistake((*at, "name") if is_user_class(name) else key, str(error)))
+
+
+def _check_parameters(
+    name: str, space: ParameterSpace | None, tuned: Any, mistakes: list[Mistake]
+) -> None:
+    if space is None and not tuned:
+        message = f"define the parameters: a {name} does not know its own"
+        mistakes.append(Mistake(("parameters",), message))
+    for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
+        key = ("parameters", parameter)
+        if space is not None and parameter not in space.names:
+            mistakes.append(Mistake(key, _why_not_tuned(name, space, parameter)))
+        elif isinstance(given, dict):
+            whole = whole_definition(space, parameter, given)
+            if str(whole.get("type")) not in _KINDS:
+                mistakes.append(Mistake(key, f"give its type, one of {', '.join(_KINDS)}"))
+            else:
+                validated(_KINDS[whole["type"]], whole, key, mistakes)
+
+
+def _why_not_tuned(name: str, space: ParameterSpace, parameter: Any) -> str:
+    own: Any = None if is_user_class(name) or name in PROGRAMS else odometry_class(name)
+    if own is not None and parameter in own.space.names:
+        return f"{parameter} is fixed by settings; leave it out there to tune it"
+    return f"{name} has no parameter {parameter!r}: {nearest(str(parameter), space.names)}"
+
+
+def _check_imu(config: StudyConfig, odometry: str) -> Iterable[Mistake]:
+    needs = f"{odometry} needs an IMU"
+    for name, sequence in config.sequences.items():
+        if sequence.imu is None:
+            help_ = "name its topic and its place, imu: {topic: ..., extrinsic: ...}"
+            yield Mistake(("sequences", name), f"{needs}; {help_}")
+    for name, course in config.courses.items():
+        if course.imu is None:
+            yield Mistake(("courses", name), f"{needs}; simulate one, imu: 200")
+
+
+def _check_set(at: Key, given: Mapping[str, Any], space: ParameterSpace) -> Iterable[Mistake]:
+    """Find what is wrong with the names in a set that the study gives."""
+    own = dict(given)
+    if isinstance(space, PooledSpace):
+        if ODOMETRY not in own:
+            message = f"say which odometry it is for ({ODOMETRY}: {next(iter(space.spaces))})"
+            yield Mistake(at, message)
+            return
+        if (label := own.pop(ODOMETRY)) not in space.spaces:
+            message = f"there is no such odometry; {nearest(str(label), space.spaces)}"
+            yield Mistake((*at, ODOMETRY), message)
+            return
+        space = space.spaces[label]
+    for name in own:
+        if name not in space.names:
+            message = f"there is no such parameter; {nearest(name, space.names)}"
+            yield Mistake((*at, name), message)
+
+
+def _check_pins(pins: Mapping[str, Any], space: ParameterSpace) -> Iterable[Mistake]:
+    """Find parameters that no odometry has, and values that none can have."""
+    spaces = list(space.spaces.values()) if isinstance(space, PooledSpace) else [space]
+    for name, value in pins.items():
+        having = [one.parameters[name] for one in spaces if name in one.parameters]
+        if not having:
+            every = [known for one in spaces for known in one.names]
+            message = f"there is no such parameter; {nearest(name, every)}"
+            yield Mistake(("online", "pin", name), message)
+        elif wrong := [one for one in having if not one.contains(value)]:
+            message = f"{value!r} is outside {describe(wrong[0])}"
+            yield Mistake(("online", "pin", name), message)
+
+
+def _check_switching(
+    config: StudyConfig, described: list[Description], space: ParameterSpace
+) -> Iterable[Mistake]:
+    online, key = config.online, ("online", "switching")
+    for i, given in enumerate(online.switching.sets or ()):
+        if isinstance(given, dict):
+            yield from _check_set((*key, "sets", i), given, space)
+    whole, names = any(one.whole for one in described), ", ".join(config.odometries)
+    # A study's folder holds the defaults, too.
+    if whole and online.rules and online.rules != type(online)().rules:
+        message = f"{names} runs whole recordings and cannot adapt; leave this out"
+        yield Mistake(("online", "rules"), message)
+    live = len(described) == 1 and described[0].live
+    if whole and online.switching.mechanism != "auto":
+        message = f"{names} runs whole recordings and cannot change parameters; leave this out"
+        yield Mistake((*key, "mechanism"), message)
+    elif online.switching.mechanism == "live" and not live:
+        message = f"{names} cannot change parameters between scans; choose auto, hand_over or bank"
+        yield Mistake((*key, "mechanism"), message)
+
+
+# What a study has learned from since its YAML was written: `learned.yaml` in its folder.
+
+
+FILE = "learned.yaml"
+"""Training sequences beside those that the study's YAML names."""
+_LEARNED_KINDS = {"sequences": dict, "training": list}
+_HEADER = (
+    "# Drives that this study has learned from beside those of its YAML. `adaptune learn` writes "
+    "it.\n# Remove a drive from both lists, and run `adaptune offline`, to forget it.\n"
+)
+
+
+@dataclass(frozen=True)
+class LearnedDrives:
+    """The drives that a study has learned from.
+
+    Attributes
+    ----------
+    path : Path
+        The file, which need not exist.
+    text : str, optional
+        Its content; None if there is no file.
+    sequences : dict
+        By name, entries as under `sequences` of a study.
+    training : list
+        Entries as under `training` of a study.
+    """
+
+    path: Path
+    text: str | None
+    sequences: Mapping[str, Any]
+    training: list[Any]
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read the file of a study's folder.
+
+        Raises
+        ------
+        ConfigurationError
+            If it is damaged.
+        """
+        path = folder / FILE
+        try:
+            text = path.read_text(encoding="utf-8")
+            data = files.Document(text).data or {}
+        except (FileNotFoundError, NotADirectoryError):
+            return cls(path, None, {}, [])
+        except (OSError, UnicodeDecodeError, files.YamlError) as error:
+            raise ConfigurationError(f"{path}: cannot be read ({error}); mend it") from error
+        parts = (
+            [data.get(key) or kind() for key, kind in _LEARNED_KINDS.items()]
+            if _sound(data)
+            else []
+        )
+        if not parts:
+            raise ConfigurationError(
+                f"{path}: needs `sequences` by name, a list `training`, and nothing else; mend it"
+            )
+        return cls(path, text, *parts)
+
+    def adding(self, entry: Any, sequences: Mapping[str, Any]) -> Self:
+        """With another entry of `training`, and the sequences that it needs."""
+        return self._of({**self.sequences, **sequences}, [*self.training, entry])
+
+    def without(self, name: str) -> Self:
+        """Without a training sequence."""
+        sequences = {key: value for key, value in self.sequences.items() if key != name}
+        return self._of(sequences, [entry for entry in self.training if role_name(entry) != name])
+
+    def _of(self, sequences: Mapping[str, Any], training: list[Any]) -> Self:
+        if not sequences and not training:
+            return type(self)(self.path, None, {}, [])
+        data = {"sequences": dict(sequences), "training": training}
+        return type(self)(self.path, _HEADER + files.dump(data), sequences, training)
+
+    def write(self) -> None:
+        """Bring the file to this content."""
+        if self.text is None:
+            self.path.unlink(missing_ok=True)
+        else:
+            write_text(self.path, self.text)
+
+    def merge(self, data: dict[str, Any], study: Path) -> "Added":
+        """Add the drives to a study's data, which are changed.
+
+        A drive is no longer among the test sequences: it proves nothing there.
+
+        Parameters
+        ----------
+        data
+            The study's data. What is of a wrong kind is left as it is.
+        study
+            The study's YAML.
+
+        Raises
+        ------
+        ConfigurationError
+            If the YAML has another sequence of the same name.
+        """
+        for kind in ("sequences", "courses"):
+            known = names if isinstance(names := data.get(kind), dict) else {}
+            for name in self.sequences:
+                if name in known:
+                    raise ConfigurationError(
+                        f"{self.path}, line {self.line(('sequences', name))}: sequences.{name}: "
+                        f"{study} names another one, {kind}.{name}; give that one another name, "
+                        f"or remove this one and its entry of `training`"
+                    )
+        if self.sequences and isinstance(data.get("sequences", {}), dict):
+            data["sequences"] = {**data.get("sequences", {}), **self.sequences}
+        training, test = data.get("training"), data.get("test")
+        named = list(map(role_name, training)) if isinstance(training, list) else []
+        new = [i for i, entry in enumerate(self.training) if role_name(entry) not in named]
+        if isinstance(training, list):
+            data["training"] = [*training, *(self.training[i] for i in new)]
+        learned = set(map(role_name, self.training))
+        kept = list(range(len(test))) if isinstance(test, list) else []
+        if isinstance(test, list) and learned:
+            kept = [i for i in kept if role_name(test[i]) not in learned]
+            data["test"] = [test[i] for i in kept]
+        return Added(self, len(named), new, kept)
+
+    def line(self, key: Key) -> int | None:
+        """Line of a key in the file."""
+        return None if self.text is None else files.Document(self.text).line(key)
+
+
+def _sound(data: Any) -> bool:
+    if not isinstance(data, dict) or not set(data) <= set(_LEARNED_KINDS):
+        return False
+    return all(isinstance(data.get(key) or kind(), kind) for key, kind in _LEARNED_KINDS.items())
+
+
+class Added(NamedTuple):
+    """What was added to a study's data, and where it stands.
+
+    Attributes
+    ----------
+    learned : LearnedDrives
+        The drives.
+    first : int
+        Index in `training` of the first that was added.
+    training : list of int
+        Indices of those that were added, in the drives' own list.
+    test : list of int
+        Indices of the test sequences that are left, in the YAML's list.
+    """
+
+    learned: LearnedDrives
+    first: int
+    training: list[int]
+    test: list[int]
+
+    def place(self, key: Key) -> tuple[bool, Key]:
+        """Whether a key of the merged data stands in the drives' file, and its key there."""
+        kind, *rest = key or ("",)
+        if not rest:
+            return False, key
+        at = rest[0]
+        if kind == "sequences" and at in self.learned.sequences:
+            return True, key
+        if kind == "training" and isinstance(at, int) and at >= self.first and self.training:
+            return True, (kind, self.training[at - self.first], *rest[1:])
+        if kind == "test" and isinstance(at, int) and at < len(self.test):
+            return False, (kind, self.test[at], *rest[1:])
+        return False, key
+
+
+# Recordings that a study trains on and tests on under two names.
+
+
+_NOTES = (".txt", ".yaml")
+"""Files beside scans: two recordings may have the same."""
+
+
+def overlaps(config: StudyConfig) -> Iterator[Mistake]:
+    """Find test sequences that hold scans of a training sequence, by the content of their files.
+
+    Files are read only where their sizes agree.
+    """
+    for i, test in enumerate(config.test):
+        for training in config.training:
+            if test != training and _overlap(config, test, training):
+                message = (
+                    f"{test!r} is the recording of the training sequence {training!r}, and proves "
+                    f"nothing here; leave one of them out, or give both a `start` or a `stop` so "
+                    f"that they share no scan"
+                )
+                yield Mistake(("test", i), message)
+
+
+def _overlap(config: StudyConfig, one: str, other: str) -> bool:
+    if one in config.courses and other in config.courses:
+        return config.courses[one] == config.courses[other]
+    a, b = config.sequences.get(one), config.sequences.get(other)
+    return a is not None and b is not None and share_scans(a, b)
+
+
+def share_scans(a: SequenceConfig, b: SequenceConfig) -> bool:
+    """Whether two sequences hold the same scans, by the content of their files.
+
+    Raises
+    ------
+    SequenceError
+        If one of them cannot be opened.
+    """
+    return _same_files(a, b) and _same_time(a, b)
+
+
+def _same_files(a: SequenceConfig, b: SequenceConfig) -> bool:
+    if a.evalio is not None and a.evalio == b.evalio:
+        return True
+    mine, others = _scan_files(a), _scan_files(b)
+    if set(mine) & set(others):
+        return True
+    if len(mine) >= MANY:
+        mine = [mine[0], mine[len(mine) // 2], mine[-1]]
+    for file in mine:
+        size = file.stat().st_size
+        alike = [path for path in others if path.stat().st_size == size]
+        if alike and fingerprint(file) in map(fingerprint, alike):
+            return True
+    return False
+
+
+def _scan_files(config: SequenceConfig) -> Sequence[Path]:
+    files = sequence_files(config).recording
+    return [file.resolve() for file in files if file.suffix not in _NOTES]
+
+
+def _same_time(a: SequenceConfig, b: SequenceConfig) -> bool:
+    """Whether sections overlap, by the stamps of their recordings."""
+    (begin, end), (other_begin, other_end) = interval_of(a), interval_of(b)
+    return begin < other_end and other_begin < end
+
 
 _MOST_BYTES = 10**6
 
@@ -69,7 +556,7 @@ class _Sources(NamedTuple):
     """The files of a study's data."""
 
     path: Path
-    document: yaml.Document
+    document: files.Document
     added: Added
 
     def find(self, key: Key) -> tuple[bool, int, Key]:
@@ -87,14 +574,14 @@ def _lines(
         yield _say(mistake, sources, overridden)
 
 
-def _read(path: Path) -> yaml.Document:
+def _read(path: Path) -> files.Document:
     try:
         if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
             raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
-        document = yaml.Document.of_file(path)
+        document = files.Document.of_file(path)
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read as text ({error})") from error
-    except yaml.YamlError as error:
+    except files.YamlError as error:
         raise ConfigurationError(str(error)) from error
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
@@ -114,8 +601,8 @@ def _override(data: dict[str, Any], text: str) -> Key:
         if not isinstance(data, dict):
             raise ConfigurationError(f"-o {text}: {part} has no keys below it")
     try:
-        data[last] = yaml.scalar(value)
-    except yaml.YamlError as error:
+        data[last] = files.scalar(value)
+    except files.YamlError as error:
         raise ConfigurationError(f"-o {text}: {error}") from error
     return path
 

@@ -5,19 +5,16 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adaptune import yaml
-from adaptune.errors import AdaptuneError
+from adaptune import files
+from adaptune.errors import AdaptuneError, Mistake, nearest, validated
 from adaptune.files import expand_user
-from adaptune.inspect import inspect
-from adaptune.sequence.config import ESTIMATED, REFERENCE_FILES, SequenceConfig
-from adaptune.sequence.fingerprint import fingerprints
-from adaptune.sequence.opening import sequence_files
-from adaptune.space import nearest
+from adaptune.recording.cache import fingerprints
+from adaptune.recording.config import ESTIMATED, REFERENCE_FILES, SequenceConfig
+from adaptune.recording.inspect import inspect
+from adaptune.recording.opening import sequence_files
+from adaptune.study.config import role_name
 from adaptune.study.inputs import trained_recording
-from adaptune.study.learned import LearnedDrives
-from adaptune.study.mistakes import Mistake, validated
-from adaptune.study.overlaps import share_scans
-from adaptune.study.roles import role_name
+from adaptune.study.loading import LearnedDrives, share_scans
 from adaptune.study.study import Study
 
 _KINDS = ("bag", "kitti", "folder")
@@ -162,7 +159,7 @@ def _free_name(study: Study, name: str, config: SequenceConfig) -> str:
 def _described(study: Study, path: Path, reference: str | None) -> tuple[str, dict[str, Any]]:
     """Name and entry of a recording for a study."""
     found = inspect(path)
-    named = (yaml.Document(found.entry).data or {}).get("sequences")
+    named = (files.Document(found.entry).data or {}).get("sequences")
     if not named:
         raise DriveError(f"{path}: holds poses and no scans; name a bag, or a folder of scans")
     ((name, proposed),) = named.items()

@@ -9,19 +9,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from adaptune.cores import pin
-from adaptune.reference import estimate
-from adaptune.reference.estimated import EstimatedReference, EstimateError
-from adaptune.reference.prior import warn_of_unused
-from adaptune.reference.stored import Refusal, StoredEstimate, write_estimate
-from adaptune.sequence.fingerprint import fingerprints
-from adaptune.sequence.names import origin
-from adaptune.sequence.opening import (
+from adaptune.processes import pin
+from adaptune.recording.cache import fingerprints
+from adaptune.recording.opening import (
     of_prior,
     open_unseen,
     position_prior,
     prior_files,
     wants_estimate,
+)
+from adaptune.recording.scan import origin
+from adaptune.reference import estimate
+from adaptune.reference.graph import warn_of_unused
+from adaptune.reference.stored import (
+    EstimatedReference,
+    EstimateError,
+    Refusal,
+    StoredEstimate,
+    write_estimate,
 )
 from adaptune.study.study import Study
 

@@ -6,24 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adaptune.odometry.program_input import ProgramInput, program_input
-from adaptune.reference.estimated import BREAK, EstimateError
-from adaptune.reference.stored import StoredEstimate
-from adaptune.sequence.config import REFERENCE_FILES, SequenceConfig, ViewConfig
-from adaptune.sequence.export import Layout
-from adaptune.sequence.fingerprint import fingerprints
-from adaptune.sequence.names import OF_VIEW, origin
-from adaptune.sequence.opening import (
-    SequenceFiles,
-    open_sequence,
-    sequence_files,
-    wants_estimate,
-)
-from adaptune.sequence.part import part_name
-from adaptune.sequence.sequence import Sequence
-from adaptune.sequence.views import WithImu
+from adaptune.errors import ConfigurationError
+from adaptune.odometry.program import ProgramInput, program_input
+from adaptune.recording.cache import fingerprints
+from adaptune.recording.config import REFERENCE_FILES, SequenceConfig, ViewConfig
+from adaptune.recording.export import Layout
+from adaptune.recording.opening import SequenceFiles, open_sequence, sequence_files, wants_estimate
+from adaptune.recording.scan import OF_VIEW, Recording, origin, part_name
+from adaptune.recording.views import WithImu
+from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
-from adaptune.study.mistakes import ConfigurationError
 
 _PATHS = ("bag", "kitti", "folder", "evalio")
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
@@ -71,7 +63,7 @@ class StudySequences:
         """Configuration of a sequence, or a course, without an estimate that was made of it."""
         if name in self.recordings:
             return self.recordings[name]
-        from adaptune.simulation.rig import as_sequence
+        from adaptune.simulation.course import as_sequence
 
         return as_sequence(self.courses[name], self.recording(name))
 
@@ -129,7 +121,7 @@ class StudySequences:
         config = self.config(origin(name))
         return str(next(path for key in _PATHS if (path := getattr(config, key)) is not None))
 
-    def open(self, name: str) -> Sequence:
+    def open(self, name: str) -> Recording:
         """Open a sequence, a recorded course, or a view.
 
         Raises

@@ -2,23 +2,26 @@
 
 from typing import TYPE_CHECKING
 
-from adaptune.pooled_space import PooledSpace
-from adaptune.space import ParameterSpace
+from adaptune.space import ParameterSpace, PooledSpace
 from offline.samplers.settings import is_user_sampler
 
 if TYPE_CHECKING:
     from offline.config import OfflineConfig
-    from offline.samplers.base import Sampler
+    from offline.samplers.samplers import Sampler
 
 
 def make_sampler(space: ParameterSpace, config: "OfflineConfig") -> "Sampler":
     """Make the sampler that a configuration names."""
-    from offline.samplers.asked import AskedSampler
-    from offline.samplers.hosted import HostedSampler
-    from offline.samplers.points import GridSampler, RandomSampler, SobolSampler
+    from offline.samplers.samplers import (
+        AskedSampler,
+        GridSampler,
+        HostedSampler,
+        RandomSampler,
+        SobolSampler,
+    )
 
     if isinstance(space, PooledSpace):
-        from offline.samplers.pooled import PooledSampler
+        from offline.samplers.samplers import PooledSampler
 
         return PooledSampler(space, config, make_sampler)
     own: dict[str, type[Sampler]] = {

@@ -24,7 +24,7 @@ from optuna.search_space import IntersectionSearchSpace
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from adaptune.space import nearest
+from adaptune.errors import nearest
 from offline.samplers.settings import AnnealingSettings, Step
 
 SIGMA = 0.05

@@ -1,17 +1,26 @@
 """The samplers by name, and the settings of each."""
 
 import inspect
+import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
 from pydantic import BaseModel, Field
 
-from adaptune import hosting, plugins
-from adaptune.errors import AdaptuneError
-from adaptune.space import Value, nearest
-from adaptune.strict import StrictModel
+from adaptune import plugins, processes
+from adaptune.errors import AdaptuneError, Mistake, StrictModel, nearest
+from adaptune.space import (
+    Categorical,
+    Float,
+    Integer,
+    ParameterSet,
+    ParameterSpace,
+    Value,
+    describe,
+)
 
 OPTUNA = {
     "cmaes": "optuna.samplers:CmaEsSampler",
@@ -28,7 +37,7 @@ FORGETFUL = ("tpe", "gp")
 """Samplers that keep no notes: they continue from any list of trials."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
-SERVICE = hosting.Service("offline.samplers.hosted")
+SERVICE = processes.Service("offline.samplers.samplers")
 """What a server does with a sampler of the user."""
 
 
@@ -157,3 +166,329 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "sobol": type("SobolSettings", (StrictModel,), {"__doc__": "`sobol` has no settings."}),
 }
 """Settings of adaptune's own samplers."""
+
+
+# Grids of parameter sets, whose points are computed when they are asked for.
+
+
+LARGEST = 10_000
+"""Points of the largest grid that a search without a budget may try."""
+
+
+@dataclass(frozen=True)
+class GridAxis:
+    """The values of one parameter that a grid tries."""
+
+    parameter: Float | Integer | Categorical
+    count: int  # number of values
+    first: float = 0.0  # the first number, in log scale if `log`
+    step: float = 0.0  # from one number to the next
+    log: bool = False
+    choices: tuple[Value, ...] = ()  # the values of a category
+
+    def __getitem__(self, i: int) -> Value:
+        if self.choices:
+            return self.choices[i]
+        value = self.first + i * self.step
+        value = math.exp(value) if self.log else value
+        if isinstance(self.parameter, Integer):
+            return round(value)
+        assert isinstance(self.parameter, Float)
+        for bound in (self.parameter.low, self.parameter.high):
+            if math.isclose(value, bound, abs_tol=1e-12):
+                return bound  # rounding may miss it
+        return value
+
+    def index(self, value: Value) -> int | None:
+        """Index of a value, up to rounding; None if it is not on the axis."""
+        if self.choices:
+            alike = (i for i, c in enumerate(self.choices) if type(c) is type(value) and c == value)
+            return next(alike, None)
+        x = float(value)
+        steps = ((math.log(x) if self.log else x) - self.first) / (self.step or 1.0)
+        i = min(max(round(steps), 0), self.count - 1)
+        return i if math.isclose(float(self[i]), x, rel_tol=1e-9, abs_tol=1e-12) else None
+
+
+class Grid:
+    """All combinations of the axes' values, in row-major order: the last axis changes fastest.
+
+    Attributes
+    ----------
+    size : int
+        Number of points.
+    """
+
+    def __init__(self, axes: Mapping[str, GridAxis]):
+        self.axes = dict(axes)
+        self.size = math.prod(axis.count for axis in self.axes.values())
+
+    def __getitem__(self, index: int) -> ParameterSet:
+        values: ParameterSet = {}
+        for name, axis in reversed(self.axes.items()):
+            index, i = divmod(index, axis.count)
+            values[name] = axis[i]
+        return {name: values[name] for name in self.axes}
+
+    def index(self, parameters: ParameterSet) -> int | None:
+        """Index of a point; None if it is not on the grid."""
+        index = 0
+        for name, axis in self.axes.items():
+            i = axis.index(parameters[name])
+            if i is None:
+                return None
+            index = index * axis.count + i
+        return index
+
+    @classmethod
+    def of(cls, space: ParameterSpace) -> "Grid | None":
+        """All sets of a space; None if there are infinitely many."""
+        axes = {}
+        for name, p in space.parameters.items():
+            if isinstance(p, Float):
+                return None
+            axes[name] = (
+                GridAxis(p, len(p.choices), choices=p.choices)
+                if isinstance(p, Categorical)
+                else GridAxis(p, int(p.high - p.low) + 1, p.low, 1.0)
+            )
+        return cls(axes)
+
+
+def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]]) -> Grid:
+    """Make a grid from its settings, which have no mistakes."""
+    return Grid({name: _axis(p, grid.get(name)) for name, p in space.parameters.items()})
+
+
+def _axis(
+    parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None
+) -> GridAxis:
+    if isinstance(parameter, Categorical):
+        return _choices(parameter, parameter.choices if given is None else given)
+    if given is None:
+        raise ValueError("is missing; give [first, step, count] or {low, high, count}")
+    axis = _span(parameter, given) if isinstance(given, Span) else _steps(parameter, given)
+    for end in (axis[0], axis[axis.count - 1]):
+        if not parameter.contains(end):
+            raise ValueError(f"{end:g} is outside {describe(parameter)}")
+    return axis
+
+
+def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> GridAxis:
+    if isinstance(given, Span) or not given:
+        raise ValueError("give a list of its choices")
+    for choice in given:
+        if not parameter.contains(choice):
+            raise ValueError(f"{choice!r} is not one of {describe(parameter)}")
+    if len(set(map(repr, given))) < len(given):
+        raise ValueError("choices repeat themselves")
+    return GridAxis(parameter, len(given), choices=tuple(given))
+
+
+def _span(parameter: Float | Integer, given: Span) -> GridAxis:
+    low, high, count = given.low, given.high, given.count
+    if low > high or (count > 1 and low == high):
+        raise ValueError(f"low ({low:g}) must be less than high ({high:g})")
+    if isinstance(parameter, Integer) and count > high - low + 1:
+        raise ValueError(f"there are no {count} whole numbers from {low:g} to {high:g}")
+    if parameter.log:
+        if low <= 0:
+            raise ValueError(f"a log scale needs low ({low:g}) above 0")
+        low, high = math.log(low), math.log(high)
+    return GridAxis(parameter, count, low, (high - low) / max(count - 1, 1), parameter.log)
+
+
+def _steps(parameter: Float | Integer, given: Sequence[Value]) -> GridAxis:
+    if len(given) != 3 or any(isinstance(v, bool | str) for v in given):
+        raise ValueError("give [first, step, count], three numbers, or {low, high, count}")
+    first, step, count = map(float, given)
+    if not (count >= 1 and count.is_integer()):
+        raise ValueError("count, the last number, must be a whole one of at least 1")
+    if step == 0 and count > 1:
+        raise ValueError("a step of 0 gives the same value again and again")
+    if isinstance(parameter, Integer) and not (first.is_integer() and step.is_integer()):
+        raise ValueError("first and step must be whole numbers, as the parameter is")
+    return GridAxis(parameter, int(count), first, step)
+
+
+def check_grid(
+    axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
+) -> Iterable[Mistake]:
+    """Find mistakes in a grid.
+
+    Yields
+    ------
+    Mistake
+        Its key begins below the sampler's settings.
+    """
+    for name in axes:
+        if name not in space.names:
+            help_ = nearest(name, space.names)
+            yield Mistake(("grid", name), f"no parameter {name!r} is tuned: {help_}")
+            return
+    made = {}
+    for name, parameter in space.parameters.items():
+        try:
+            made[name] = _axis(parameter, axes.get(name))
+        except ValueError as error:
+            yield Mistake(("grid", name), str(error))
+    if len(made) < len(space):
+        return
+    grid = Grid(made)
+    if not bounded and grid.size > LARGEST:
+        yield Mistake(
+            ("grid",),
+            f"has {grid.size:,} points, and the study sets no budget; give offline.trials, hours, "
+            f"stagnation or target, or a coarser grid (up to {LARGEST:,} points)",
+        )
+    elif grid.size >= 2**62:
+        yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")
+
+
+# Mistakes in a sampler's settings that only the sampler and the parameters show.
+
+
+_ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
+"""Settings of Optuna's samplers that adaptune sets, and from which key."""
+_BOX = ("low", "high")
+_MOST = 100_000
+"""Candidates, or members of a population: more of them take hours, or all memory."""
+
+
+def check_class(name: str) -> None:
+    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere.
+
+    Raises
+    ------
+    SamplerError
+    """
+    if not is_user_sampler(name):
+        optuna_class(name)
+        return
+    try:
+        processes.server(SERVICE, name)
+    except processes.HostError as error:
+        raise SamplerError(str(error)) from error
+
+
+def check_sampler(
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
+) -> Iterable[Mistake]:
+    """Find mistakes in a sampler's settings, where `space` is None without the parameters.
+
+    Yields
+    ------
+    Mistake
+        Its key begins below the settings.
+    """
+    if name == "tpe" and not settings:
+        return  # a look at Optuna would take long
+    if name not in SETTINGS:
+        yield from _check_optuna(name, settings, space)
+    elif space is None:
+        return
+    elif name == "annealing":
+        given = AnnealingSettings.model_validate(settings)
+        for parameter, value in (given.start or {}).items():
+            yield from _check_start(parameter, value, given.steps.get(parameter, Step()), space)
+        for parameter, step in given.steps.items():
+            yield from _check_step(parameter, step, space)
+    elif name in ("grid", "random"):
+        axes = RandomSettings.model_validate(settings).grid
+        if axes is not None:
+            yield from check_grid(axes, space, bounded=budgeted or name == "random")
+
+
+def _check_optuna(
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
+) -> Iterable[Mistake]:
+    if taken := next((key for key in _ELSEWHERE if key in settings), None):
+        yield Mistake((taken,), f"is set by offline.{_ELSEWHERE[taken]}")
+        return
+    for key, value in settings.items():
+        if isinstance(value, int) and abs(value) > _MOST:
+            yield Mistake((key,), f"give a number of at most {_MOST:,}, not {value}")
+            return
+    try:
+        make = _make_elsewhere if is_user_sampler(name) else optuna_sampler
+        make(name, settings, 0)
+    except SamplerError as error:
+        key, _, rest = str(error).partition(": ")
+        yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
+    parameters = () if space is None else space.parameters.values()
+    if name == "cmaes" and parameters and all(isinstance(p, Categorical) for p in parameters):
+        yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
+
+
+def _check_step(name: str, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
+    key = ("steps", name)
+    parameter = space.parameters.get(name)
+    if parameter is None:
+        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
+        return
+    allowed = _allowed(parameter)
+    given = step.model_dump(exclude_none=True)
+    for setting in given:
+        if setting not in allowed:
+            kind = "log " * getattr(parameter, "log", False) + parameter.type
+            message = f"steps of a {kind} are set by {_listed(allowed)}"
+            yield Mistake((*key, setting), message)
+    if not isinstance(parameter, Categorical):
+        low, high = box = _box(parameter, step)
+        if not (low < high and all(map(parameter.contains, box))):
+            message = f"the walk's low and high must lie in {describe(parameter)}, low below high"
+            yield Mistake(key, message)
+    still = {k: v for k, v in given.items() if k in allowed and k not in _BOX}
+    if still and not any(still.values()) and (allowed[0] != "mu" or "sigma" in still):
+        named = " and ".join(f"{k} {v:g}" for k, v in still.items())
+        yield Mistake(key, f"never moves with {named}")
+
+
+def _check_start(name: str, value: float, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
+    key = ("start", name)
+    parameter = space.parameters.get(name)
+    if parameter is None:
+        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
+    elif isinstance(parameter, Categorical):
+        yield Mistake(key, "is a category, which starts at the baseline; leave it out")
+    else:
+        low, high = _box(parameter, step)
+        if not (parameter.contains(value) and low <= value <= high):
+            what = "a whole number" if isinstance(parameter, Integer) else "a number"
+            yield Mistake(key, f"give {what} from {low:g} to {high:g}, not {value!r}")
+
+
+def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
+    """Bounds of the walk."""
+    low, high = step.low, step.high
+    return parameter.low if low is None else low, parameter.high if high is None else high
+
+
+def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
+    if isinstance(parameter, Categorical):
+        return ("change",)
+    linear = isinstance(parameter, Integer) and not parameter.log
+    return (*(("delta_max",) if linear else ("mu", "sigma")), *_BOX)
+
+
+def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
+    """Try whether a sampler of the user takes its settings.
+
+    Raises
+    ------
+    SamplerError
+    """
+    seconds = processes.IMPORT_SECONDS
+    bounds = processes.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
+    process = processes.Hosted(SERVICE, name, "make", bounds)
+    try:
+        process.ask({"settings": dict(settings), "seed": seed})
+    except processes.HostError as error:
+        raise SamplerError(str(error)) from error
+    finally:
+        process.close()
+
+
+def _listed(words: tuple[str, ...]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from adaptune import cores
+from adaptune import processes
 from adaptune.errors import AdaptuneError
 
 
@@ -24,63 +24,63 @@ def allowed(monkeypatch):
 
 
 def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
-    unpin = cores.pin(6)
+    unpin = processes.pin(6)
     assert allowed == {5}
-    assert cores.available() == 1
+    assert processes.available() == 1
     unpin()
     assert allowed == {2, 3, 5, 7}
 
 
 def test_others_get_one_core_after_the_other(allowed):
-    some = [cores.next_core() for _ in range(8)]
+    some = [processes.next_core() for _ in range(8)]
     assert some[:4] == some[4:]
     assert set(some) == allowed
 
 
 def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
-    unpin = cores.pin(1, alone=True)
-    assert {cores.next_core() for _ in range(4)} == {2, 3, 5, 7}
+    unpin = processes.pin(1, alone=True)
+    assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
     unpin()
-    unpin = cores.pin(1)
-    assert {cores.next_core() for _ in range(4)} == allowed == {3}
+    unpin = processes.pin(1)
+    assert {processes.next_core() for _ in range(4)} == allowed == {3}
     unpin()
 
 
 def test_those_that_work_for_this_process_get_other_cores(allowed):
-    assert [cores.other_core(i) for i in range(4)] == [3, 5, 7, 3]
-    unpin = cores.pin(1, alone=True)
-    assert cores.together() == 4
-    assert [cores.other_core(i) for i in range(4)] == [2, 5, 7, 2]
+    assert [processes.other_core(i) for i in range(4)] == [3, 5, 7, 3]
+    unpin = processes.pin(1, alone=True)
+    assert processes.together() == 4
+    assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
     unpin()
     allowed.clear()
     allowed.add(7)
-    assert [cores.other_core(i) for i in range(2)] == [7, 7]
-    assert cores.together() == 1
+    assert [processes.other_core(i) for i in range(2)] == [7, 7]
+    assert processes.together() == 1
 
 
 def test_mapped_files_are_no_memory_of_the_process(tmp_path):
     path = tmp_path / "mapped"
     np.zeros(50_000_000, np.uint8).tofile(path)
     mapped = np.memmap(path, np.uint8, "r")
-    before = cores.resident_megabytes()
+    before = processes.resident_megabytes()
     assert mapped.sum() == 0  # now all of it is there
-    assert cores.resident_megabytes() < before + 20.0
+    assert processes.resident_megabytes() < before + 20.0
     held = np.ones(50_000_000, np.uint8)
-    assert cores.resident_megabytes() > before + 40.0
+    assert processes.resident_megabytes() > before + 40.0
     del held
-    cores.release_memory()
-    assert cores.resident_megabytes() < before + 20.0
+    processes.release_memory()
+    assert processes.resident_megabytes() < before + 20.0
 
 
 def test_processes_compute_and_say_what_went_wrong():
-    with cores.processes(2) as pool:
+    with processes.processes(2) as pool:
         assert list(pool.map(divmod, (7, 9), (2, 4))) == [(3, 1), (2, 1)]
         with pytest.raises(ZeroDivisionError):
             list(pool.map(divmod, (7, 9), (0, 4)))
 
 
 def test_a_process_that_is_killed_is_told():
-    with pytest.raises(AdaptuneError, match="was the memory full"), cores.processes(1) as pool:
+    with pytest.raises(AdaptuneError, match="was the memory full"), processes.processes(1) as pool:
         pool.submit(os._exit, 1).result()
 
 

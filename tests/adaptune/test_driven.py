@@ -1,6 +1,6 @@
 import pytest
 
-from adaptune.study.driven import expected_in_words
+from adaptune.study.study import expected_in_words
 
 EXPECTED = {
     "loss": -0.2,

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from wicked import IMPORTS, gone
 
-from adaptune import hosting
+from adaptune import processes as hosting
+from adaptune.commands.tools import show
+from adaptune.errors import ConfigurationError
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.remote import Limits
 from adaptune.selector import Selector
 from adaptune.space import Float, ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
-from adaptune.tools import show
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
-from online.run_replays import run_replays
+from online.run import run_replays
 
 NAMED = {
     "odometry": ["odometry.name=wicked_one:It", "odometry.parameters=", "odometry.settings="],
@@ -187,8 +187,8 @@ import sys, time
 import numpy as np
 from adaptune import hosting
 from adaptune.odometry.base import BaseSettings
-from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.sequence import Scan
+from adaptune.odometry.remote import Isolated, Limits
+from adaptune.recording import Scan
 program = hosting.Program(["sh", "-c", {leaves!r} + "wait"], 4.0)
 odometry = Isolated("with_children:Mine", {{}}, BaseSettings(), Limits())
 odometry.start(Scan(0, np.zeros((5, 3), np.float32)), np.eye(4))
@@ -235,7 +235,7 @@ def test_an_odometry_that_kills_its_group_costs_one_fault(mine, tmp_path):
     odometry = OdometryFactory("with_children:Mine", {}, space, Limits())()
 
     def scan(stamp):
-        from adaptune.sequence import Scan
+        from adaptune.recording import Scan
 
         return Scan(stamp, np.zeros((5, 3), np.float32))
 

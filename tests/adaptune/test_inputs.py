@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Archive, Frames, Trial
+from adaptune.errors import ConfigurationError
 from adaptune.study.inputs import InputNotes, check_inputs, resume, warn_of_stale
-from adaptune.study.mistakes import ConfigurationError
 from adaptune.trajectory import write_tum
-from offline.offline_study import load_study
+from offline.config import load_study
 
 CLASS = """
-from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.keyframe import KeyframeGicp
 
 
 class Mine(KeyframeGicp):

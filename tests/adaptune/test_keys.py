@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from adaptune.study.keys import complete
-from adaptune.study.mistakes import Mistake, validated
+from adaptune.errors import Mistake, validated
+from adaptune.study.config import complete
 from offline.config import OfflineStudyConfig
 
 HEAVY = ("scipy", "numba", "open3d", "optuna", "matplotlib", "rosbags", "sklearn", "small_gicp")

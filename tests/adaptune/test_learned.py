@@ -2,9 +2,9 @@
 
 import pytest
 
-from adaptune.study.learned import LearnedDrives
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.errors import ConfigurationError
+from adaptune.study.loading import LearnedDrives
+from offline.config import load_study
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import re
 import fuzz
 import pytest
 
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.errors import ConfigurationError
+from offline.config import load_study
 
 FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tuple|dict|None")
 """Words of pydantic's and of Python's."""

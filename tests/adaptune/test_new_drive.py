@@ -12,7 +12,7 @@ import small_bag
 from adaptune.errors import AdaptuneError
 from adaptune.study.new_drive import find_drive
 from adaptune.study.references import ensure_references
-from offline.offline_study import load_study
+from offline.config import load_study
 
 
 @pytest.fixture(scope="module")

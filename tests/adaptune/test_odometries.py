@@ -6,11 +6,11 @@ import pytest
 from drives import STUDY
 from needs import needs_evalio
 
-from adaptune.odometry.gicp import KeyframeGicp, KeyframeVgicp
-from adaptune.odometry.pool import OdometryPool
-from adaptune.pooled_space import ODOMETRY
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.errors import ConfigurationError
+from adaptune.odometry.factory import OdometryPool
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
+from adaptune.space import ODOMETRY
+from offline.config import load_study
 
 TWO = """
   - gicp
@@ -120,13 +120,13 @@ def test_none_of_several_is_changed_live(study_of):
 
 def test_what_is_not_installed_is_named_first(study_of, monkeypatch):
     needs_evalio()
-    from adaptune.odometry.base import NotInstalledError
-    from adaptune.odometry.evalio import base
+    from adaptune.errors import NotInstalledError
+    from adaptune.odometry import evalio
 
     def missing():
         raise NotInstalledError("evalio cannot be imported (no); run `pip install`")
 
-    monkeypatch.setattr(base, "evalio_modules", missing)
+    monkeypatch.setattr(evalio, "evalio_modules", missing)
     text = refused(study_of, "\n  - gicp\n  - mad_icp")
     assert "line 3: odometry.1.name: evalio cannot be imported" in text
 

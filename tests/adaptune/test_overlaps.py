@@ -5,8 +5,8 @@ import shutil
 import drives
 import pytest
 
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.errors import ConfigurationError
+from offline.config import load_study
 
 
 @pytest.fixture

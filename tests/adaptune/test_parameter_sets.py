@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from tables import table
 
-from adaptune.parameter_sets import ParameterSets
+from adaptune.space import ParameterSets
 
 
 def test_sets_are_known_by_their_trials():

@@ -3,9 +3,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.parameter_sets import ParameterSets
-from adaptune.pooled_space import ODOMETRY, PooledSpace, load_space
-from adaptune.space import Categorical, Float, Integer, ParameterSpace, SpaceError
+from adaptune.space import (
+    ODOMETRY,
+    Categorical,
+    Float,
+    Integer,
+    ParameterSets,
+    ParameterSpace,
+    PooledSpace,
+    SpaceError,
+    load_space,
+)
 
 GICP = ParameterSpace.of(
     distance=Float(low=0.1, high=10.0, baseline=1.0, log=True),

@@ -7,17 +7,13 @@ import estimates
 import numpy as np
 import pytest
 
-from adaptune.reference.estimated import EstimateError
-from adaptune.sequence.config import ImuConfig, SequenceConfig
-from adaptune.sequence.opening import open_sequence, wants_estimate
-from adaptune.study.mistakes import ConfigurationError
-from adaptune.study.references import (
-    ensure_references,
-    estimates_as_data,
-    estimates_in_words,
-)
+from adaptune.errors import ConfigurationError
+from adaptune.recording.config import ImuConfig, SequenceConfig
+from adaptune.recording.opening import open_sequence, wants_estimate
+from adaptune.reference.stored import EstimateError
+from adaptune.study.references import ensure_references, estimates_as_data, estimates_in_words
 from adaptune.trajectory import Trajectory, write_tum
-from offline.offline_study import load_study
+from offline.config import load_study
 
 LEFT_OUT = "sequences.one.reference="
 EXTRINSIC = "sequences.one.extrinsic=[0, 2, 0, 0, 0, 0, 1]"

@@ -1,8 +1,8 @@
 import pytest
 import yaml
 
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.errors import ConfigurationError
+from offline.config import load_study
 
 COURSES = "courses.cave={scenes: [cave], length: 10, seed: 1}"
 

@@ -7,20 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.descriptor.motion import speed_and_turn_rate
-from adaptune.descriptor.ndt_histogram import describe
-from adaptune.live.live_evidence import LiveEvidence, OwnError
-from adaptune.live.squares import LiveSquares
+from adaptune.live.evidence import LiveEvidence, OwnError
+from adaptune.live.hops import LiveSquares
 from adaptune.model import BankRule, BankSettings, ErrorModel, PairedSettings
-from adaptune.model.bank_weights import measured_weights
+from adaptune.model.descriptor import describe, speed_and_turn_rate
+from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
-from adaptune.parameter_sets import ParameterSets
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.selector import REMEMBERED, WORSE, Selector
-from adaptune.sequence.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
-from adaptune.space import Float, ParameterSpace
+from adaptune.simulation.record import simulate
+from adaptune.space import Float, ParameterSets, ParameterSpace
 
 SPACE = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
 SETS = ParameterSets(SPACE, (3, 5), ({"speed": 1.0}, {"speed": 8.0}))

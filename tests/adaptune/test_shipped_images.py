@@ -5,21 +5,20 @@ from typing import Any
 
 import pytest
 
-from adaptune import yaml
+from adaptune import files
+from adaptune.errors import ConfigurationError
 from adaptune.odometry.docker import rustle
 from adaptune.odometry.template import Template
 from adaptune.space import ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
-from offline.samplers.asked import AskedSampler
+from offline.config import OfflineConfig, load_study
+from offline.samplers.samplers import AskedSampler
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 IMAGES = ("faster_lio_botanic_garden", "fast_livo2_botanic_garden", "lego_loam_kitti")
 
 
 def read(name: str) -> Any:
-    return yaml.Document((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")).data
+    return files.Document((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")).data
 
 
 @pytest.fixture
@@ -57,8 +56,8 @@ def test_templates_hold_the_baseline(name: str) -> None:
     odometry = read(name)["odometry"]
     template = CONFIGS / odometry["settings"]["template"]
     baseline = {key: p["baseline"] for key, p in odometry["parameters"].items()}
-    unchanged = yaml.Document(Template(template).fill({})).data
-    assert yaml.Document(Template(template).fill(baseline)).data == unchanged
+    unchanged = files.Document(Template(template).fill({})).data
+    assert files.Document(Template(template).fill(baseline)).data == unchanged
 
 
 @pytest.mark.parametrize("name", IMAGES[:2])

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from needs import needs_evalio
 
-from offline.offline_study import load_study
+from offline.config import load_study
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 THIRD_PARTY = sorted(path.stem for path in CONFIGS.glob("third_party_*.yaml"))

@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from adaptune import yaml
-from adaptune.pooled_space import PooledSpace
+from adaptune import files
+from adaptune.errors import nearest
 from adaptune.space import (
     Categorical,
     Float,
     Integer,
     ParameterSpace,
+    PooledSpace,
     SpaceError,
     describe,
-    nearest,
 )
 
 modest = settings(max_examples=60, deadline=None)
@@ -230,7 +230,7 @@ def test_space_survives_its_dump():
     space = ParameterSpace(
         dict(SPACE.parameters) | {"mixed": Categorical(choices=(1, "1", 2.5, True), baseline=2.5)}
     )
-    for write, read in [(json.dumps, json.loads), (yaml.dump, yaml.scalar)]:
+    for write, read in [(json.dumps, json.loads), (files.dump, files.scalar)]:
         back = ParameterSpace.load(read(write(space.dump())))
         assert back == space
         assert list(map(type, back.parameters["mixed"].choices)) == [int, str, float, bool]

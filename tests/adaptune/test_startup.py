@@ -12,12 +12,12 @@ HEAVY = ("matplotlib", "numba", "open3d", "rosbags", "scipy", "sklearn")
     "code",
     [
         "from adaptune.simulation.course import Course\nCourse(scenes=['cave', 'street'], imu=200)",
-        "from adaptune.simulation.rig import as_sequence",
-        "from adaptune.sequence.config import SequenceConfig, ViewConfig\n"
+        "from adaptune.simulation.course import as_sequence",
+        "from adaptune.recording.config import SequenceConfig, ViewConfig\n"
         "SequenceConfig(bag='a.bag', views=[ViewConfig(reverse=True)]).model_dump()",
-        "from adaptune.sequence.names import origin",
+        "from adaptune.recording.scan import origin",
         "from adaptune.study.config import StudyConfig",
-        "from adaptune.descriptor import check_descriptor\ncheck_descriptor('ndt')",
+        "from adaptune.model.descriptor import check_descriptor\ncheck_descriptor('ndt')",
     ],
 )
 def test_configuration_imports_nothing_heavy(code: str) -> None:

@@ -22,7 +22,7 @@ def imported(code):
 def test_help_imports_neither_numpy_nor_a_stage():
     code = (
         "from typer.testing import CliRunner\n"
-        "from adaptune.cli import app\n"
+        "from adaptune.commands.cli import app\n"
         "assert CliRunner().invoke(app, ['--help']).exit_code == 0"
     )
     names = imported(code)
@@ -35,4 +35,4 @@ def test_help_imports_neither_numpy_nor_a_stage():
 def test_configuration_models_import_nothing_heavy(module):
     names = imported(f"import {module}")
     assert not names & set(HEAVY)
-    assert not names & {"adaptune.simulation.simulate", "adaptune.simulation.world"}
+    assert not names & {"adaptune.simulation.record", "adaptune.simulation.world"}

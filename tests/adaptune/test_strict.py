@@ -5,10 +5,9 @@ from typing import Annotated
 import pytest
 from pydantic import Field, ValidationError
 
+from adaptune.errors import StrictModel, plain_words
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
-from adaptune.plain_words import plain_words
 from adaptune.space import Value
-from adaptune.strict import StrictModel
 from offline.config import OfflineStudyConfig
 from offline.samplers.settings import SETTINGS
 

@@ -4,9 +4,8 @@ import sys
 import pytest
 from needs import needs_evalio
 
-from adaptune.odometry.base import import_extra
-from adaptune.study.mistakes import RENAMED, ConfigurationError
-from offline.offline_study import load_study
+from adaptune.errors import RENAMED, ConfigurationError, import_extra
+from offline.config import load_study
 
 
 def failure(file, *overrides):

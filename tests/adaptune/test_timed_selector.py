@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 from random_models import random_model
 
-from adaptune.live.untrained import UntrainedSelector
-from adaptune.odometry.base import Motions
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.parameter_sets import ParameterSets
+from adaptune.odometry.base import InProcess, Motions
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.selector import Selector
-from adaptune.sequence.scan import Scan
-from adaptune.timed_selector import Schedule, TimedSelector
+from adaptune.selector import Schedule, Selector, TimedSelector, UntrainedSelector
+from adaptune.space import ParameterSets
 
 SCAN = Scan(0, np.zeros((0, 3), np.float32))
 GUIDE = Path(__file__).parents[2] / "docs/adapting-live.md"

@@ -7,10 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from adaptune.archive import Archive, Frames, Trial
-from adaptune.report import csv_text
+from adaptune.archive import Archive, Frames, Trial, TrialsError, export, rows, select, with_units
+from adaptune.report.tables import csv_text
 from adaptune.trajectory import read_tum
-from adaptune.trials import TrialsError, export, rows, select, with_units
 from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from adaptune.errors import AdaptuneError
-from adaptune.yaml import Document, YamlError, dump, scalar
+from adaptune.files import Document, YamlError, dump, scalar
 
 modest = settings(max_examples=80, deadline=None)
 

@@ -8,12 +8,10 @@ import pytest
 from drives import STUDY
 
 from adaptune.archive import Archive, Summary
-from adaptune.pooled_space import ODOMETRY, PooledSpace
-from adaptune.space import Float, ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
+from adaptune.errors import ConfigurationError
+from adaptune.space import ODOMETRY, Float, ParameterSpace, PooledSpace
 from offline.campaign import run_batches
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
+from offline.config import OfflineConfig, load_study
 from offline.samplers import make_sampler
 from offline.search import Search
 

@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Frames, Trial
+from adaptune.bank.bank import Bank
 from adaptune.geometry import invert, steps
-from adaptune.live.hop import Hop, Hops
-from adaptune.live.squares import CLIP
+from adaptune.live.hops import CLIP, Hop, Hops
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.model.bank_weights import MemberWeights
+from adaptune.model.weights import MemberWeights
 from adaptune.odometry import InProcess, Odometry, WarmUp
-from adaptune.odometry.bank import Bank
 from adaptune.odometry.base import Registration
+from adaptune.recording import Scan
 from adaptune.selection import Selection
-from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 

@@ -9,9 +9,9 @@ from needs import needs_evalio
 
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
-from offline import baseline
-from offline.baseline import BaselineError, check_baseline, run_baseline
-from offline.offline_study import load_study
+from offline import campaign
+from offline.campaign import BaselineError, check_baseline, run_baseline
+from offline.config import load_study
 from offline.train import train
 from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Workers
@@ -50,7 +50,7 @@ def test_one_sequence_on_which_it_fails_is_enough(study_file, tmp_path, monkeypa
         if len(seen) == 2:
             raise BaselineError(sequence)
 
-    monkeypatch.setattr(baseline, "check_baseline", fail)
+    monkeypatch.setattr(campaign, "check_baseline", fail)
     with pytest.raises(BaselineError):
         train(study)
     assert not list(study.folder.rglob("*.npz"))
@@ -146,7 +146,7 @@ def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkey
             assert archive.read(name, number, whole=True).parameters == parameters
         assert len(archive.read_frames(name).stamps) == 40
     # One that is lacking is run alone.
-    monkeypatch.setattr(baseline, "check_baseline", lambda *told: ran.append(told[:2]))
+    monkeypatch.setattr(campaign, "check_baseline", lambda *told: ran.append(told[:2]))
     ran = []
     archive.trial_path("two", 1, whole=True).unlink()
     run_baselines(study)

@@ -5,10 +5,9 @@ import re
 import pytest
 
 from adaptune.errors import AdaptuneError
-from offline.budget import Clock, all_done, max_trials, more_trials, spent
-from offline.config import OfflineConfig
+from offline.config import OfflineConfig, load_study
 from offline.objective import Verdict
-from offline.offline_study import load_study
+from offline.search import Clock, all_done, max_trials, more_trials, spent
 from offline.train import train
 
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from kills import contents
 
-from adaptune import yaml
+from adaptune import files
 from adaptune.archive import Archive
-from adaptune.descriptor import averaged
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.model import ErrorModel
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.model.descriptor import averaged
+from offline.config import load_study
 from offline.train import train
 from offline.workers import WorkerError, Workers
 
@@ -45,7 +44,7 @@ def test_the_table_of_trials(trained):
     assert [int(row["trial"]) for row in rows] == list(range(10))
     assert float(rows[7]["two"]) == pytest.approx(training.means["two"][7])
     best = min(rows, key=lambda row: float(row["mean"]))
-    fixed = yaml.Document((study.folder / "fixed.yaml").read_text()).data
+    fixed = files.Document((study.folder / "fixed.yaml").read_text()).data
     assert {name: float(best[name]) for name in fixed} == fixed
 
 

@@ -9,11 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adaptune import terminal
 from adaptune.archive import Archive
+from adaptune.commands import terminal
 from adaptune.reference import estimate
-from adaptune.reference.estimated import EstimateError
-from adaptune.reference.stored import StoredEstimate
+from adaptune.reference.stored import EstimateError, StoredEstimate
 from adaptune.study.references import ensure_references
 from offline.check_reference import (
     Judged,
@@ -24,7 +23,7 @@ from offline.check_reference import (
     over_all,
     rank_correlation,
 )
-from offline.offline_study import load_study
+from offline.config import load_study
 
 SCALES = (1.0, 1.01, 0.97, 1.05)
 

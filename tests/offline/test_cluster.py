@@ -14,7 +14,7 @@ from setups import setup_of
 
 from offline import cluster
 from offline.cluster import Cluster, ClusterError
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
 
 distributed = pytest.importorskip("distributed")

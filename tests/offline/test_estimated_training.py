@@ -7,13 +7,12 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from adaptune.cli import app
-from adaptune.errors import AdaptuneError
+from adaptune.commands.cli import app
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.model import ErrorModel
-from adaptune.model.show import render
-from adaptune.reference.estimated import EstimateError
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from adaptune.model.error_model import render
+from adaptune.reference.stored import EstimateError
+from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
 

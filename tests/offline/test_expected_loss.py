@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.model.paired import ERROR_FLOOR
-from offline.expected_loss import (
+from adaptune.model.rules import ERROR_FLOOR
+from offline.tuning import (
     expected_loss,
     figures,
     interval_of,

@@ -3,7 +3,7 @@ import pytest
 from rooms import scan_at, street
 
 from adaptune.archive import Frames
-from offline.hops import with_measured_hops
+from offline.trial import with_measured_hops
 
 STEP = 1.0
 WORLD = street()

@@ -1,14 +1,14 @@
 """Reading the labelled data set of a study."""
 
 import numpy as np
+import offline.labelling
 import pytest
 
-import offline.labelling
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.model.base import mean_errors
-from offline.labelling import labelled_data
-from offline.offline_study import load_study
+from adaptune.model.rules import mean_errors
+from offline.config import load_study
+from offline.labelled import labelled_data
 
 
 @pytest.mark.parametrize("pool", [1, 64])

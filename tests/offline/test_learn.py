@@ -10,10 +10,10 @@ import yaml
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.study.driven import BANK, ONE_SET
 from adaptune.study.new_drive import NewDrive
+from adaptune.study.study import BANK, ONE_SET
+from offline.config import load_study
 from offline.learn import Known, LearnError, changes, learn, runs_in_words
-from offline.offline_study import load_study
 
 FIGURES = {
     "loss": -0.2,

@@ -13,21 +13,20 @@ from labelled_places import (
     with_motions,
 )
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.base import Rule
+from adaptune.model.rules import Rule
 from adaptune.selection import Selection
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import driven
-from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.study import driven
 from offline import leave_one_out as leave_one_out_module
 from offline import tuning
 from offline import validate as validation_of_study
+from offline.config import load_study
 from offline.curves import bank_curve, learning_curve
-from offline.fit import fit, tuned
 from offline.labelled import LabelledSequence
 from offline.leave_one_out import LeftOut, Validation, ValidationError, leave_one_out
-from offline.offline_study import load_study
+from offline.train import fit, tuned
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings
 from offline.validate import validate
 

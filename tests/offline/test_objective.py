@@ -12,12 +12,11 @@ from pictures import texts
 from setups import made_of, setup_of
 
 from adaptune.archive import Archive, Frames, Summary
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.geometry import steps
 from adaptune.odometry import Registration
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.study.mistakes import ConfigurationError
-from offline.config import OfflineConfig
+from adaptune.odometry.keyframe import KeyframeGicp
+from offline.config import OfflineConfig, load_study
 from offline.objective import (
     SEVERITY,
     SamplerResult,
@@ -34,7 +33,6 @@ from offline.objective import (
     sampler_results,
     trajectory_metrics,
 )
-from offline.offline_study import load_study
 from offline.train import train
 
 

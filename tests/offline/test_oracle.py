@@ -5,12 +5,12 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
-from adaptune.cli import app
+from adaptune.commands.cli import app
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
-from adaptune.study.oracle_runs import oracle_archive, read_oracle
-from offline.offline_study import load_study
+from adaptune.study.inputs import oracle_archive, read_oracle
+from offline.config import load_study
 from offline.oracle import oracle_sets, run_oracle
 from offline.train import train
 

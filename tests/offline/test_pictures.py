@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pictures import is_white, share_of, texts
 
-from adaptune.drawing import LINES, POINTS
+from adaptune.report.paper import LINES, POINTS
 from offline.objective import label
 from offline.pictures import (
     CANCELLING,

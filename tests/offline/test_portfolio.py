@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.model.bank_weights import minimum_variance_weights
+from adaptune.model.weights import minimum_variance_weights
 from offline.portfolio import Portfolio, loss
 
 N, LENGTH = 120, 5.0

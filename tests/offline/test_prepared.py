@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from adaptune.odometry.base import OdometryInstance
-from adaptune.sequence.scan import Scan
-from offline.prepared import SharedScans
+from adaptune.recording.scan import Scan
+from offline.trial import SharedScans
 
 N, SIZE = 5, 1000
 

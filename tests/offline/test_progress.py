@@ -2,7 +2,7 @@ import pytest
 
 from offline import workers
 from offline.campaign import watched
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
 from offline.workers import Death, Task, TaskProgress, TaskResult, now_and_then, run
 

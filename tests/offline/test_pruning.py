@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.archive import Archive
+from adaptune.errors import ConfigurationError
 from adaptune.model import ErrorModel
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
-from offline.pruning import estimate, rungs, survivors
+from offline.config import load_study
+from offline.search import estimate, rungs, survivors
 from offline.train import train
 from offline.validate import validate
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Archive
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.model import ErrorModel
 from adaptune.study.inputs import check_inputs
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
 
@@ -151,7 +150,7 @@ def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
     code = (
         "import sys\n"
         "from typer.testing import CliRunner\n"
-        "from adaptune.cli import app\n"
+        "from adaptune.commands.cli import app\n"
         f"given = ['offline', {str(trained.folder.parent / 'small.yaml')!r}, '--folder', "
         f"{str(trained.folder)!r}, '-o', 'offline.trials=4']\n"
         "done = CliRunner().invoke(app, given)\n"

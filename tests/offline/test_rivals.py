@@ -6,16 +6,13 @@ from labelled_places import TRIALS, labelled, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, PairedSettings
-from adaptune.model.costs import Costs, SetCost
-from adaptune.parameter_sets import ParameterSets
-from adaptune.pooled_space import ODOMETRY, PooledSpace
-from adaptune.space import Float, ParameterSpace
-from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST
+from adaptune.model.rules import Costs, SetCost
+from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
+from adaptune.study.study import BEST_DEFAULT, EQUAL_COST
 from offline.frontier import frontier
 from offline.leave_one_out import PAIRED, leave_one_out
 from offline.pictures import CANCELLING, draw_frontier
-from offline.rivals import driven_cost, rivals
-from offline.tuning import NO_BANK, Policy
+from offline.tuning import NO_BANK, Policy, driven_cost, rivals
 
 ONE = ParameterSpace({"x": Float(low=0.0, high=9.0, baseline=1.0)})
 POOL = PooledSpace({"gicp": ONE, "ndt": ONE})

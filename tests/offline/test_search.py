@@ -10,17 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive, Summary
-from adaptune.cli import app
+from adaptune.commands.cli import app
+from adaptune.errors import ConfigurationError
 from adaptune.model import ErrorModel
-from adaptune.parameter_sets import ParameterSets
-from adaptune.space import Categorical, ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
+from adaptune.space import Categorical, ParameterSets, ParameterSpace
 from offline.campaign import run_batches
-from offline.config import OfflineConfig
-from offline.labelling import labelled_data
+from offline.config import OfflineConfig, load_study
+from offline.labelled import labelled_data
 from offline.leave_one_out import leave_one_out
 from offline.objective import best_by_trials
-from offline.offline_study import load_study
 from offline.samplers import make_sampler
 from offline.search import Search, make_stages, owner
 from offline.train import train

@@ -9,11 +9,9 @@ import postgres
 import pytest
 from optuna.storages.journal import JournalFileBackend
 
-from adaptune.pooled_space import PooledSpace
-from adaptune.space import Float, Integer, ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
+from adaptune.errors import ConfigurationError
+from adaptune.space import Float, Integer, ParameterSpace, PooledSpace
+from offline.config import OfflineConfig, load_study
 from offline.storage import JOURNAL, MirrorRow, StorageError, open_mirror
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from labelled_places import in_stretches, labelled, with_motions
 
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
+from offline.bank_simulation import PER_STRETCH, Extent, cut, stretches_of_view
 from offline.labelled import LabelledSequence
-from offline.stretches import PER_STRETCH, Extent, cut, stretches_of_view
 from offline.tuning import on_labelled
 
 LENGTH = 10.0

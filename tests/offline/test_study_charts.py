@@ -8,13 +8,8 @@ from made_trials import write_trials
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from offline.campaign import run_batches
-from offline.offline_study import load_study
-from offline.study_charts import (
-    charts_of_trials,
-    charts_of_validation,
-    reannealings,
-    sequence_groups,
-)
+from offline.charts import charts_of_trials, charts_of_validation, reannealings, sequence_groups
+from offline.config import load_study
 
 COURSES = """\
 odometry: {name: gicp}

@@ -10,9 +10,9 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
 from adaptune.metrics import sub_trajectory_rte, window_ends
 from adaptune.odometry import Registration
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.sequence import SequenceConfig
-from offline.offline_study import load_study
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.recording import SequenceConfig
+from offline.config import load_study
 from offline.trial import TrialSettings, episodes
 from online.replay import replay
 

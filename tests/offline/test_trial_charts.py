@@ -3,7 +3,7 @@ import pytest
 from made_trials import SPACE, made_table
 
 from adaptune.archive import OF_SLOT, Summary
-from adaptune.charts.chart import Bars, Line, Mark, Points
+from adaptune.report.chart import Bars, Line, Mark, Points
 from offline.config import OfflineConfig
 from offline.trial_charts import (
     best_tenth,
@@ -14,8 +14,8 @@ from offline.trial_charts import (
     kernel_density,
     scatter_chart,
     sensitivity_chart,
+    trial_table,
 )
-from offline.trial_table import trial_table
 
 
 def error(name, parameters):

@@ -1,13 +1,11 @@
 import numpy as np
 from made_trials import SPACE, made_sets, made_table, write_trials
 
-from adaptune import yaml
+from adaptune import files
 from adaptune.archive import Summary
-from adaptune.pooled_space import PooledSpace
-from adaptune.space import Float, ParameterSpace
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
-from offline.trial_table import read_trials, trial_table
+from adaptune.space import Float, ParameterSpace, PooledSpace
+from offline.config import OfflineConfig, load_study
+from offline.trial_charts import read_trials, trial_table
 
 
 def test_the_mean_is_over_all_sequences_or_unknown():
@@ -46,7 +44,7 @@ def test_a_study_is_read(study_file, tmp_path):
     intervals = table.column("keyframe_interval")
     np.testing.assert_allclose(table.values, intervals, rtol=1e-6)
     assert table.fixed is None
-    (study.folder / "fixed.yaml").write_text(yaml.dump(table.sets[2]), "utf-8")
+    (study.folder / "fixed.yaml").write_text(files.dump(table.sets[2]), "utf-8")
     assert read_trials(study).fixed == 2
 
 

@@ -5,10 +5,9 @@ import pytest
 from labelled_places import TRIALS, in_stretches, labelled, sequence, two_kinds, with_motions
 
 from adaptune.model import BankSettings, PairedSettings
-from adaptune.model.costs import Costs, SetCost
+from adaptune.model.rules import Costs, SetCost
 from offline import tuning
 from offline.bank_simulation import BankSimulation
-from offline.expected_loss import expected_loss
 from offline.labelled import LabelledData
 from offline.tuning import (
     BANK_SETTINGS,
@@ -18,6 +17,7 @@ from offline.tuning import (
     cancelling_members,
     choose,
     complementary_members,
+    expected_loss,
     reserve,
 )
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from adaptune.charts.chart import Band, Line, Points
-from offline.expected_loss import figures
+from adaptune.report.chart import Band, Line, Points
+from offline.charts import MOST_NAMED, frontier_chart, stretch_chart
 from offline.pictures import CANCELLING
-from offline.validation_charts import MOST_NAMED, frontier_chart, stretch_chart
+from offline.tuning import figures
 
 
 def stretches(n_recordings=2, n=6):

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from adaptune.cli import app
+from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.config import ALSO
-from offline.offline_study import load_study
-from online.compared_modes import compared_modes
-from online.comparison import compare
-from online.run_replays import run_replays, run_untrained
-from online.stored_replays import StoredReplayError, read_repeats, repeat_folder
+from offline.config import load_study
+from online.compare import compare, compared_modes
+from online.record import StoredReplayError, read_repeats, repeat_folder
+from online.run import run_replays, run_untrained
 
 EVERY = [
     *("baseline", "fixed", "paired", "untrained", "one_set", "bank", "bank_learned"),

@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 from pictures import texts
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.selection import Selection
-from adaptune.study.driven import ModeError, bank_members
-from adaptune.study.mistakes import ConfigurationError
+from adaptune.study.study import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
-from offline.offline_study import load_study
-from online.comparison import compare
-from online.comparison_row import ComparisonRow
-from online.remarks import remarks
-from online.run_replays import ReplayError, run_replays, warn_of_scant_evidence
-from online.statistics import Reference
-from online.stored_replays import StoredReplay, StoredReplayError
+from offline.config import load_study
+from online.compare import compare
+from online.record import StoredReplay, StoredReplayError
+from online.run import ReplayError, run_replays, warn_of_scant_evidence
+from online.statistics import ComparisonRow, Reference
+from online.verdict import remarks
 
 MODES = ["baseline", "fixed", "paired", "paper"]
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from adaptune.charts.chart import Line, Points
-from online.comparison_chart import comparison_chart
+from adaptune.report.chart import Line, Points
+from online.charts import comparison_chart
 
 
 def row(sequence, mode, ratio, low=None, high=None, other="fixed"):

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptune.drawing import LINES
 from adaptune.metrics import KittiError
-from online.comparison_row import ALL, ORACLES, ComparisonRow, StandardErrors
-from online.comparison_tables import modes_in_words, side_by_side, tables
+from adaptune.report.paper import LINES
+from online.statistics import ALL, ORACLES, ComparisonRow, StandardErrors
+from online.tables import modes_in_words, side_by_side, tables
 
 SHORT = KittiError(np.nan, np.nan, ())
 

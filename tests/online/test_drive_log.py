@@ -7,8 +7,8 @@ import pytest
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.selection import Selection
 from adaptune.trajectory import read_tum
-from online.drive_log import DriveLog
-from online.safety import Choice
+from online.replay import Choice
+from online.robot import DriveLog
 
 STAMP = 1_700_000_000_123_456_789
 

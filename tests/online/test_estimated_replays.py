@@ -6,13 +6,13 @@ import estimates
 import pytest
 from pictures import texts
 
-from adaptune.reference.estimated import EstimateError
-from offline.offline_study import load_study
-from online.comparison import compare
-from online.comparison_tables import tables
-from online.remarks import remarks
-from online.run_replays import run_untrained
+from adaptune.reference.stored import EstimateError
+from offline.config import load_study
+from online.compare import compare
+from online.run import run_untrained
 from online.statistics import allowing_for
+from online.tables import tables
+from online.verdict import remarks
 
 BOTH = ["baseline", "untrained"]
 

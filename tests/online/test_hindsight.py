@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
 
-from adaptune.study.oracle_runs import OracleErrors
-from online.comparison_row import ORACLES, ComparisonRow
-from online.hindsight import oracle_rows
-from online.statistics import JudgedModes
+from adaptune.study.inputs import OracleErrors
+from online.statistics import ORACLES, ComparisonRow, JudgedModes, oracle_rows
 
 
 def judged(rte=1.0):

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from needs import needs_evalio
 
-from adaptune.hosting import server
-from adaptune.live.untrained import UntrainedSelector
-from adaptune.odometry.bank import Bank
-from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.isolation import SERVICE, Limits
-from adaptune.odometry.pool import OdometryPool
+from adaptune.bank.bank import Bank
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
-from adaptune.parameter_sets import ParameterSets
-from adaptune.sequence import Scan
+from adaptune.odometry.remote import SERVICE, Limits
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.processes import server
+from adaptune.recording import Scan
+from adaptune.selector import UntrainedSelector
+from adaptune.space import ParameterSets
 from online.replay import replay
 
 SETS = {
@@ -64,7 +63,7 @@ def test_a_member_that_is_killed_costs_its_weight_and_nothing_else(order, caplog
     needs_evalio()
     bank, selector = of_pool(*order)
     scans = [Scan(stamp, points) for stamp, points, _ in drives.scans(0, 110, STEP)]
-    with caplog.at_level(logging.WARNING, "adaptune.odometry.bank"):
+    with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         found = replay(killing(scans), bank, HealthCheck(), selector)
     assert not bank.dead
     bank.close()
@@ -73,7 +72,7 @@ def test_a_member_that_is_killed_costs_its_weight_and_nothing_else(order, caplog
     assert not found.restarted.any()
     # It restarts at most once a second, so it is dead most of the time.
     assert bank.restarts == len(bank.faults) == 3
-    told = [r.getMessage() for r in caplog.records if r.name == "adaptune.odometry.bank"]
+    told = [r.getMessage() for r in caplog.records if r.name == "adaptune.bank.bank"]
     what = "its process was ended by SIGKILL; the bank goes on without it"
     assert told == [f"trial 12 (genz_icp) ended: {what}", "trial 12 (genz_icp) is back"] * 3
     weights = [choice.selection.weights for choice in found.choices]

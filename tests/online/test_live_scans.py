@@ -5,11 +5,10 @@ import local_link
 import numpy as np
 import pytest
 
-from adaptune.sequence.imu import USUAL
-from adaptune.sequence.recorded import ImuSettings
-from adaptune.sequence.timing import Timing
-from online import live_scans
-from online.live_scans import LiveScans
+from adaptune.recording.recording import ImuSettings
+from adaptune.recording.scan import USUAL, Timing
+from online import live
+from online.live import LiveScans
 
 TENTH = 10**8
 START = 1_700_000_000 * 10**9
@@ -99,7 +98,7 @@ def test_what_is_no_point_cloud_is_left_out(link, caplog):
 
 
 def test_a_topic_that_falls_silent_and_comes_back(link, caplog, monkeypatch):
-    monkeypatch.setattr(live_scans, "SILENCE", 0.05)
+    monkeypatch.setattr(live, "SILENCE", 0.05)
     scans = LiveScans(link, "/other", Timing())
     later = threading.Timer(0.5, lambda: link.play("/other", local_link.cloud(START, points(0))))
     later.start()
@@ -113,7 +112,7 @@ def test_a_topic_that_falls_silent_and_comes_back(link, caplog, monkeypatch):
 
 
 def test_scans_bring_along_what_the_imu_measured(link, monkeypatch):
-    monkeypatch.setattr(live_scans, "IMU_WAIT", 0.01)
+    monkeypatch.setattr(live, "IMU_WAIT", 0.01)
     settings = ImuSettings("/imu", None, 2.0, USUAL)
     scans = topic(link, imu=settings)
     for i in range(-50, 250):
@@ -133,7 +132,7 @@ def test_scans_bring_along_what_the_imu_measured(link, monkeypatch):
 
 
 def test_an_imu_that_is_silent_does_not_hold_up_the_scans(link, monkeypatch):
-    monkeypatch.setattr(live_scans, "IMU_WAIT", 0.01)
+    monkeypatch.setattr(live, "IMU_WAIT", 0.01)
     scans = topic(link, imu=ImuSettings("/imu", None, 1.0, USUAL))
     play(link, range(2))
     for i, arrival in enumerate(scans.arrivals()):

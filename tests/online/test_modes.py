@@ -8,11 +8,11 @@ from random_models import random_model
 
 from adaptune.model import BankSettings, PairedSettings
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.isolation import Limits
 from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.remote import Limits
 from adaptune.space import ParameterSpace
 from adaptune.study.config import ALSO, SwitchingConfig
-from adaptune.study.driven import ModeError
+from adaptune.study.study import ModeError
 from online.modes import ReplaySetup
 
 

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from online.comparison_row import ORACLES, ComparisonRow
-from online.pooled_rows import pooled, ratio_to
-from online.statistics import JudgedModes, allowing_for
+from online.compare import pooled, ratio_to
+from online.statistics import ORACLES, ComparisonRow, JudgedModes, allowing_for
 
 BLOCK = 20
 

@@ -6,16 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import OdometryError, Registration
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.in_process import InProcess
+from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.odometry.base import InProcess, Registration
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.selection import Selection
-from adaptune.sequence.imu import Imu, ImuNoise
-from adaptune.sequence.scan import Scan
 from adaptune.study.config import RealTimeConfig
-from online.real_time import arrivals, outlook, replay_in_real_time
-from online.selector_process import Answer
+from online.real_time import Answer, arrivals, outlook, replay_in_real_time
 
 TENTH = 10**8
 """Nanoseconds between scans."""

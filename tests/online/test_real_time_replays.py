@@ -10,11 +10,11 @@ import pytest
 from commands import call
 
 from adaptune.model import BankSettings, ErrorModel
-from offline.offline_study import load_study
-from online.comparison import compare
-from online.remarks import remarks
-from online.run_replays import run_replays
-from online.stored_replays import StoredReplay, StoredReplayError
+from offline.config import load_study
+from online.compare import compare
+from online.record import StoredReplay, StoredReplayError
+from online.run import run_replays
+from online.verdict import remarks
 
 RATE = "online.real_time.rate=5"
 WAITS = "online.real_time.deadline=5"

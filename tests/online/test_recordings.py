@@ -14,21 +14,18 @@ import pytest
 from commands import call
 from rosbags.highlevel import AnyReader
 
+from adaptune.errors import import_extra
 from adaptune.geometry import invert
-from adaptune.odometry.base import import_extra
 from adaptune.odometry.tracker import RegisteredScan
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
 from adaptune.trajectory import Trajectory
-from offline.offline_study import load_study
-from online.mcap_recording import topic
-from online.record_replays import record_replays
-from online.recordings import clouds, gather
-from online.replay import RealTimeRecord, Replay
-from online.run_replays import shared_identity
-from online.safety import Choice
-from online.stored_reference import write_reference
-from online.stored_replays import ReplayIdentity, StoredReplayError, write_replay
+from offline.config import load_study
+from online.record import ReplayIdentity, StoredReplayError, write_reference, write_replay
+from online.recordings import clouds, gather, topic
+from online.replay import Choice, RealTimeRecord, Replay
+from online.rerun_recording import record_replays
+from online.run import shared_identity
 
 N = 40
 STAMPS = drives.FIRST_STAMP + np.arange(N) * 100_000_000

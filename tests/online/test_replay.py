@@ -7,19 +7,18 @@ import drives
 import numpy as np
 import pytest
 
-from adaptune.errors import AdaptuneError
-from adaptune.live.untrained import UntrainedSelector, untrained_sets
-from adaptune.odometry.bank import Bank
-from adaptune.odometry.base import Odometry, OdometryError, Registration, Usage, WarmUp
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.in_process import InProcess
+from adaptune.bank.bank import Bank
+from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.odometry.base import InProcess, Odometry, Registration, Usage, WarmUp
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
+from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.space import Float, ParameterSpace
 from adaptune.trajectory import read_tum
+from online.record import ReplayIdentity, StoredReplay, write_replay
 from online.replay import replay
-from online.stored_replays import ReplayIdentity, StoredReplay, write_replay
 
 
 class Scripted(Odometry):

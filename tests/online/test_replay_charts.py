@@ -2,15 +2,9 @@ import numpy as np
 import pytest
 from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
-from adaptune.charts.chart import Band, Line, Points, Shares, Spans
-from offline.offline_study import load_study
-from online.replay_charts import (
-    charts_of_replays,
-    choice_chart,
-    error_chart,
-    map_chart,
-    switches,
-)
+from adaptune.report.chart import Band, Line, Points, Shares, Spans
+from offline.config import load_study
+from online.charts import charts_of_replays, choice_chart, error_chart, map_chart, switches
 
 
 def of_kind(panel, kind):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pictures import MODES, is_white, share_of, texts
 
-from adaptune.drawing import LINES, OTHERS
+from adaptune.report.paper import LINES, OTHERS
 from adaptune.space import Categorical, Float, ParameterSpace
 from online.replay_picture import FEW, Track, draw_replays, drawn_modes
 

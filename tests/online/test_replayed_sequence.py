@@ -4,12 +4,11 @@ import shutil
 import numpy as np
 import pytest
 
-from offline.offline_study import load_study
-from online.comparison import compare
-from online.replay_charts import charts_of_replays
-from online.replayed_sequence import read_replays, scenes_along
-from online.run_replays import run_replays
-from online.stored_replays import StoredReplayError
+from offline.config import load_study
+from online.charts import charts_of_replays, read_replays, scenes_along
+from online.compare import compare
+from online.record import StoredReplayError
+from online.run import run_replays
 
 COURSE = """\
 odometry: {name: gicp}

@@ -12,15 +12,15 @@ from commands import call
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
-from adaptune.ros.ros_link import LinkError
-from adaptune.sequence.scan import Scan
-from adaptune.study.driven import ModeError
+from adaptune.recording.scan import Scan
+from adaptune.ros.link import LinkError
+from adaptune.study.study import ModeError
 from adaptune.trajectory import read_tum
-from offline.offline_study import load_study
-from online import robot_drive
+from offline.config import load_study
+from online import robot as robot_drive
 from online.modes import ReplaySetup
 from online.replay import replay
-from online.robot_drive import RobotDrive
+from online.robot import RobotDrive
 
 PATIENT = (
     "online.real_time={deadline: 5, queue: 0}",
@@ -132,7 +132,7 @@ def test_a_drive_that_goes_on_does_not_need_the_disk(make, monkeypatch, caplog):
 
 
 def test_it_ends_where_the_node_in_ros_has_ended(make, monkeypatch):
-    monkeypatch.setattr("online.live_scans.SILENCE", 0.01)
+    monkeypatch.setattr("online.live.SILENCE", 0.01)
     link = local_link.LocalLink()
     link.alive = False
     with pytest.raises(LinkError, match="adaptune's node in ROS has ended"):

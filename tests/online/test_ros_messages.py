@@ -7,8 +7,8 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from adaptune.selection import Selection
+from online.live import UNKNOWN, RosMessages, Status, Uncertainty
 from online.replay import RealTimeRecord
-from online.ros_messages import UNKNOWN, RosMessages, Status, Uncertainty
 
 MESSAGES = RosMessages(local_link.STORE, "odom")
 

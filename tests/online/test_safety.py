@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from adaptune.odometry.bank import Bank
-from adaptune.odometry.base import Odometry, OdometryError, Registration, WarmUp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.in_process import InProcess
+from adaptune.bank.bank import Bank
+from adaptune.errors import OdometryError
+from adaptune.odometry.base import InProcess, Odometry, Registration, WarmUp
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 from online.replay import replay
 

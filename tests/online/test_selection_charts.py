@@ -2,13 +2,8 @@ import numpy as np
 import pytest
 from made_replays import SECONDS, bank, kept, replay, sequence
 
-from adaptune.charts.chart import Line, Mark, Points
-from online.selection_charts import (
-    familiarity_chart,
-    histograms,
-    latency_chart,
-    period_ratios,
-)
+from adaptune.report.chart import Line, Mark, Points
+from online.charts import familiarity_chart, histograms, latency_chart, period_ratios
 
 
 def test_ratios_are_of_the_same_stretches_of_time():

@@ -9,13 +9,11 @@ import pytest
 from noting_selector import Noting, refusing
 
 from adaptune.errors import AdaptuneError
-from adaptune.live.untrained import UntrainedSelector, untrained_sets
 from adaptune.odometry.base import Motions
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.sequence.imu import Imu, ImuNoise
-from adaptune.sequence.scan import Scan
-from adaptune.timed_selector import TimedSelector
-from online.selector_process import SLOTS, SelectorProcess
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.recording.scan import Imu, ImuNoise, Scan
+from adaptune.selector import TimedSelector, UntrainedSelector, untrained_sets
+from online.real_time import SLOTS, SelectorProcess
 
 SETS = untrained_sets(KeyframeGicp.space, 3)
 SECOND = 10**9

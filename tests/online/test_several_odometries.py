@@ -7,19 +7,19 @@ from dataclasses import replace
 import pytest
 from drives import STUDY
 
-from adaptune import yaml
+from adaptune import files
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.pooled_space import ODOMETRY, PooledSpace
-from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, driven
-from offline.offline_study import load_study
+from adaptune.space import ODOMETRY, PooledSpace
+from adaptune.study.study import BEST_DEFAULT, EQUAL_COST, driven
+from offline.config import load_study
 from offline.pictures import CANCELLING
 from offline.train import train
 from offline.validate import validate
-from online.comparison import compare
-from online.comparison_tables import tables
-from online.remarks import remarks
-from online.run_replays import run_replays
+from online.compare import compare
+from online.run import run_replays
+from online.tables import tables
+from online.verdict import remarks
 
 ODOMETRIES = """\
 odometry:
@@ -59,7 +59,7 @@ def test_the_trials_range_over_both(trained):
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
     assert all((row["resolution"] == "") == (row[ODOMETRY] == "gicp") for row in rows)
     assert all(float(row["cost [ms]"]) > 0.0 for row in rows)
-    fixed = yaml.Document((study.folder / "fixed.yaml").read_text()).data
+    fixed = files.Document((study.folder / "fixed.yaml").read_text()).data
     assert fixed == sets[training.model.fixed]
 
 

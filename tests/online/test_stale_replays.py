@@ -10,15 +10,13 @@ import pytest
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.trajectory import Trajectory, write_tum
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
-from online.comparison import compare
-from online.replay_charts import charts_of_replays
-from online.run_replays import run_replays
-from online.stale_replays import current_modes
-from online.stored_reference import check_reference
-from online.stored_replays import StoredReplayError
+from online.charts import charts_of_replays
+from online.compare import compare, current_modes
+from online.record import StoredReplayError, check_reference
+from online.run import run_replays
 from online.switch_cost import measure_switching
 
 

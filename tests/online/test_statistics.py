@@ -5,9 +5,8 @@ import pytest
 
 from adaptune.metrics import KittiError, kitti_error
 from adaptune.trajectory import Trajectory, read_kitti
-from online.comparison_row import ComparisonRow, StandardErrors
-from online.pooled_rows import pooled
-from online.statistics import JudgedModes, Reference
+from online.compare import pooled
+from online.statistics import ComparisonRow, JudgedModes, Reference, StandardErrors
 
 
 def trajectory(T, first=0):

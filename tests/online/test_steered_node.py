@@ -4,13 +4,13 @@ import local_link
 import numpy as np
 import pytest
 
-from adaptune.odometry.base import OdometryError
-from adaptune.ros.ros_link import LinkError
+from adaptune.errors import OdometryError
+from adaptune.recording.scan import Scan
+from adaptune.ros.link import LinkError
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
 from adaptune.study.config import SteerConfig
-from online import steered_node
-from online.steered_node import SteeredNode
+from online import robot
+from online.robot import SteeredNode
 
 TENTH = 10**8
 
@@ -32,7 +32,7 @@ def link():
 
 @pytest.fixture
 def node(link, monkeypatch):
-    monkeypatch.setattr(steered_node, "PATIENCE", 0.01)
+    monkeypatch.setattr(robot, "PATIENCE", 0.01)
 
     def make(**settings):
         return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings))

@@ -6,7 +6,7 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from offline.offline_study import load_study
+from offline.config import load_study
 from online import switch_cost
 
 

@@ -10,18 +10,18 @@ import pytest
 from pictures import texts
 from typer.testing import CliRunner
 
-from adaptune.cli import app
-from adaptune.live.untrained import UntrainedSelector, untrained_sets
+from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
-from adaptune.study.driven import ModeError
-from offline.offline_study import load_study
-from online.comparison import compare
-from online.comparison_tables import tables
+from adaptune.selector import UntrainedSelector, untrained_sets
+from adaptune.study.study import ModeError
+from offline.config import load_study
+from online.charts import read_replays
+from online.compare import compare
 from online.modes import ReplaySetup, sequences_without_model
-from online.remarks import remarks
-from online.replayed_sequence import read_replays
-from online.run_replays import run_replays, run_untrained
-from online.stored_replays import StoredReplay, StoredReplayError
+from online.record import StoredReplay, StoredReplayError
+from online.run import run_replays, run_untrained
+from online.tables import tables
+from online.verdict import remarks
 
 MODES = ["baseline", "untrained"]
 BLIND = "sequences.three.reference=none"

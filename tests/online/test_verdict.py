@@ -2,9 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from online.comparison_row import ALL, ORACLES, ComparisonRow, Ratio
-from online.remarks import remarks
-from online.verdict import verdict
+from online.statistics import ALL, ORACLES, ComparisonRow, Ratio
+from online.verdict import remarks, verdict
 
 
 def rows_of(sequence=ALL, **ratios):

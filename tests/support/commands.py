@@ -3,7 +3,7 @@
 from click.testing import Result
 from typer.testing import CliRunner
 
-from adaptune.cli import app
+from adaptune.commands.cli import app
 
 
 def call(*arguments: object) -> Result:

@@ -13,13 +13,13 @@ import drives
 import numpy as np
 from needs import reference_image
 
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.docker.engine import engine
 from adaptune.odometry.docker.rustle import RustleSettings
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.program_input import ProgramInput
-from adaptune.sequence import Scan
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.remote import Limits
+from adaptune.recording import Scan
 
 LABEL = "adaptune.owner"
 N_SCANS = 40

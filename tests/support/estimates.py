@@ -3,7 +3,7 @@
 import drives
 import numpy as np
 
-from adaptune.reference.estimated import EstimatedReference, Registrations
+from adaptune.reference.stored import EstimatedReference, Registrations
 
 STEP = 0.3
 

@@ -26,18 +26,17 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import get_types_from_msg
 
 from adaptune.errors import AdaptuneError
-from adaptune.inspect import inspect
-from adaptune.rendering import render_inspection
-from adaptune.sequence import Scan, SequenceConfig, livox, pointcloud2
-from adaptune.sequence.export import Messages
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.pointcloud2 import PointCloudError
-from adaptune.sequence.timing import AUTO
-from offline.offline_study import load_study
+from adaptune.recording import Scan, SequenceConfig, clouds
+from adaptune.recording.clouds import PointCloudError
+from adaptune.recording.export import Messages
+from adaptune.recording.inspect import inspect, render_inspection
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.scan import AUTO
+from offline.config import load_study
 
 SECONDS, BYTES = 10, 2 << 30
 START = 1_700_000_000_123_456_789
-CLOUD, LIVOX = "sensor_msgs/msg/PointCloud2", livox.TYPES[0]
+CLOUD, LIVOX = "sensor_msgs/msg/PointCloud2", clouds.LIVOX_TYPES[0]
 # What a count or an offset is most wrong with.
 WORDS = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 0x10000, 0x7FC00000, 0x7F800000)
 LAYOUTS = {
@@ -68,7 +67,7 @@ def stores() -> dict[bool, Messages]:
     """What makes messages of ROS 1 and of ROS 2, Livox's among them."""
     made = {False: Messages(1), True: Messages(2)}
     types: Any = {}
-    for name, text in livox.DEFINITIONS.items():
+    for name, text in clouds.DEFINITIONS.items():
         types.update(get_types_from_msg(text, name))
     for messages in made.values():
         with contextlib.suppress(Exception):  # registered before
@@ -115,12 +114,12 @@ def samples() -> Iterator[tuple[bytes, Decode]]:
 
 
 def _cloud(cdr: bool) -> Decode:
-    return lambda data: pointcloud2.decode(data, cdr)
+    return lambda data: clouds.decode_cloud(data, cdr)
 
 
 def _livox(fields: Any, cdr: bool) -> Decode:
     point = fields[LIVOX.replace("Msg", "Point")][1]
-    return lambda data: livox.decode(data, fields[LIVOX][1], point, cdr, AUTO)
+    return lambda data: clouds.decode_livox(data, fields[LIVOX][1], point, cdr, AUTO)
 
 
 def damage(data: bytes, rng: np.random.Generator) -> bytes:
@@ -265,7 +264,7 @@ def _writer(path: Path, cdr: bool, option: Any) -> Any:
     return folder
 
 
-@patch("adaptune.survey.SECONDS", 0.0)
+@patch("adaptune.recording.survey.SECONDS", 0.0)
 def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
     """Read so many damaged bags, and count what became of them; inspect samples of half of them."""
     rng = np.random.default_rng(seed)

@@ -5,10 +5,9 @@ from typing import Any
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from adaptune import yaml
-from adaptune.inspect import Inspection
-from adaptune.rendering import render_inspection
-from adaptune.sequence import SequenceConfig
+from adaptune import files
+from adaptune.recording import SequenceConfig
+from adaptune.recording.inspect import Inspection, render_inspection
 
 
 def inspection_text(inspection: Any, width: int = 100) -> str:
@@ -20,7 +19,7 @@ def inspection_text(inspection: Any, width: int = 100) -> str:
 
 def entry(inspection: Any) -> dict[str, SequenceConfig]:
     """The proposed entry, read back as a study would."""
-    data = yaml.Document(inspection.entry).data["sequences"]
+    data = files.Document(inspection.entry).data["sequences"]
     return TypeAdapter(dict[str, SequenceConfig]).validate_python(data)
 
 

@@ -39,7 +39,15 @@ def contents(folder: Path) -> dict[Path, object]:
 def begin(study_file: Path, folder: Path, *overrides: str) -> subprocess.Popen[str]:
     """Start a campaign in a process of its own."""
     given = [word for text in overrides for word in ("-o", text)]
-    command = ["-m", "adaptune.cli", "offline", str(study_file), "--folder", str(folder), *given]
+    command = [
+        "-m",
+        "adaptune.commands.cli",
+        "offline",
+        str(study_file),
+        "--folder",
+        str(folder),
+        *given,
+    ]
     return subprocess.Popen(
         [sys.executable, *command],
         stdout=subprocess.DEVNULL,

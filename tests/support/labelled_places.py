@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 from tables import table
 
-from adaptune.live.hop import Hops
+from adaptune.live.hops import Hops
 from adaptune.metrics import sub_trajectory_vectors
-from offline.bank_simulation import BankSimulation
+from offline.bank_simulation import BankSimulation, Extent, cut
 from offline.labelled import LabelledData, LabelledSequence
-from offline.stretches import Extent, cut
 
 TRIALS = (0, 3, 4, 7, 8)
 SETS = table(np.linspace(0.0, 1.0, 5)[:, None], TRIALS)

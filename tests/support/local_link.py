@@ -7,8 +7,8 @@ import drives
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune.ros.ros_link import LinkError
-from online.live_scans import CLOUD, IMU
+from adaptune.ros.link import LinkError
+from online.live import CLOUD, IMU
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 STORE.register(

@@ -6,11 +6,10 @@ import numpy as np
 from rooms import moved
 
 from adaptune.geometry import invert, rectify, steps
-from adaptune.live.hop import Hop
-from adaptune.reference.consensus import Consensus
-from adaptune.reference.registering import Guess, Pass, pass_over
+from adaptune.live.hops import Hop
+from adaptune.reference.registering import Consensus, Guess, Pass, pass_over
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 
 STEP = 0.4
 """Metres between the scans of a made-up pass."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from adaptune.reference.estimated import EstimatedReference, Registrations
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
+from adaptune.reference.stored import EstimatedReference, Registrations
 
 
 def smooth(T, scale, seed=0):

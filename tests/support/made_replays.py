@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from adaptune.charts.chart import Spans
+from adaptune.report.chart import Spans
 from adaptune.space import Categorical, Float, ParameterSpace
+from online.charts import ModeReplay, ReplayedSequence
 from online.replay_picture import Track
-from online.replayed_sequence import ModeReplay, ReplayedSequence
 
 SECONDS = np.arange(0.0, 20.0, 0.1)
 XY = np.column_stack([SECONDS, np.sin(SECONDS)])

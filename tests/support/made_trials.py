@@ -5,7 +5,7 @@ import numpy as np
 from adaptune.archive import Archive, Summary, Trial
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 from offline.config import OfflineConfig
-from offline.trial_table import trial_table
+from offline.trial_charts import trial_table
 
 SPACE = ParameterSpace(
     {

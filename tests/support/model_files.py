@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.model_file import checksum
+from adaptune.model.error_model import checksum
 
 
 def assert_same(a, b):

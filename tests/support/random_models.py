@@ -3,8 +3,7 @@
 import numpy as np
 
 from adaptune.model import ErrorModel
-from adaptune.parameter_sets import ParameterSets
-from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from adaptune.space import Categorical, Float, Integer, ParameterSets, ParameterSpace
 
 SPACE = ParameterSpace(
     {

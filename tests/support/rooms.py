@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.sequence.scan import Scan
+from adaptune.recording.scan import Scan
 
 REACH = 18.0
 """Metres that the sensor sees."""

@@ -2,20 +2,9 @@
 
 import numpy as np
 
-from adaptune.charts.chart import (
-    Axis,
-    Band,
-    Bars,
-    Chart,
-    Line,
-    Mark,
-    Panel,
-    Points,
-    Shares,
-    Spans,
-)
-from adaptune.charts.page import Page, PageSection
-from adaptune.report import Listing
+from adaptune.report.chart import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Shares, Spans
+from adaptune.report.page import Page, PageSection
+from adaptune.report.tables import Listing
 
 TIME = Axis("time [s]")
 RTE = Axis("RTE over the next 20 m [%]", log=True)

@@ -15,15 +15,13 @@ import numpy as np
 import program
 from needs import reference_image
 
-from adaptune.odometry.command import Command
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.process import Process
-from adaptune.odometry.program_input import ProgramInput
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.program import Command, ProgramInput
 from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.remote import Limits, Process
 from adaptune.odometry.serving import listen
-from adaptune.sequence import Scan
+from adaptune.recording import Scan
 from adaptune.space import Float, ParameterSpace
 
 STEP = 0.4
@@ -69,7 +67,7 @@ def _that_has_run(name, parameters):
 
 def _contained(name, parameters):
     """A new instance whose program is in a container."""
-    from adaptune.odometry.docker.docker_process import DockerProcess
+    from adaptune.odometry.docker.programs import DockerProcess
 
     kind = odometry_class("rustle" if name == LOCKSTEP else name)
     image, file = reference_image(), Path(_folder.name) / "params.yaml"

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from adaptune.parameter_sets import ParameterSets
-from adaptune.space import Float, ParameterSpace
+from adaptune.space import Float, ParameterSets, ParameterSpace
 
 
 def table(unit, trials=None):

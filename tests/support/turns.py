@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.sequence import Imu, Scan
+from adaptune.recording import Imu, Scan
 
 STEP = 0.4
 """Metres that the sensor moves along x between scans, and during one."""

@@ -3,8 +3,8 @@
 import numpy as np
 
 from adaptune.odometry import InProcess, Odometry, Registration, WarmUp
+from adaptune.recording import Scan
 from adaptune.selection import Selection
-from adaptune.sequence import Scan
 from adaptune.space import Float, ParameterSpace
 
 

@@ -1,23 +1,31 @@
 """The Docker engine: images, and containers that can reach nothing and leave nothing behind."""
 
 import contextlib
+import hashlib
+import json
 import logging
 import os
+import shutil
 import signal
+import stat
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, BinaryIO, NamedTuple
 
 from pydantic import BeforeValidator, Field
 
-from adaptune import hosting
-from adaptune.files import temporary_prefix
+from adaptune import files, processes
+from adaptune.errors import OdometryError, UnavailableError
+from adaptune.files import replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
-from adaptune.odometry.base import BaseSettings, OdometryError, UnavailableError
+from adaptune.odometry.base import BaseSettings, Usage
 from adaptune.odometry.docker import undertaker
+from adaptune.space import ParameterSet
 
 OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
@@ -379,7 +387,7 @@ class Container:
         from docker.errors import APIError
 
         try:
-            return hosting.plain_lines(engine().api.logs(self.id, tail=_TAIL))
+            return processes.plain_lines(engine().api.logs(self.id, tail=_TAIL))
         except (APIError, OSError):
             return ""
 
@@ -398,3 +406,111 @@ class Container:
         if self.id is not None and not self._removed:
             self._removed = True
             _remove(engine(), self.id)
+
+
+# Folders that containers write to. Nothing that is in them is trusted.
+
+
+_SECONDS = 20.0
+"""Seconds that a container may take to remove what its user has written."""
+
+
+def make_shared(folder: Path) -> Path:
+    """Make a folder that any user of a container may write to."""
+    folder.mkdir()
+    folder.chmod(0o777)
+    return folder
+
+
+@contextlib.contextmanager
+def opened(path: Path, root: Path) -> Iterator[BinaryIO | None]:
+    """Open a regular file below `root`; None if there is none, or it is a link, or a pipe."""
+    inside = path.parent.resolve() == root.resolve() / path.parent.relative_to(root)
+    try:
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        file = os.fdopen(os.open(path, flags), "rb") if inside else None
+    except OSError:
+        file = None
+    if file is None:
+        yield None
+        return
+    with file:
+        yield file if stat.S_ISREG(os.fstat(file.fileno()).st_mode) else None
+
+
+def copy_regular(path: Path, root: Path, target: Path) -> bool:
+    """Copy a regular file below `root`; False if there is none."""
+    with opened(path, root) as file:
+        if file is None:
+            return False
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("wb") as copy:
+            shutil.copyfileobj(file, copy)
+    return True
+
+
+def regular_files(root: Path) -> Iterator[Path]:
+    """All files below a folder, links and what they lead to left out."""
+    for folder, _, names in os.walk(root):
+        yield from (path for name in names if not (path := Path(folder) / name).is_symlink())
+
+
+def remove_shared(folder: Path, image: str, user: str) -> None:
+    """Remove a folder; what another user has written, that user removes in a container."""
+    shutil.rmtree(folder, ignore_errors=True)
+    if not folder.exists():
+        return
+    with contextlib.suppress(OdometryError):
+        container = Container(
+            ContainerSettings(image=image),
+            0.5,
+            ["/bin/sh", "-c", "rm -rf /shared/*"],
+            [Mount(folder, "/shared", writable=True)],
+            user=user,
+            bare=True,
+        )
+        with contextlib.closing(container):
+            begin = time.monotonic()
+            while container.ended() is None and time.monotonic() - begin < _SECONDS:
+                time.sleep(0.05)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+# What is kept of a trial in a container.
+
+
+@contextmanager
+def kept_log(
+    logs: Path | None, settings: Any, parameters: ParameterSet, about: Mapping[str, Any]
+) -> Iterator[Path | None]:
+    """A folder for the block to fill, which then replaces that of the same set; None if not kept.
+
+    Parameters
+    ----------
+    logs
+        Folder of the sequence's logs.
+    settings, parameters
+        Of the trial.
+    about
+        What ``trial.yaml`` says besides.
+    """
+    if logs is None:
+        yield None
+        return
+    whole = json.dumps([settings.model_dump(mode="json"), parameters], sort_keys=True)
+    name = hashlib.blake2b(whole.encode(), digest_size=4).hexdigest()
+    with replacing_folder(logs / name) as temporary:
+        temporary.mkdir()
+        digest = image_digest(settings.image)
+        note = {"image": settings.image, "digest": digest, "parameters": parameters, **about}
+        (temporary / "trial.yaml").write_text(files.dump(note), encoding="utf-8")
+        yield temporary
+
+
+def costs(usage: Usage, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """CPU seconds, peak megabytes and the seconds of each step, as ``trial.yaml`` has them."""
+    return {
+        "cpu": round(usage.cpu, 3),
+        "memory": round(usage.memory or 0.0, 1),
+        "seconds": {name: round(value, 2) for name, value in seconds.items()},
+    }

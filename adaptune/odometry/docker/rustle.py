@@ -4,21 +4,50 @@ Such an image has a package with ``rustle.launch``, which loads ``/rustle/config
 login shell finds it.
 """
 
+import contextlib
+import logging
 import re
-from collections.abc import Callable
+import shutil
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer
+from rosbags.typesys.store import Typestore
 
-from adaptune.odometry.base import Description, OdometryError, OdometryInstance
-from adaptune.odometry.docker.engine import ContainerSettings, image_digest
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.program_input import ProgramInput
+from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
+from adaptune.files import temporary_prefix
+from adaptune.geometry import Poses, invert, rectify
+from adaptune.odometry.base import Description, OdometryInstance, Registration, Usage
+from adaptune.odometry.docker.engine import ContainerSettings, Mount, costs, image_digest, kept_log
+from adaptune.odometry.docker.ros_container import (
+    RosSystem,
+    filled,
+    server_keys,
+    warn_of_unread,
+    whole_name,
+)
+from adaptune.odometry.program import ProgramInput, WholeRun, WholeSettings
+from adaptune.odometry.remote import Faulting, Limits, pose_fault
 from adaptune.odometry.template import Template, check_names
-from adaptune.odometry.whole_run import WholeSettings
-from adaptune.sequence.config import resolve
+from adaptune.recording.clouds import PATH, POSES, Pose, usable
+from adaptune.recording.config import resolve, to_pose
+from adaptune.recording.export import IMU, POINTS, Messages, structured
+from adaptune.recording.scan import Scan
+from adaptune.ros.link import LinkError, Steering
+from adaptune.ros.ros1 import Ros1
+from adaptune.selection import Selection
 from adaptune.space import ParameterSet
+from adaptune.trajectory import Trajectory
 
 
 def _topic(name: str) -> str:
@@ -98,9 +127,564 @@ class Rustle:
     ) -> OdometryInstance:
         """Make an instance, as all programs of the user are made."""
         if settings.play == "bag":
-            from adaptune.odometry.docker.played_bag import PlayedBag
-
             return PlayedBag(parameters, settings, limits, read)
-        from adaptune.odometry.docker.lockstep import Lockstep
 
         return Lockstep(parameters, settings, limits)
+
+
+# A ROS 1 system in a container that receives scan after scan, and can change its parameters.
+
+
+_CLOUD, _IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
+_MOST_SILENT = 30
+"""Scans in a row without a pose that are a fault."""
+_BETWEEN_LOOKS = 1.0
+"""Seconds between looks at what the system has used."""
+_EARLY = 1_000_000
+"""Nanoseconds by which a pose's stamp may be before the scan's."""
+
+
+class Lockstep(Faulting):
+    """A ROS 1 system that hears a scan, and then waits for the next one until its pose is there.
+
+    It begins in a new container. Where a scan gets no pose, the last motion goes on.
+
+    Parameters
+    ----------
+    parameters, limits
+        See `Isolated`.
+    settings
+        A `RustleSettings`.
+    """
+
+    apart = True
+
+    def __init__(self, parameters: ParameterSet, settings: Any, limits: Limits):
+        super().__init__(settings.image, parameters)
+        self._settings, self._limits = settings, limits
+        self._system: RosSystem | None = None
+        self._used = self._used_before = Usage(0.0, 0.0)
+        extrinsic = settings.extrinsic
+        self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
+        self._news = threading.Condition()
+        self._poses: list[tuple[int, Poses]] = []
+        self._waiting = self._has_run = False
+        self._looked = -np.inf
+
+    @property
+    def ended(self) -> bool:
+        return self._system is None
+
+    @property
+    def usage(self) -> Usage:
+        if self._system is not None and time.monotonic() - self._looked > _BETWEEN_LOOKS:
+            self._look(self._system)
+        cpu = self._used_before.cpu + self._used.cpu
+        memory = max(self._used_before.memory or 0.0, self._used.memory or 0.0)
+        return Usage(cpu, memory, elsewhere=cpu)
+
+    def prepare(self, scan: Scan) -> Scan:
+        return scan  # the system prepares
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+        self.close()
+        if self.given_up:
+            return
+        self._T_odom_sensor = np.array(T_odom_sensor)
+        self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
+        self._T_odom_own: Poses | None = None
+        self._silent, self._stamp, self._poses = 0, prepared.stamp, []
+        self._late: int | None = None
+        self._before: tuple[int, Poses] | None = None
+        try:
+            self._begin(prepared)
+            self._show(prepared)
+            self._correct()
+        except UnavailableError:
+            raise
+        except (OdometryError, LinkError) as error:
+            told = self._told(error)
+            # One that has run can be gone for good.
+            if not self._has_run:
+                self.close()
+                raise OdometryError(f"{self.name}: {told}") from error
+            self.note_fault(told)
+
+    def submit(self, prepared: Scan) -> None:
+        self._stamp, self._waiting = prepared.stamp, True
+        if self._system is not None:
+            try:
+                self._show(prepared)
+            except UnavailableError:
+                raise
+            except (OdometryError, LinkError) as error:
+                self.note_fault(self._told(error))
+
+    def collect(self) -> Registration:
+        self._waiting = False
+        lost = Registration(np.full((4, 4), np.nan), registered=False)
+        if self._system is None:
+            return lost
+        T_before = self._T_odom_sensor
+        self._T_odom_sensor = T_before @ self._T_step
+        try:
+            registered = self._correct()
+        except UnavailableError:
+            raise
+        except (OdometryError, LinkError) as error:
+            return self.note_fault(self._told(error))
+        if registered:
+            self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
+        self._last_motion.move(self._T_odom_sensor)
+        return Registration(self._T_odom_sensor.copy(), registered)
+
+    def ready(self, seconds: float) -> bool:
+        return self._system is None or self._pose(seconds) is not None
+
+    @property
+    def busy(self) -> bool:
+        return self._waiting
+
+    def apply(self, selection: Selection) -> None:
+        """Set the node's parameters, see `adaptune.ros.link.Steering.apply`."""
+        if unknown := selection.parameters.keys() - self.parameters.keys():
+            raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
+        self.parameters |= selection.parameters
+        if self._system is not None and self._steering is not None:
+            try:
+                self._steering.apply(
+                    {
+                        whole_name(self._template, name): value
+                        for name, value in selection.parameters.items()
+                    }
+                )
+            except LinkError as error:
+                raise OdometryError(str(error)) from error
+
+    def close(self) -> None:
+        if self._system is not None:
+            self._look(self._system)
+            if self._has_run:
+                with contextlib.suppress(OdometryError, LinkError):
+                    warn_of_unread(self._system.link, self.name, self._keys)
+            self._system.close()
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._system = None
+            self._used_before = Usage(self.usage.cpu, self.usage.memory)
+            self._used = Usage(0.0, 0.0)
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _look(self, system: RosSystem) -> None:
+        """See what the system has used."""
+        self._looked = time.monotonic()
+        with contextlib.suppress(OdometryError, LinkError):
+            system.state()
+        self._used = system.usage
+
+    def _begin(self, scan: Scan) -> None:
+        """Start the system, and wait until it listens."""
+        self._template, text = filled(self._settings, self.parameters)
+        self._folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        try:
+            system = RosSystem(self._settings, self._limits.memory, text, self._folder)
+        except AdaptuneError:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
+        self._system = system
+        link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
+        self._messages = Messages(1)
+        take = weakref.WeakMethod(self._take)  # the link must not keep this alive
+        link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
+        self._clock = system.run_clock(scan.stamp)
+        self._send_cloud = link.advertise(topics[0], _CLOUD)
+        self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
+        self._topics = topics
+        system.wait(topics[0], topics if self._settings.imu else topics[:1])
+        self._keys = keys = server_keys(self._template, self.parameters, link.ask("parameters"))
+        self._steering = None
+        if (node := self._settings.node) is not None:
+
+            def set_parameters(values: ParameterSet) -> Mapping[str, Any]:
+                return link.set_parameters(node, values, keys)
+
+            command = self._settings.set_parameter
+            self._steering = Steering(node, set_parameters, command, system.run)
+
+    def _show(self, scan: Scan) -> None:
+        """Publish what the system hears until the end of a scan."""
+        with self._news:
+            self._poses = []
+        messages, (points, imu_topic) = self._messages, self._topics
+        if scan.imu is not None and self._send_imu is not None:
+            imu = scan.imu
+            measured = zip(imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True)
+            for stamp, gyro, acceleration in measured:
+                self._clock.reach(stamp)
+                header = messages.header(imu_topic, stamp, "imu")
+                self._send_imu(messages.imu(header, gyro, acceleration))
+        self._clock.reach(scan.stamp + max(scan.span, 0))
+        header = messages.header(points, scan.stamp, "lidar")
+        self._send_cloud(messages.cloud(header, structured(scan)))
+
+    def _correct(self) -> bool:
+        """Correct the predicted pose; False if the system gave none."""
+        seconds = min(self._settings.patience, self._limits.seconds)
+        found = self._pose(seconds)
+        assert self._system is not None
+        if found is None:
+            self._silent += 1
+            self._system.state()
+            if self._silent >= _MOST_SILENT:
+                published = self._system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
+                raise OdometryError(
+                    f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row; "
+                    f"topics that are published: {', '.join(sorted(published)) or 'none'}"
+                )
+            return False
+        stamp, T_own = found
+        self._silent, self._has_run = 0, True
+        if wrong := pose_fault(T_own):
+            raise OdometryError(f"it gave a pose {wrong}")
+        T_own = T_own @ self._T_base_sensor
+        if self._late is None:
+            self._late = stamp - self._stamp
+        T_own = self._at_scan(stamp, T_own)
+        if self._T_odom_own is None:
+            self._T_odom_own = self._T_odom_sensor @ invert(T_own)
+        self._T_odom_sensor = self._T_odom_own @ T_own
+        return True
+
+    def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
+        """The pose at the scan's stamp, if the system gives that at the scan's end."""
+        before, self._before = self._before, (stamp, T_own_sensor)
+        if before is None or not before[0] <= self._stamp < stamp:
+            return T_own_sensor
+        both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
+        T: Poses = both.at(np.array([self._stamp], np.int64), 1e9)[0]
+        return T
+
+    def _pose(self, seconds: float) -> tuple[int, Poses] | None:
+        """The system's pose of the scan that was published last; None if it does not come.
+
+        It comes after the scan was published. Its stamp is as late as that of the first pose was:
+        a system gives it at the scan's begin, or at its end, where the next scan begins.
+        """
+        earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
+
+        def there() -> bool:
+            return bool(self._poses) and self._poses[-1][0] >= earliest
+
+        with self._news:
+            return self._poses[-1] if self._news.wait_for(there, seconds) else None
+
+    def _take(self, kind: str, data: bytes) -> None:
+        if self._system is None or kind not in POSES:
+            return
+        found = POSES[kind](self._system.link.store.deserialize_ros1(data, kind))[-1:]
+        for stamp, _, p, q in found:
+            try:
+                T = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            except ValueError:
+                T = np.full((4, 4), np.nan)
+            with self._news:
+                self._poses = [(stamp, T)]
+                self._news.notify_all()
+
+    def _told(self, error: Exception) -> str:
+        """An error, and the last lines that the system wrote."""
+        words = "" if self._system is None else self._system.words()
+        return f"{error}: {words}" if words else str(error)
+
+
+# A ROS 1 system in a container, on a bag that is played.
+
+
+_BETWEEN_TOPIC_LOOKS = 0.1
+_BETWEEN_STATES = 1.0
+_LONGEST_PAUSE = 10.0
+"""Seconds."""
+_STEADY = 0.9
+"""Least share of poses whose stamps are as far from the scans' as those of the others."""
+
+_log = logging.getLogger(__name__)
+
+
+class PoseRecorder:
+    """Records what a system publishes on the topic of its poses."""
+
+    def __init__(self, link: Ros1, topic: str):
+        self.topic, self.store = topic, link.store
+        self.received: list[tuple[str, bytes]] = []
+        self.last = time.monotonic()
+        self.longest_pause = 0.0
+        link.record(topic, self._take)
+
+    def _take(self, kind: str, data: bytes) -> None:
+        now = time.monotonic()
+        if self.received:
+            self.longest_pause = max(self.longest_pause, now - self.last)
+        self.last = now
+        if kind == PATH:  # which repeats all poses
+            self.received.clear()
+        self.received.append((kind, data))
+
+    def poses(self) -> list[Pose]:
+        """Poses in the order in which they came, see `adaptune.recording.clouds`.
+
+        Raises
+        ------
+        OdometryError
+            If the messages hold no poses.
+        """
+        messages = self.received
+        if messages and (kind := messages[0][0]) not in POSES:
+            raise OdometryError(
+                f"{self.topic} is {kind}; odometry.settings.odometry must name poses"
+            )
+        return [pose for kind, data in messages for pose in self._poses(kind, data)]
+
+    def newest(self) -> int:
+        """Stamp of the pose that came last; 0 if there is none."""
+        if not self.received or self.received[-1][0] not in POSES:
+            return 0
+        return max((stamp for stamp, *_ in self._poses(*self.received[-1])[-1:]), default=0)
+
+    def _poses(self, kind: str, data: bytes) -> list[Pose]:
+        return POSES[kind](self.store.deserialize_ros1(data, kind))
+
+    def write(self, path: Path) -> None:
+        """Write a ROS 1 bag."""
+        write_poses(path, self.topic, self.received, self.store)
+
+
+def write_poses(
+    path: Path, topic: str, messages: list[tuple[str, bytes]], store: Typestore
+) -> None:
+    """Write messages of one type to a ROS 1 bag, at their poses' stamps."""
+    with Writer(path) as bag:
+        connection = None
+        for kind, data in messages:
+            if connection is None:
+                connection = bag.add_connection(topic, kind, typestore=store)
+            stamps = [stamp for stamp, *_ in POSES[kind](store.deserialize_ros1(data, kind))]
+            bag.write(connection, max(stamps, default=0), data)
+
+
+class PlayedBag(WholeRun):
+    """A ROS 1 system that hears a bag, from its beginning to its end."""
+
+    @property
+    def called(self) -> str:
+        return str(self.settings.image)
+
+    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
+        self._seconds: dict[str, float] = {}
+        self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
+        template, text = filled(self.settings, self.parameters)
+        source = given.path.resolve()
+        # As RUSTLE mounts the folder of a data set.
+        bag = Mount(source, f"/rustle/dataset/{source.name}")
+        with self._timed("container"):
+            system = RosSystem(self.settings, self._limits.memory, text, folder, [bag])
+        recorder, fault = PoseRecorder(system.link, self.settings.odometry), ""
+        with closing(system):
+            try:
+                renamed = self._renamed(given)
+                with self._timed("ready"):
+                    system.wait(renamed.get(given.points, given.points))
+                    keys = server_keys(template, self.parameters, system.link.ask("parameters"))
+                self._play(system, recorder, given, bag.target)
+                warn_of_unread(system.link, self.called, keys)
+                self._check_published(system, recorder)
+                return self._checked(recorder, given)
+            except AdaptuneError as error:
+                fault = str(error)
+                raise
+            finally:
+                self._finish(system, recorder, given, fault)
+
+    @contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
+        begin = time.monotonic()
+        yield
+        self._seconds[what] = time.monotonic() - begin
+
+    def _renamed(self, given: ProgramInput) -> dict[str, str]:
+        """Topics of the recording that the system expects by another name."""
+        pairs = ((given.points, self.settings.points), (given.imu, self.settings.imu))
+        renamed = {old: new for old, new in pairs if old and new and old != new}
+        # Poses that were recorded with the bag are not the system's.
+        if (odometry := self.settings.odometry) not in (given.points, given.imu):
+            renamed[odometry] = f"/recorded{odometry}"
+        return renamed
+
+    def _play(
+        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str
+    ) -> None:
+        """Play the bag and wait until nothing comes any more."""
+        n = len(given.stamps)
+        with self._timed("bag"):
+            looked = time.monotonic()
+            system.play(bag, self.settings.rate, self._renamed(given))
+            while not system.played():
+                time.sleep(_BETWEEN_TOPIC_LOOKS)
+                if time.monotonic() - looked > _BETWEEN_STATES:
+                    looked = time.monotonic()
+                    self._see(system, n)
+                self._check_time()
+        with self._timed("drained"):
+            over = time.monotonic()
+            # Nodes that sleep by the clock must wake up to finish.
+            system.run_clock(_end_of(given.path), self.settings.rate)
+            while not self._drained(recorder, over, int(given.stamps[-1])):
+                time.sleep(_BETWEEN_TOPIC_LOOKS)
+                self._check_time()
+            self._see(system, n)
+
+    def _see(self, system: RosSystem, n: int) -> None:
+        """See whether the system runs, and what it has used.
+
+        The bag sets the pace, so CPU time counts as the system's time.
+        """
+        system.state()
+        self._usage = system.usage._replace(seconds=system.usage.cpu / n)
+
+    def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
+        """Whether the pose of the last scan is there, or nothing came for a while."""
+        # Stamps of a clock of its own say nothing.
+        if last <= recorder.newest() < last + 10**9:
+            return True
+        pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
+        return bool(time.monotonic() - max(recorder.last, over) > pause)
+
+    def _check_time(self) -> None:
+        if time.monotonic() > self._end:
+            limit = f"isolation.seconds = {self._limits.seconds:g}"
+            raise OdometryError(f"it took longer than {limit} for each scan")
+
+    def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
+        if recorder.received:
+            return
+        topic, drain = self.settings.odometry, self.settings.drain
+        topics = set(system.link.topics()) - {"/clock", "/rosout"}
+        others = ", ".join(sorted(topics - {topic})) or "nothing"
+        if topic in topics:
+            raise OdometryError(
+                f"nothing was published on {topic} until {drain:g} s after the bag, though a node "
+                f"announces it (others publish {others}); a system that is slow to begin needs a "
+                f"longer odometry.settings.drain"
+            )
+        raise OdometryError(
+            f"nothing was published on {topic}, but on {others}; name its topic as "
+            f"odometry.settings.odometry"
+        )
+
+    def _finish(
+        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, fault: str
+    ) -> None:
+        """End the system, and keep what is left of the run."""
+        self._words, written = system.words(), system.log()
+        with self._timed("removed"):
+            system.stop()
+        steps = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
+        _log.info("%s: %s; %.1f s of CPU time", self.called, steps, self._usage.cpu)
+        limits = {"input": str(given.path), "rate": self.settings.rate, "cpus": self.settings.cpus}
+        about = limits | costs(self._usage, self._seconds) | ({"fault": fault} if fault else {})
+        with kept_log(given.logs, self.settings, self.parameters, about) as kept:
+            if kept is None:
+                return
+            (kept / "roscore.log").write_bytes(written)
+            system.keep(kept)
+            if recorder.received and recorder.received[0][0] in POSES:
+                recorder.write(kept / "odometry.bag")
+
+    def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
+        """The trajectory, if its stamps are those of the data."""
+        poses = recorder.poses()
+        stamps = np.array([stamp for stamp, *_ in poses], np.int64)
+        if scatter := check_stamps(stamps, given.stamps):
+            _log.warning(
+                "%s: stamps of poses scatter by up to %.3f s around those of the scans: %s, and "
+                "errors contain it",
+                *(self.called, scatter, _OWN_CLOCK),
+            )
+        trajectory, unusable = usable(poses)
+        if trajectory is None or unusable:
+            raise OdometryError(
+                f"{unusable} of {len(poses)} poses are no poses (NaN, or no rotation)"
+            )
+        n, half = len(given.stamps), 0.5 * float(np.median(np.diff(given.stamps)))
+        near = np.searchsorted(stamps, given.stamps - half) < np.searchsorted(
+            stamps, given.stamps + 2.0 * half
+        )
+        # Systems need a few scans to begin.
+        missing = int((~near[np.argmax(near) :]).sum())
+        if missing > 0.01 * n:
+            _log.warning(
+                "%s: %d of %d scans have no pose at rate %g: it drops scans, so a lower "
+                "odometry.settings.rate gives other results",
+                *(self.called, missing, n, self.settings.rate),
+            )
+        return trajectory
+
+
+_OWN_CLOCK = "the system stamps poses by its own clock, not by the scans"
+
+
+def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> float:
+    """Refuse stamps of poses that are not those of the scans.
+
+    A system that publishes one pose for a scan stamps it with the scan's start, its end, or
+    anything fixed between. One that publishes more is judged by begin and end only.
+
+    Parameters
+    ----------
+    stamps, scans
+        Nanoseconds, of shapes (m,) and (n,).
+
+    Returns
+    -------
+    float
+        Seconds by which stamps scatter around those of the scans; 0 if they do not.
+
+    Raises
+    ------
+    OdometryError
+        If they go back, or are further off than two scans. It says how far.
+    """
+    if len(stamps) < 2:
+        return 0.0
+    if backwards := int((np.diff(stamps) < 0).sum()):
+        what = f"{backwards} of {len(stamps)} poses have stamps that go back"
+        raise OdometryError(f"{what}: {_OWN_CLOCK}")
+    period = float(np.median(np.diff(scans)))
+    if stamps[-1] - scans[-1] > 1e9 + period or scans[0] - stamps[0] > 1e9 + period:
+        begin, end = (1e-9 * stamps[[0, -1]]).tolist()
+        raise OdometryError(
+            f"its poses are of {begin:.3f} s to {end:.3f} s, the scans of "
+            f"{1e-9 * scans[0]:.3f} s to {1e-9 * scans[-1]:.3f} s: {_OWN_CLOCK}"
+        )
+    if len(stamps) > 1.5 * len(scans):
+        return 0.0
+    # Pose j is of scan j, or of a later one if poses are missing before it.
+    missing = max(0, len(scans) - len(stamps))
+    n = min(len(stamps), len(scans))
+    late = 1e-9 * float(np.percentile(stamps[:n] - scans[missing : missing + n], 95))
+    early = 1e-9 * float(np.percentile(scans[:n] - stamps[:n], 95))
+    if max(late, early) > 2e-9 * period:
+        how = f"{late:.3f} s late" if late > early else f"{early:.3f} s early"
+        raise OdometryError(f"its stamps are up to {how}: {_OWN_CLOCK}")
+    i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
+    off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
+    steady = np.abs(off - np.median(off)) < max(5e6, 0.1 * period)
+    return 0.0 if steady.mean() > _STEADY else 1e-9 * float(np.percentile(off, 95))
+
+
+def _end_of(bag: Path) -> int:
+    with AnyReader([bag]) as reader:
+        return int(reader.end_time)

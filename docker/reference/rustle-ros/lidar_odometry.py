@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from adaptune.geometry import to_quaternions
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.sequence.scan import Scan
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.recording.scan import Scan
 from adaptune.space import Categorical, Integer
 
 POINTS_TOPIC = "/points"

@@ -7,12 +7,11 @@ import pytest
 from click.testing import Result
 from commands import call
 
-from adaptune import yaml
+from adaptune import files as yaml
+from adaptune.errors import ConfigurationError
 from adaptune.odometry.docker import rustle as docker_rustle
 from adaptune.space import ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
+from offline.config import OfflineConfig, load_study
 
 PARAMETERS = """
 common: {lid_topic: /velodyne_points, imu_topic: /imu/data}

@@ -7,14 +7,13 @@ import made_references
 import numpy as np
 import pytest
 
-from adaptune import terminal
+from adaptune.commands import terminal
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import RecordedSequence
+from adaptune.recording.scan import SequenceError
 from adaptune.reference import estimate
-from adaptune.reference.estimated import EstimateError
-from adaptune.reference.stored import StoredEstimate, write_estimate
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
-from adaptune.sequence.recorded import RecordedSequence
-from adaptune.sequence.sequence import SequenceError
+from adaptune.reference.stored import EstimateError, StoredEstimate, write_estimate
 from adaptune.trajectory import read_tum
 
 

@@ -3,8 +3,8 @@ import shutil
 import pytest
 from commands import call
 
-from offline.offline_study import load_study
-from online.run_replays import run_replays
+from offline.config import load_study
+from online.run import run_replays
 
 
 @pytest.fixture(scope="module")

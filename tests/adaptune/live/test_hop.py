@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from rooms import moved, scan_at, street, tunnel
 
-from adaptune.live.hop import HopCloud, Hops, register
-from adaptune.sequence.scan import Scan
+from adaptune.live.hops import HopCloud, Hops, register
+from adaptune.recording.scan import Scan
 
 EMPTY = Scan(0, np.zeros((0, 3), np.float32))
 

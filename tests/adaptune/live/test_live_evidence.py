@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from rooms import moved, scan_at, street
 
-from adaptune.live import live_evidence
-from adaptune.live.hop import LENGTHS, Hop
-from adaptune.live.live_evidence import LOST, TWICE, LiveEvidence
-from adaptune.model.bank_weights import measured_weights
+from adaptune.live import evidence
+from adaptune.live.evidence import LOST, TWICE, LiveEvidence
+from adaptune.live.hops import LENGTHS, Hop
+from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
 
 STEP = 1.0
 """Metres from scan to scan, ten a second."""
@@ -48,9 +48,9 @@ class Numbered:
 @pytest.fixture
 def exactly(monkeypatch):
     """Registrations that are right; the test may put others in their place."""
-    monkeypatch.setattr(live_evidence, "HopCloud", Numbered)
-    monkeypatch.setattr(live_evidence, "register", exact)
-    return lambda register: monkeypatch.setattr(live_evidence, "register", register)
+    monkeypatch.setattr(evidence, "HopCloud", Numbered)
+    monkeypatch.setattr(evidence, "register", exact)
+    return lambda register: monkeypatch.setattr(evidence, "register", register)
 
 
 def drive(live, n, motions, scans=None, first=0):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from rooms import moved
 
-from adaptune.live.hop import Hop
-from adaptune.live.own_error import COVERED, GROWTH, HOP_ERROR, UNSURE, Link, OwnErrors
-from adaptune.live.squares import SECONDS
+from adaptune.live.evidence import COVERED, GROWTH, HOP_ERROR, UNSURE, Link, OwnErrors
+from adaptune.live.hops import SECONDS, Hop
 
 KNOWN = np.eye(3)
 

@@ -4,10 +4,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adaptune.live.hop import NOISE
-from adaptune.live.squares import (
+from adaptune.live.hops import (
     CLIP,
     METRES,
+    NOISE,
     SECONDS,
     HopErrors,
     LiveSquares,
@@ -15,7 +15,7 @@ from adaptune.live.squares import (
     clip_to_best,
     live_squares,
 )
-from adaptune.model.bank_weights import minimum_variance_weights
+from adaptune.model.weights import minimum_variance_weights
 
 ERRORS = arrays(np.float64, (6, 4, 3), elements=st.floats(-1.0, 1.0))
 OFFSETS = arrays(np.float64, (6, 1, 3), elements=st.floats(-0.2, 0.2))

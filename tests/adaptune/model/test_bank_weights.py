@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from tables import table
 
-from adaptune.live.squares import LiveSquares
+from adaptune.live.hops import LiveSquares
 from adaptune.metrics import FAILURE
 from adaptune.model import BankRule, BankSettings, TrainingData
-from adaptune.model.bank_weights import (
+from adaptune.model.weights import (
     SMOOTHING,
     UNFAMILIAR,
     bank_weights,

@@ -1,7 +1,7 @@
 import numpy as np
 from tables import table
 
-from adaptune.model.base import TrainingData, complementary
+from adaptune.model.rules import TrainingData, complementary
 
 
 def chosen(errors, sequence, size):

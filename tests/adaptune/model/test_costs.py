@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
-from adaptune.model.bank_weights import choose_members
-from adaptune.model.base import TrainingData, complementary
-from adaptune.model.costs import Costs, SetCost, Spending
-from adaptune.parameter_sets import ParameterSets
-from adaptune.space import ParameterSpace
+from adaptune.model.rules import Costs, SetCost, Spending, TrainingData, complementary
+from adaptune.model.weights import choose_members
+from adaptune.space import ParameterSets, ParameterSpace
 
 COSTS = Costs(
     {

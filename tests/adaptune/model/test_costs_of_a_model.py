@@ -10,10 +10,9 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from adaptune.model import ErrorModel
-from adaptune.model.costs import Costs, SetCost
-from adaptune.model.model_file import checksum
-from adaptune.parameter_sets import ParameterSets
-from adaptune.pooled_space import ODOMETRY, PooledSpace
+from adaptune.model.error_model import checksum
+from adaptune.model.rules import Costs, SetCost
+from adaptune.space import ODOMETRY, ParameterSets, PooledSpace
 
 
 def test_costs_rivals_and_a_budget_survive(tmp_path):

@@ -13,7 +13,7 @@ from random_models import random_model
 from safetensors.numpy import save_file
 
 from adaptune.model import RULES, BankSettings, ErrorModel, ModelError, make_rule
-from adaptune.model.model_file import FORMAT
+from adaptune.model.error_model import FORMAT
 
 
 def test_knows_the_sensors_of_its_training():

@@ -11,8 +11,8 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from tables import table
 
 from adaptune.model import TrainingData
-from adaptune.model.base import mean_errors
 from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor, nearest_of_groups
+from adaptune.model.rules import mean_errors
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

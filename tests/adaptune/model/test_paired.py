@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tables import table
 
 from adaptune.model import RULES, PairedExpectedRatio, PairedSettings, TrainingData, make_rule
-from adaptune.model.base import complementary
+from adaptune.model.rules import complementary
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

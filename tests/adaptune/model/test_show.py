@@ -5,12 +5,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from adaptune.cli import app
+from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
-from adaptune.model.costs import Costs, SetCost
-from adaptune.parameter_sets import ParameterSets
-from adaptune.pooled_space import ODOMETRY, PooledSpace
-from adaptune.space import Categorical, Float, ParameterSpace
+from adaptune.model.rules import Costs, SetCost
+from adaptune.space import ODOMETRY, Categorical, Float, ParameterSets, ParameterSpace, PooledSpace
 from offline.config import Limit, OfflineConfig
 
 

@@ -13,14 +13,13 @@ import yaml
 from needs import lacking
 from setups import setup_of
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, ConfigurationError
 from adaptune.odometry.template import Template
-from adaptune.study.mistakes import ConfigurationError
-from offline.baseline import BaselineError
-from offline.offline_study import load_study
+from offline.campaign import BaselineError
+from offline.config import load_study
 from offline.train import train
-from online.comparison import compare
-from online.run_replays import run_replays
+from online.compare import compare
+from online.run import run_replays
 
 STUDY = """\
 odometry:

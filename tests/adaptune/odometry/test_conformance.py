@@ -28,13 +28,13 @@ from street import (
     usual_drive,
 )
 
-from adaptune import cores
+from adaptune import processes
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import prepared_bytes
 from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
+from adaptune.recording import Scan
 from adaptune.selection import Selection
-from adaptune.sequence import Scan
 
 CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 """Those that live in this process; test_conformance_isolated.py holds what the others must do."""
@@ -112,7 +112,7 @@ def test_the_same_scans_give_the_same_bytes_on_one_core(name):
 
 
 def print_digests():
-    cores.pin(0)
+    processes.pin(0)
     for name in HERE:
         poses = [drive(make(name), prepared_drive(name)) for _ in range(2)]
         found = (hashlib.sha256(of_one.tobytes()).hexdigest() for of_one in poses)

@@ -9,10 +9,10 @@ from turns import STEP, measured
 
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
-from adaptune.odometry.isolation import Isolated, Limits
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
+from adaptune.odometry.remote import Isolated, Limits
+from adaptune.recording import Scan
 from adaptune.selection import Selection
-from adaptune.sequence import Scan
 
 NAMES = [name for name in ODOMETRIES if not odometry_class(name).clean]
 """test_conformance.py holds what the others must do."""

@@ -3,9 +3,9 @@ from importlib import metadata
 
 import pytest
 
-from adaptune.odometry.command import CommandSettings
-from adaptune.odometry.content import descriptor_content, module_file, odometry_content
-from adaptune.odometry.process import ProcessSettings
+from adaptune.odometry.factory import descriptor_content, module_file, odometry_content
+from adaptune.odometry.program import CommandSettings
+from adaptune.odometry.remote import ProcessSettings
 
 
 @pytest.fixture

@@ -6,10 +6,9 @@ import turns
 from needs import lacking
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.evalio.base import Pipeline
-from adaptune.odometry.evalio.lidar import Loam, MadIcp
+from adaptune.odometry.evalio import Loam, MadIcp, Pipeline
 from adaptune.odometry.registry import odometry_class
-from adaptune.sequence import Scan
+from adaptune.recording import Scan
 
 try:
     import evalio  # noqa: F401

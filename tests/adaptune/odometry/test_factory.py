@@ -6,13 +6,12 @@ import pytest
 from needs import needs_evalio
 
 from adaptune.odometry import OdometryError
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.keyframe import KeyframeSettings
-from adaptune.odometry.program_input import ProgramInput
-from adaptune.sequence import Scan
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
+from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.remote import Limits
+from adaptune.recording import Scan
 from adaptune.space import Float, ParameterSpace
 
 SPACE = ParameterSpace({"keyframe_interval": Float(low=1.0, high=9.0, baseline=2.0)})

@@ -6,13 +6,12 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import invert
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry.frame_check import contradiction
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.tracker import Tracker
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.program import contradiction
+from adaptune.odometry.tracker import HealthCheck, Tracker
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
 
 N = 400
 

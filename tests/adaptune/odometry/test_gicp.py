@@ -7,7 +7,7 @@ from rosbags.highlevel import AnyReader
 from adaptune.geometry import from_quaternions
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
-from adaptune.sequence import pointcloud2
+from adaptune.recording import clouds
 
 
 def recording(path):
@@ -16,7 +16,7 @@ def recording(path):
     with AnyReader([path]) as reader:
         for connection, _, data in reader.messages():
             if connection.topic == "/velodyne_points":
-                scans.append(pointcloud2.decode(data, cdr=False))
+                scans.append(clouds.decode_cloud(data, cdr=False))
             elif connection.topic == "/gt_poses":
                 message = reader.deserialize(data, connection.msgtype)
                 p, q = message.pose.position, message.pose.orientation

@@ -10,12 +10,11 @@ import pytest
 from setups import setup_of
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.guarded import Guarded
-from adaptune.odometry.isolation import Isolated, Limits
+from adaptune.odometry.factory import Guarded, OdometryFactory
+from adaptune.odometry.remote import Isolated, Limits
+from adaptune.recording import Scan
 from adaptune.selection import Selection
-from adaptune.sequence import Scan
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.workers import Task, Workers, run
 
 TOLD = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from adaptune.odometry.health import Guard, HealthCheck, unhealthy
+from adaptune.odometry.tracker import Guard, HealthCheck, unhealthy
 
 CHECK = HealthCheck(max_speed=10.0, max_acceleration=5.0)
 

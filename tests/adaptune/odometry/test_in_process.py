@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from walker import Walker, at, every, x_on
 
+from adaptune.bank.bank import Bank
 from adaptune.odometry import InProcess, Motions, Odometry, OdometryError, Usage
-from adaptune.odometry.bank import Bank
 from adaptune.selection import Selection
 
 

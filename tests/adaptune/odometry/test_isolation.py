@@ -12,17 +12,18 @@ import pytest
 import turns
 from setups import setup_of
 
+from adaptune import processes
 from adaptune.archive import Archive
-from adaptune.hosting import server
 from adaptune.odometry import OdometryError, wire
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.health import HealthCheck
-from adaptune.odometry.isolation import SERVICE, Isolated, Limits
-from adaptune.odometry.keyframe import KeyframeSettings
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
+from adaptune.odometry.registry import make_here
+from adaptune.odometry.remote import SERVICE, Isolated, Limits
+from adaptune.odometry.tracker import HealthCheck
+from adaptune.processes import server
+from adaptune.recording import Imu, Scan
+from adaptune.recording.scan import ImuNoise
 from adaptune.selection import Selection
-from adaptune.sequence import Imu, Scan
-from adaptune.sequence.imu import ImuNoise
-from offline.offline_study import load_study
+from offline.config import load_study
 from offline.workers import Task, Workers, run
 from online.replay import replay
 
@@ -173,12 +174,12 @@ def exchange(*messages):
     """What a server answers to messages."""
     sent, answered = io.BytesIO(), io.BytesIO()
     for header, arrays in messages:
-        wire.send(sent, header, **arrays)
+        processes.send(sent, header, **arrays)
     sent.seek(0)
-    wire.serve(sent, answered)
+    wire.serve(sent, answered, None, make_here)
     answered.seek(0)
     answers = []
-    while (message := wire.receive(answered)) is not None:
+    while (message := processes.receive(answered)) is not None:
         answers.append(message)
     return answers
 
@@ -218,9 +219,9 @@ def test_what_an_imu_measured_arrives():
         sent = io.BytesIO()
         light = np.arange(5, dtype=np.float32)
         whole = Scan(7, np.ones((5, 3), np.float32), intensities=light, imu=given)
-        wire.send(sent, {"type": "register", "stamp": 7}, **wire.scan_arrays(whole))
+        processes.send(sent, {"type": "register", "stamp": 7}, **wire.scan_arrays(whole))
         sent.seek(0)
-        there = wire.to_scan(wire.receive(sent))
+        there = wire.to_scan(processes.receive(sent))
         assert there.times is there.rings is None
         np.testing.assert_array_equal(there.intensities, light)
         got = there.imu
@@ -230,7 +231,7 @@ def test_what_an_imu_measured_arrives():
 
 def test_a_conversation_with_the_command_line():
     process = subprocess.Popen(
-        [sys.executable, "-m", "adaptune.cli", "serve"],
+        [sys.executable, "-m", "adaptune.commands.cli", "serve"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -239,13 +240,13 @@ def test_a_conversation_with_the_command_line():
     settings = {"fault": "words", "at": 0}
     points = np.zeros((5, 3), np.float32)
     with process:
-        wire.send(process.stdin, HELLO | {"settings": settings})
-        assert wire.receive(process.stdout).header["version"] == 2
-        wire.send(process.stdin, {"type": "start", "stamp": -1}, points=points, pose=np.eye(4))
-        assert wire.receive(process.stdout).header["type"] == "done"
+        processes.send(process.stdin, HELLO | {"settings": settings})
+        assert processes.receive(process.stdout).header["version"] == 2
+        processes.send(process.stdin, {"type": "start", "stamp": -1}, points=points, pose=np.eye(4))
+        assert processes.receive(process.stdout).header["type"] == "done"
         # What the odometry writes does not come between the messages.
-        wire.send(process.stdin, {"type": "register", "stamp": 0}, points=points)
-        assert wire.receive(process.stdout).arrays["pose"][0, 3] == pytest.approx(0.1)
+        processes.send(process.stdin, {"type": "register", "stamp": 0}, points=points)
+        assert processes.receive(process.stdout).arrays["pose"][0, 3] == pytest.approx(0.1)
         process.stdin.close()
         assert b"Traceback" not in process.stderr.read()
     assert process.returncode == 0
@@ -277,5 +278,5 @@ def test_what_a_server_refuses(first, message):
     "data", [b"Hello, world!", b"\x02\0\0\0{}", b"\x05\0\0\0{}", b"\x01", b"\x03\0\0\0[1]"]
 )
 def test_what_is_no_message(data):
-    with pytest.raises(wire.WireError, match="the stream"):
-        wire.receive(io.BytesIO(data))
+    with pytest.raises(processes.WireError, match="the stream"):
+        processes.receive(io.BytesIO(data))

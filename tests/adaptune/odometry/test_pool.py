@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from street import N_SCANS, scan
 
+from adaptune.bank.hand_over import HandOver
 from adaptune.odometry import OdometryError
-from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.isolation import Limits
-from adaptune.odometry.ndt import KeyframeNdt
-from adaptune.odometry.pool import OdometryPool
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt
 from adaptune.odometry.registry import odometry_class
-from adaptune.pooled_space import ODOMETRY
+from adaptune.odometry.remote import Limits
 from adaptune.selection import Selection
-from adaptune.space import SpaceError
+from adaptune.space import ODOMETRY, SpaceError
 
 
 def factory(name, **settings):

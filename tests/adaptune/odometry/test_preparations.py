@@ -1,15 +1,11 @@
 import numpy as np
 import pytest
 
-from adaptune.odometry.base import Odometry, Registration, WarmUp
-from adaptune.odometry.gicp import KeyframeGicp, KeyframeVgicp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.keyframe import KeyframeSettings
-from adaptune.odometry.ndt import KeyframeNdt
-from adaptune.odometry.preparations import Preparations
+from adaptune.bank.hand_over import HandOver
+from adaptune.odometry.base import InProcess, Odometry, Preparations, Registration, WarmUp
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings, KeyframeVgicp
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.sequence.scan import Scan
 from adaptune.space import Float, ParameterSpace
 
 

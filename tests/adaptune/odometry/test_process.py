@@ -10,16 +10,15 @@ import pytest
 import server
 import turns
 
+from adaptune.errors import ConfigurationError
 from adaptune.odometry import OdometryError
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import MOST_FAULTS, Limits
-from adaptune.odometry.process import Process, ProcessSettings
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.remote import MOST_FAULTS, Limits, Process, ProcessSettings
 from adaptune.odometry.serving import listen
+from adaptune.recording import Scan
 from adaptune.selection import Selection
-from adaptune.sequence import Scan
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from offline.config import load_study
 
 LIMITS = Limits(seconds=20.0)
 
@@ -162,7 +161,7 @@ def test_it_is_the_same_odometry_behind_a_socket(listening, tmp_path, kind):
 
 def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
-    command = (sys.executable, "-m", "adaptune.cli", "serve", "gicp")
+    command = (sys.executable, "-m", "adaptune.commands.cli", "serve", "gicp")
     odometry = Process(NEAR, ProcessSettings(command=command), Limits(seconds=60.0))
     np.testing.assert_array_equal(drive(odometry), drive(InProcess(KeyframeGicp(NEAR))))
     assert not odometry.faults
@@ -179,7 +178,7 @@ def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
 )
 def test_what_cannot_be_served(arguments, words):
     done = subprocess.run(
-        [sys.executable, "-m", "adaptune.cli", "serve", *arguments],
+        [sys.executable, "-m", "adaptune.commands.cli", "serve", *arguments],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         check=False,

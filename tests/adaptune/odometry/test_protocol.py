@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 from street import N_SCANS, drive, make, scan
 
+from adaptune.bank.bank import Bank
+from adaptune.bank.hand_over import HandOver
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError, OdometryInstance, Usage, WarmUp
-from adaptune.odometry.bank import Bank
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Isolated, Limits
-from adaptune.odometry.keyframe import KeyframeSettings
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
+from adaptune.odometry.remote import Isolated, Limits
 from adaptune.selection import Selection
 
 BASELINE = KeyframeGicp.space.baseline

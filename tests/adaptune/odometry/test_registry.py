@@ -4,7 +4,7 @@ from importlib import metadata
 import pytest
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.gicp import KeyframeGicp
+from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.registry import ODOMETRIES, odometry_class, versions
 
 MINE = """
@@ -65,7 +65,7 @@ def test_names_that_do_not_do(name, message):
 
 def test_an_odometry_that_a_package_announces(monkeypatch):
     point = metadata.EntryPoint(
-        "theirs", "adaptune.odometry.gicp:KeyframeGicp", "adaptune.odometries"
+        "theirs", "adaptune.odometry.keyframe:KeyframeGicp", "adaptune.odometries"
     )
     monkeypatch.setattr("adaptune.plugins.entry_points", lambda group: [point][: "odom" in group])
     assert odometry_class("theirs") is KeyframeGicp

@@ -5,7 +5,7 @@ from needs import needs_evalio
 
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.scan_time import END, MIDDLE, START, AtStamp, duration_of
-from adaptune.sequence.scan import Scan
+from adaptune.recording.scan import Scan
 
 TURN = 10**8
 

@@ -20,14 +20,13 @@ from rooms import moved
 
 from adaptune.geometry import invert, steps
 from adaptune.metrics import sub_trajectory_rte
+from adaptune.recording.scan import Scan
 from adaptune.reference import estimate
-from adaptune.reference.consensus import HALVES, Consensus
 from adaptune.reference.estimate import estimate_reference, estimated
-from adaptune.reference.estimated import EstimateError
-from adaptune.reference.registering import Guess, pass_over
-from adaptune.sequence.scan import Scan
+from adaptune.reference.registering import HALVES, Consensus, Guess, pass_over
+from adaptune.reference.stored import EstimateError
 from adaptune.simulation import Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 from adaptune.trajectory import Trajectory
 
 N = 121

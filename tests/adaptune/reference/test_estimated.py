@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from made_passes import straight
 
 from adaptune.metrics import window_ends
-from adaptune.reference.estimated import (
+from adaptune.reference.stored import (
     BREAK,
     HALVES_TO_WHOLE,
     OF_BOTH,

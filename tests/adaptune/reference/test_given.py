@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rooms import moved, scan_at, street
 
-from adaptune.live.hop import Hops
-from adaptune.reference.given import (
+from adaptune.live.hops import Hops
+from adaptune.reference.check import (
     MeasuredReference,
     common_poses,
     mean_difference,

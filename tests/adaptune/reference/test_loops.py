@@ -4,8 +4,8 @@ from made_passes import chained, straight
 from rooms import moved, scan_at, street
 
 from adaptune.metrics import travelled
-from adaptune.reference.loops import EVERY, LATER, MOST, NEAR, Loop, closed, loops
-from adaptune.sequence.scan import Scan
+from adaptune.recording.scan import Scan
+from adaptune.reference.graph import EVERY, LATER, MOST, NEAR, Loop, closed, loops
 
 
 def circle(metres, laps, step=0.5):

@@ -1,8 +1,8 @@
 import pytest
 
-from adaptune.inspect import inspect
-from adaptune.reference.estimated import EstimateError
-from adaptune.reference.of_recording import estimated_name, recording_config
+from adaptune.recording.inspect import inspect
+from adaptune.reference.check import estimated_name, recording_config
+from adaptune.reference.stored import EstimateError
 
 
 def test_the_sequence_is_the_one_that_inspect_proposes(study_file, tmp_path):

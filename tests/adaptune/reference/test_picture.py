@@ -7,9 +7,7 @@ from made_passes import straight
 from made_references import made_of
 from pictures import is_white, texts
 
-from adaptune.reference.estimated import Registrations
-from adaptune.reference.picture import draw_estimate
-from adaptune.reference.stored import StoredEstimate
+from adaptune.reference.stored import Registrations, StoredEstimate, draw_estimate
 
 NAN = float("nan")
 

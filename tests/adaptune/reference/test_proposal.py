@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from adaptune.live.own_error import OwnError
-from adaptune.reference.proposal import accuracy_words, advice, proposed_sub_trajectory
+from adaptune.live.evidence import OwnError
+from adaptune.reference.check import accuracy_words, advice, proposed_sub_trajectory
 from adaptune.trajectory import Trajectory
 
 

@@ -8,8 +8,9 @@ from made_passes import course, passed, straight, truth
 from rooms import moved
 
 from adaptune.geometry import invert, steps
-from adaptune.live.hop import Hop, HopCloud
+from adaptune.live.hops import Hop, HopCloud
 from adaptune.metrics import travelled
+from adaptune.recording.scan import Scan
 from adaptune.reference import registering
 from adaptune.reference.registering import (
     DEPARTURE,
@@ -18,7 +19,6 @@ from adaptune.reference.registering import (
     SPACING,
     pass_over,
 )
-from adaptune.sequence.scan import Scan
 
 N_MEMBERS = 3
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from made_passes import straight
 from made_references import made_of
 
-from adaptune.reference.estimated import EstimateError
-from adaptune.reference.stored import StoredEstimate, write_estimate
+from adaptune.reference.stored import EstimateError, StoredEstimate, write_estimate
 from adaptune.trajectory import read_tum
 
 ABOUT = {"bag": "drive.bag", "topics": ["/points"], "version": 1}
@@ -68,7 +67,7 @@ def test_what_is_known_is_written_last(tmp_path, monkeypatch):
     def fails(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("adaptune.reference.picture.draw_estimate", fails)
+    monkeypatch.setattr("adaptune.reference.stored.draw_estimate", fails)
     with pytest.raises(KeyboardInterrupt):
         write_estimate(tmp_path / "drive.tum", reference(), ABOUT)
     assert StoredEstimate.read(tmp_path / "drive.tum") is None
@@ -139,7 +138,7 @@ def test_a_sound_file_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "at", ["adaptune.reference.picture.draw_estimate", "adaptune.reference.stored.write_text"]
+    "at", ["adaptune.reference.stored.draw_estimate", "adaptune.reference.stored.write_text"]
 )
 def test_what_was_known_before_is_not_of_new_poses(tmp_path, monkeypatch, at):
     path = tmp_path / "one.tum"

@@ -18,8 +18,8 @@ import pytest
 from needs import needs_ros1
 
 from adaptune.keeper import descendants
+from adaptune.ros.link import LinkError
 from adaptune.ros.ros1 import local_ros1, ros_python
-from adaptune.ros.ros_link import LinkError
 from adaptune.trajectory import read_tum
 
 ROBOT = Path(drives.__file__).with_name("ros1_robot.py")

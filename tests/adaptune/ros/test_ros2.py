@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import ros2_node
 
-from adaptune.odometry.base import import_extra
+from adaptune.errors import import_extra
+from adaptune.ros.link import LinkError
 from adaptune.ros.ros2 import Ros2, message_types
-from adaptune.ros.ros_link import LinkError
 from adaptune.trajectory import read_tum
-from offline.offline_study import load_study
-from online.robot_drive import RobotDrive
+from offline.config import load_study
+from online.robot import RobotDrive
 
 STORE = message_types()
 HASHES = {  # as ROS 2 Jazzy has them

@@ -4,17 +4,16 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import invert
 from adaptune.simulation import MOTIONS
-from adaptune.simulation.inertial import GRAVITY, T_IMU_LIDAR, ideal, measure
-from adaptune.simulation.ride import Ride
-from adaptune.simulation.road import Road
-from adaptune.simulation.scenes import scene
+from adaptune.simulation.record import GRAVITY, T_IMU_LIDAR, ideal, measure
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.world import Ride, Road
 
 RATE = 400
 
 
 @pytest.fixture(scope="module")
 def ride():
-    return Ride(Road([(scene("garden"), 60.0)], seed=2), MOTIONS["handheld"], seed=2)
+    return Ride(Road([(SCENES["garden"], 60.0)], seed=2), MOTIONS["handheld"], seed=2)
 
 
 def test_integrating_the_measurements_gives_the_truth_back(ride):

@@ -1,6 +1,6 @@
 import numpy as np
 
-from adaptune.simulation.noise import fractal, fractal_plane
+from adaptune.simulation.mesh import fractal, fractal_plane
 
 RNG = np.random.default_rng(0)
 

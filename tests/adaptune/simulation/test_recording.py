@@ -6,11 +6,10 @@ from pictures import is_white, texts
 from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert, rotation_angle, steps
-from adaptune.sequence.config import SequenceConfig
-from adaptune.sequence.opening import open_sequence
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.opening import open_sequence
 from adaptune.simulation import Course, SimulationError
-from adaptune.simulation.recording import record, undistort
-from adaptune.simulation.simulate import Drive, simulate
+from adaptune.simulation.record import Drive, record, simulate, undistort
 from adaptune.trajectory import read_kitti, read_tum
 
 COURSE = Course(

@@ -3,14 +3,13 @@ import pytest
 
 from adaptune.geometry import invert, steps
 from adaptune.simulation import MOTIONS
-from adaptune.simulation.ride import Ride
-from adaptune.simulation.road import Road
-from adaptune.simulation.scenes import scene
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.world import Ride, Road
 
 
 @pytest.fixture(scope="module", params=MOTIONS)
 def ride(request):
-    road = Road([(scene("street"), 60.0), (scene("field"), 60.0)], seed=1)
+    road = Road([(SCENES["street"], 60.0), (SCENES["field"], 60.0)], seed=1)
     return Ride(road, MOTIONS[request.param], seed=1), MOTIONS[request.param], road
 
 
@@ -47,7 +46,7 @@ def test_vehicle_keeps_to_its_limits_and_the_road(ride):
 
 
 def test_it_shakes():
-    road = Road([(scene("corridor"), 60.0)], seed=0)
+    road = Road([(SCENES["corridor"], 60.0)], seed=0)
     ride = Ride(road, MOTIONS["handheld"], seed=0)
     turns = steps(ride.poses(np.arange(0.0, ride.duration, 0.1)))[:, :3, :3]
     assert 0.002 < np.std(turns[:, 2, 1]) < 0.1

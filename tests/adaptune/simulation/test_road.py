@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from adaptune.simulation.road import APRON, Road
-from adaptune.simulation.scenes import scene
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.world import APRON, Road
 
 
 @pytest.fixture(scope="module")
 def road():
-    return Road([(scene(n), 40.0) for n in ("cave", "street", "garden", "open")], seed=3)
+    return Road([(SCENES[n], 40.0) for n in ("cave", "street", "garden", "open")], seed=3)
 
 
 def test_stations_and_coordinates_are_inverse(road):
@@ -34,7 +34,7 @@ def test_scenes_share_the_ground_without_a_step(road):
 
 
 def test_neighbours_of_one_kind_are_one_leg():
-    cave, street = scene("cave"), scene("street")
+    cave, street = SCENES["cave"], SCENES["street"]
     road = Road([(cave, 10.0), (cave, 15.0), (street, 10.0)], seed=0)
     assert [(leg.scene, leg.start, leg.stop) for leg in road.legs] == [
         (cave, -APRON, 25.0),

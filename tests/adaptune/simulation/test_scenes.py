@@ -4,7 +4,7 @@ import pytest
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, Course
-from adaptune.simulation.simulate import simulate
+from adaptune.simulation.record import simulate
 
 
 @pytest.mark.parametrize("scene", SCENES)

@@ -3,12 +3,11 @@ import itertools
 import numpy as np
 import pytest
 
-from adaptune import open3d
+from adaptune import files
 from adaptune.geometry import invert
 from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg
-from adaptune.simulation.movers import populate
-from adaptune.simulation.simulate import EPOCH, Drive, simulate
-from adaptune.simulation.world import World
+from adaptune.simulation.record import EPOCH, Drive, simulate
+from adaptune.simulation.world import World, populate
 
 
 def course(*scenes, **given):
@@ -22,7 +21,7 @@ def some(course, n):
 
 def surface(drive, station, reach):
     """Scene in which the distance to the world's surface can be asked for."""
-    o3d = open3d.load()
+    o3d = files.load()
     mesh = World(drive.road).around(station, reach)
     scene = o3d.t.geometry.RaycastingScene()
     tensor = o3d.core.Tensor.from_numpy

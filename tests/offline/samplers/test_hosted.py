@@ -5,14 +5,12 @@ import re
 import optuna
 import pytest
 
-from adaptune import hosting
+from adaptune import processes
+from adaptune.errors import ConfigurationError
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from adaptune.study.mistakes import ConfigurationError
-from offline.config import OfflineConfig
-from offline.offline_study import load_study
+from offline.config import OfflineConfig, load_study
 from offline.samplers import make_sampler
-from offline.samplers.asked import AskedSampler
-from offline.samplers.hosted import HostedSampler
+from offline.samplers.samplers import AskedSampler, HostedSampler
 from offline.samplers.settings import SamplerError
 
 MINE = """
@@ -72,7 +70,7 @@ SPACE = ParameterSpace(
 
 @pytest.fixture(autouse=True)
 def mine(tmp_path, monkeypatch):
-    hosting.server.cache_clear()
+    processes.server.cache_clear()
     (tmp_path / "users_samplers.py").write_text(MINE)
     monkeypatch.syspath_prepend(str(tmp_path))
 
@@ -133,7 +131,7 @@ def test_one_that_goes_wrong_is_named(name, words):
 )
 def test_settings_that_do_not_do(monkeypatch, study_file, settings, words):
     if "3" in settings:
-        monkeypatch.setattr(hosting, "IMPORT_SECONDS", 2.0)
+        monkeypatch.setattr(processes, "IMPORT_SECONDS", 2.0)
     given = ["offline.sampler=users_samplers:Picky", f"offline.sampler_settings={settings}"]
     with pytest.raises(ConfigurationError, match=re.escape(words)):
         load_study(study_file, given)

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 from offline.config import OfflineConfig
 from offline.samplers import make_sampler
-from offline.samplers.grid import Grid, make_grid
-from offline.samplers.settings import Span
+from offline.samplers.settings import Grid, Span, make_grid
 
 SPACE = ParameterSpace(
     {

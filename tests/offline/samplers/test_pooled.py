@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.pooled_space import ODOMETRY, PooledSpace
-from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSpace, PooledSpace
 from offline.config import OfflineConfig
 from offline.samplers import make_sampler
 

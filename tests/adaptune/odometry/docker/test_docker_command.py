@@ -18,12 +18,12 @@ from contained import (
 from needs import reference_image
 from setups import setup_of
 
-from adaptune.odometry.docker.docker_command import DockerCommand, DockerCommandSettings
+from adaptune.errors import ConfigurationError
 from adaptune.odometry.docker.engine import Container, EngineError
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.docker.programs import DockerCommand, DockerCommandSettings
+from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template
-from adaptune.study.mistakes import ConfigurationError
-from offline.offline_study import load_study
+from offline.config import load_study
 
 PLAIN = ("odometry-plain", "{points}")
 

@@ -6,12 +6,12 @@ from contained import FIXED, LIMITS, VALUES, containers, drive, host_poses, scan
 from needs import reference_image
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker import docker_process
-from adaptune.odometry.docker.docker_process import DockerProcess, DockerProcessSettings
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.docker import programs
 from adaptune.odometry.docker.engine import engine
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.in_process import InProcess
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.docker.programs import DockerProcess, DockerProcessSettings
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.remote import Limits
 from adaptune.selection import Selection
 
 SERVE = ("odometry-serve", "{socket}")
@@ -109,7 +109,7 @@ def test_one_that_is_killed_is_a_fault_and_the_next_start_works(make):
     ],
 )
 def test_programs_that_do_not_serve(make, script, words, monkeypatch):
-    monkeypatch.setattr(docker_process, "FIRST_ANSWER", 3.0)
+    monkeypatch.setattr(programs, "FIRST_ANSWER", 3.0)
     odometry = make(shell(script), limits=Limits(memory=0.3))
     with pytest.raises(OdometryError, match=rf"{reference_image()}: {words}$"):
         odometry.start(scans()[0], np.eye(4))
@@ -135,7 +135,7 @@ def test_one_that_takes_too_much_memory_on_the_way(make):
 
 
 def test_one_that_answers_nothing(make, monkeypatch):
-    monkeypatch.setattr(docker_process, "FIRST_ANSWER", 3.0)
+    monkeypatch.setattr(programs, "FIRST_ANSWER", 3.0)
     quiet = GREEDY.replace("bytearray(10**9)", "import time\ntime.sleep(300)")
     odometry = make(settings("python3", "-c", quiet, "{socket}"), limits=Limits(seconds=0.5))
     odometry.start(scans()[0], np.eye(4))

@@ -12,7 +12,7 @@ import requests
 from contained import LABEL
 from needs import reference_image
 
-from adaptune.odometry.base import OdometryError
+from adaptune.errors import OdometryError
 from adaptune.odometry.docker import engine as engine_module
 from adaptune.odometry.docker.engine import (
     Container,

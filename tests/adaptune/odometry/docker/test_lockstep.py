@@ -19,14 +19,14 @@ from contained import (
 )
 from needs import reference_image
 
+from adaptune.bank.hand_over import HandOver
 from adaptune.odometry import OdometryError, WarmUp
-from adaptune.odometry.docker import lockstep
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.docker import rustle as lockstep
 from adaptune.odometry.docker.engine import engine
 from adaptune.odometry.docker.ros_container import RosSystem
 from adaptune.odometry.docker.rustle import Rustle
-from adaptune.odometry.gicp import KeyframeGicp
-from adaptune.odometry.hand_over import HandOver
-from adaptune.odometry.in_process import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.selection import Selection
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")

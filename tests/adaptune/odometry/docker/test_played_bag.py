@@ -29,9 +29,8 @@ from rosbags.highlevel import AnyReader
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker import ros_container
 from adaptune.odometry.docker.engine import image_digest
-from adaptune.odometry.docker.played_bag import PlayedBag
-from adaptune.odometry.docker.rustle import Rustle
-from adaptune.odometry.isolation import Limits
+from adaptune.odometry.docker.rustle import PlayedBag, Rustle
+from adaptune.odometry.remote import Limits
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 

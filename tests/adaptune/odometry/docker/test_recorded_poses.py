@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker.played_bag import PoseRecorder, check_stamps, write_poses
-from adaptune.sequence.pose_messages import POSES, usable
+from adaptune.odometry.docker.rustle import PoseRecorder, check_stamps, write_poses
+from adaptune.recording.clouds import POSES, usable
 
 PERIOD = 10**8
 SCANS = 1_700_000_000_123_456_789 + PERIOD * np.arange(40)

@@ -3,7 +3,7 @@ import yaml
 from contained import template
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker.ros_parameters import server_keys, warn_of_unread
+from adaptune.odometry.docker.ros_container import server_keys, warn_of_unread
 from adaptune.odometry.template import Template
 
 HELD = {

@@ -1,0 +1,1 @@
+"""Several odometries side by side, and the weighted mean of their motions."""

@@ -1,0 +1,632 @@
+"""A bank: instances with different parameters, and the weighted mean of their motions."""
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from adaptune.bank.agreement import Agreement
+from adaptune.bank.members import spread
+from adaptune.errors import OdometryError
+from adaptune.geometry import Poses, invert, rectify, squared_ranges
+from adaptune.odometry.base import (
+    LastMotion,
+    Motions,
+    OdometryInstance,
+    Preparations,
+    PreparedScan,
+    Registration,
+    Usage,
+    WarmUp,
+)
+from adaptune.odometry.factory import Factory
+from adaptune.recording.scan import Imu, Scan, joined
+from adaptune.selection import Selection
+from adaptune.space import ODOMETRY, ParameterSet
+
+# The scans of the last seconds, on which a new instance builds its map before it takes over.
+
+
+Make = Callable[[ParameterSet], OdometryInstance]
+"""Makes a new instance with these parameters."""
+
+
+class PastScan(NamedTuple):
+    """A scan with the pose and the motion that were found for it."""
+
+    scan: PreparedScan
+    T_odom_sensor: Poses
+    T_previous_current: Poses | None
+
+    @property
+    def imu(self) -> Imu | None:
+        """What the IMU measured since the scan before."""
+        return self.scan.scan.imu
+
+
+class RecentScans:
+    """The scans of the last seconds.
+
+    Parameters
+    ----------
+    warm_up
+        Which of them a new instance sees.
+    """
+
+    def __init__(self, warm_up: WarmUp):
+        self._warm_up = warm_up
+        self._past: deque[PastScan] = deque()
+        self._n_dropped = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._past)
+
+    def start(self, scan: PreparedScan, T_odom_sensor: Poses, motion: Poses | None) -> None:
+        """Forget all scans and begin with this one."""
+        self._past, self._n_dropped = deque([PastScan(scan, T_odom_sensor, motion)]), 0
+
+    def add(self, scan: PreparedScan, T_odom_sensor: Poses) -> None:
+        """Add the newest scan and drop those that are too old."""
+        T_previous_current = invert(self.last.T_odom_sensor) @ T_odom_sensor
+        self._past.append(PastScan(scan, T_odom_sensor, T_previous_current))
+        while len(self._past) > 1 and self._age(self._past[0]) > self._warm_up.seconds:
+            self._past.popleft()
+            self._n_dropped += 1
+
+    @property
+    def last(self) -> PastScan:
+        """The newest scan."""
+        return self._past[-1]
+
+    def replay_to(self, odometry: OdometryInstance) -> "Successor":
+        """Start an instance with the first of these scans; the others wait for it."""
+        _, full_rate, stride = self._warm_up
+        seen: list[PastScan] = []
+        missed: list[Imu] = []
+        for number, past in enumerate(self._past, self._n_dropped):
+            if self._age(past) <= full_rate or number % stride == 0:
+                seen.append(self._with_imu(past, missed))
+                missed = []
+            elif seen and past.imu is not None:
+                missed.append(past.imu)
+        return Successor(odometry, seen)
+
+    def _with_imu(self, past: PastScan, missed: list[Imu]) -> PastScan:
+        """A scan with all IMU measurements since the last scan that the instance sees."""
+        scan = past.scan.scan
+        if not missed or scan.imu is None:
+            return past
+        joint = replace(scan, imu=joined([*missed, scan.imu]))
+        return past._replace(scan=past.scan.with_scan(joint))
+
+    def _age(self, past: PastScan) -> float:
+        return (self.last.scan.stamp - past.scan.stamp) * 1e-9
+
+
+class Successor:
+    """A new instance on its way through scans of the past, of which some are still waiting.
+
+    `T_own_sensor`, of shape (4, 4), is its own newest pose.
+    """
+
+    def __init__(self, odometry: OdometryInstance, past: Iterable[PastScan]):
+        self.odometry = odometry
+        self.waiting = deque(past)
+        self._start(self.waiting.popleft())
+
+    def catch_up(self, n: int | None = None) -> None:
+        """See at most `n` more scans, or all."""
+        for _ in range(len(self.waiting) if n is None else n):
+            if self.waiting:
+                self.submit()
+                self.collect()
+
+    def submit(self) -> None:
+        """Begin to register the next of the scans that wait."""
+        self._submitted = self.waiting.popleft()
+        self.odometry.submit(self._submitted.scan.by(self.odometry))
+
+    def collect(self) -> None:
+        """Wait for its pose."""
+        self.T_own_sensor = self.odometry.collect().T_odom_sensor
+        if not np.isfinite(self.T_own_sensor).all():
+            # It begins without a past.
+            self._start(self.waiting.pop() if self.waiting else self._submitted)
+            self.waiting.clear()
+
+    def _start(self, past: PastScan) -> None:
+        prepared = past.scan.by(self.odometry)
+        self.odometry.start(prepared, past.T_odom_sensor, past.T_previous_current)
+        self.T_own_sensor = past.T_odom_sensor
+
+
+def catch_up_together(successors: Sequence[Successor]) -> None:
+    """See all scans that wait; those at the end register while those at the beginning do."""
+    while waiting := [one for one in successors if one.waiting]:
+        for one in waiting:
+            one.submit()
+        for one in reversed(waiting):
+            one.collect()
+
+
+# How well motions place the newest scan on the scans before it: what tells a lost member.
+
+
+N_POINTS = 2000
+"""About as many points of the newest scan are placed."""
+CUT_OFF = 1.0
+"""Metres that a distance counts at most: what was hidden before tells nothing."""
+KEPT = 2.0
+"""Seconds for which scans are kept."""
+_CELL = 0.25
+"""Metres between points of the scans before. Without thinning, rings on the ground, which stand
+still whatever the sensor does, would outnumber the rest."""
+_NEAR = 1.0
+"""Metres within which points may be the robot's own."""
+
+
+class ShortRegistrations:
+    """Mean distances of the newest scan from earlier ones, where motions place it.
+
+    Scans are only kept. Work is done where somebody asks. Calling it gives what
+    `adaptune.bank.agreement.Alignment` describes.
+    """
+
+    def __init__(self) -> None:
+        self._clouds: deque[_Cloud] = deque()
+
+    def start(self, stamp: int, points: NDArray[np.float32]) -> None:
+        """Forget all scans and begin with this one."""
+        self._clouds = deque([_Cloud(stamp, points)])
+
+    def add(self, stamp: int, points: NDArray[np.float32]) -> None:
+        """Add the newest scan, of shape (n, 3), and its stamp in nanoseconds."""
+        self._clouds.append(_Cloud(stamp, points))
+        while len(self._clouds) > 2 and stamp - self._clouds[0].stamp > KEPT * 1e9:
+            self._clouds.popleft()
+
+    def __call__(self, T_then_now: Poses, ago: tuple[int, ...]) -> NDArray[np.float64]:
+        """Mean distances of shape (n_members,), see `Alignment`."""
+        thinned = self._clouds[-1].thinned
+        points = thinned[:: max(1, len(thinned) // N_POINTS)]
+        found = [np.full(T_then_now.shape[1], np.inf)]
+        for T, n in zip(T_then_now, ago, strict=True):
+            then = self._clouds[-1 - n] if n < len(self._clouds) else None
+            if then is None or not len(points) or not len(then.thinned):
+                continue
+            placed = points @ T[:, :3, :3].swapaxes(-1, -2) + T[:, None, :3, 3]
+            distances, _ = then.tree.query(placed, distance_upper_bound=CUT_OFF)
+            found.append(np.minimum(distances, CUT_OFF).mean(axis=1))
+        return np.asarray(np.mean(found[1:] or found, axis=0))
+
+
+class _Cloud:
+    """A scan, thinned and searched only where it is asked for."""
+
+    def __init__(self, stamp: int, points: NDArray[np.float32]):
+        self.stamp, self._points = stamp, points
+
+    @cached_property
+    def thinned(self) -> NDArray[np.float64]:
+        """A point in each cell of the scan, of shape (n, 3)."""
+        points = self._points[squared_ranges(self._points) > _NEAR**2].astype(np.float64)
+        if not len(points):
+            return points
+        return np.asarray(small_gicp.voxelgrid_sampling(points, _CELL).points()[:, :3])
+
+    @cached_property
+    def tree(self) -> Any:
+        """What finds the nearest of its thinned points."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.thinned)
+
+
+# Members of a bank that do not keep up with the sensor.
+
+
+ALWAYS = 5.0
+"""A member that is late at every scan for so many seconds is removed."""
+_INTERVALS = 11
+"""Newest intervals between scans whose median says when the next scan is due."""
+_POLL = 0.005
+"""Seconds from one look at a member to the next."""
+
+
+class Lateness:
+    """Collects the poses of members that are in time, and does not wait for the others.
+
+    A member in another process has until the next scan is due. One that needs longer is late: it
+    has no motion over that scan, and takes part again as soon as it is done. Members of this
+    process are never late, for everything waits for them.
+
+    Parameters
+    ----------
+    members, names
+        Of the bank.
+    rate
+        Times as fast as recorded at which scans come; None if the bank waits for everybody.
+
+    Attributes
+    ----------
+    scans : ndarray of shape (n_members,)
+        At how many scans each member was late.
+    removed : ndarray of shape (n_members,)
+        Members that were always late: they take no part any more.
+    away : ndarray of shape (n_members,)
+        Members that are restarting.
+    resting : ndarray of shape (n_members,)
+        Members that are given no scans; the bank says which, before each scan.
+    absent : ndarray of shape (n_members,)
+        Members that have no motion over the newest scan.
+    """
+
+    def __init__(
+        self, members: Sequence[OdometryInstance], names: Sequence[str], rate: float | None
+    ):
+        n = len(members)
+        self.scans = np.zeros(n, np.intp)
+        self.removed, self.resting, self.absent, self.away = np.zeros((4, n), np.bool_)
+        self._members, self._names, self._rate = members, names, rate
+        self._owing = np.zeros(n, np.bool_)
+        self._behind = np.zeros(n)  # seconds for which each member has been late
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        # The bank's pose at the last scan that each member was given.
+        self._T_odom_given = np.tile(np.eye(4), (n, 1, 1))
+
+    def settle(self) -> None:
+        """Wait for all that is owed, as before everybody starts again."""
+        for i in np.flatnonzero(self._owing & ~self.removed).tolist():
+            self._members[i].collect()
+        self._owing[:] = self.away[:] = False
+        self.absent = self.removed | self.resting
+
+    def begin(self) -> None:
+        """A scan is there: take what came late. Members that still work are absent."""
+        self._begun = time.perf_counter()
+        if self._rate is None:
+            self.absent = self.resting.copy()
+            return
+        for i in np.flatnonzero(self._owing).tolist():
+            if self._members[i].ready(0.0):
+                self._members[i].collect()
+                self._owing[i] = False
+        busy = [member.busy for member in self._members]
+        self.absent = self._owing | self.removed | self.resting | self.away | np.array(busy)
+        if self.absent.all() and (first := self._first(self._owing)) is not None:
+            self._members[first].collect()
+            self._owing[first] = self.absent[first] = False
+
+    def _first(self, owing: NDArray[np.bool_]) -> int | None:
+        """Wait for the first of these members that are not removed; None if there are none."""
+        members = np.flatnonzero(owing & ~self.removed).tolist()
+        while members:
+            for i in members:
+                if self._members[i].ready(_POLL):
+                    return int(i)
+        return None
+
+    def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
+        """The poses of all members; NaN for those that are absent, or late.
+
+        Parameters
+        ----------
+        order
+            Numbers of the members, in the order in which they are collected.
+        interval
+            Seconds from the scan before to this one.
+        """
+        self._intervals.append(interval)
+        found = [Registration(np.full((4, 4), np.nan), registered=False)] * len(self._members)
+        for i in order:
+            if self._is_in_time(i):
+                self._behind[i] = 0.0
+                found[i] = self._members[i].collect()
+            else:
+                self._owing[i] |= not self.absent[i]
+                self._note(i, interval)
+        if not any(np.isfinite(one.T_odom_sensor).all() for one in found):
+            first = self._first(self._owing & ~self.absent)
+            if first is not None:
+                self._owing[first], self._behind[first] = False, 0.0
+                found[first] = self._members[first].collect()
+        return found
+
+    def _is_in_time(self, i: int) -> bool:
+        if self.absent[i] or self._rate is None:
+            return not self.absent[i]
+        left = self._begun + median(self._intervals) / self._rate - time.perf_counter()
+        return self._members[i].ready(left)
+
+    def _note(self, i: int, interval: float) -> None:
+        if self.removed[i] or self.resting[i] or self.away[i]:
+            return
+        self.scans[i] += 1
+        # Another member of its process may be at work.
+        self._behind[i] += interval if self._owing[i] else 0.0
+        # Somebody has to go on.
+        if self._behind[i] >= ALWAYS and self.removed.sum() < len(self._members) - 1:
+            self.removed[i] = True
+            what = "%s was late for %g s; the bank goes on without it"
+            _log.warning(what, self._names[i], ALWAYS)
+
+    def motion(self, i: int, T_odom_previous: Poses) -> Poses:
+        """A member's motion over the newest scan, of shape (4, 4); NaN if it is absent or late.
+
+        Where the member has missed scans, it moved there as the bank did.
+
+        Parameters
+        ----------
+        i
+            Number of the member.
+        T_odom_previous
+            The bank's pose at the scan before.
+        """
+        if self.absent[i] or self._owing[i]:
+            return np.full((4, 4), np.nan)
+        T_moved = self._members[i].motions.T_previous_current
+        T_given = self._T_odom_given[i]
+        if self._rate is None or np.array_equal(T_given, T_odom_previous):
+            return T_moved
+        missed: Poses = invert(T_odom_previous) @ T_given
+        return np.asarray(missed @ T_moved)
+
+    def given(self, T_odom_sensor: Poses) -> None:
+        """Take note of the bank's pose at a scan that all present members were given."""
+        if self._rate is not None:
+            self._T_odom_given[~self.absent] = T_odom_sensor
+
+    def back(self, i: int, T_odom_sensor: Poses) -> None:
+        """A member has restarted, and seen the scan of this pose of the bank's."""
+        self.away[i] = False
+        self._T_odom_given[i] = T_odom_sensor
+
+    @property
+    def working(self) -> NDArray[np.bool_]:
+        """Members that cannot be restarted now, of shape (n_members,)."""
+        return self._owing | self.absent | self.away
+
+
+CATCH_UP = 3
+"""Scans of the past that a member that restarts sees with every new scan, in real time."""
+
+_log = logging.getLogger(__name__)
+
+
+class Bank(OdometryInstance):
+    """Several instances, each with its own parameters and each on every scan.
+
+    The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
+    others restart on the scans of the last seconds, at most once a second. So does a member that a
+    fault has ended, until it has had too many of them: it costs its weight, and nothing else.
+    Members that rest see no scans; when they are to work again, they begin on those of the last
+    seconds, too.
+
+    Parameters
+    ----------
+    make
+        Makes instances.
+    sets
+        Parameter sets by trial number. The first is the fixed one: it begins with all the weight.
+    warm_up
+        Which scans a member sees when it restarts.
+    lost_track
+        Metres a second by which motions may never differ and agree.
+    cores
+        That the members may use, if `make` is a factory, see `spread`. The motions are the same.
+    rate
+        Times as fast as recorded at which scans come: members that are late are not waited for,
+        see `Lateness`, and those that restart see scans of the past `CATCH_UP` at a time. None
+        waits for all.
+
+    Attributes
+    ----------
+    restarts : int
+        How often a member was restarted.
+    late : Lateness
+        Which members were late.
+    """
+
+    def __init__(
+        self,
+        make: Make,
+        sets: Mapping[int, ParameterSet],
+        warm_up: WarmUp,
+        lost_track: float = 3.0,
+        cores: int = 1,
+        rate: float | None = None,
+    ):
+        self.trials = tuple(sets)
+        self.restarts = 0
+        given = [dict(parameters) for parameters in sets.values()]
+        self._members = (
+            spread(make, given, cores)
+            if isinstance(make, Factory)
+            else [make(parameters) for parameters in given]
+        )
+        self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
+        # Members in processes of their own register while those of this process do.
+        self._apart_first = sorted(range(len(sets)), key=lambda i: not self._members[i].apart)
+        self._names = [
+            f"trial {trial}" + (f" ({of[ODOMETRY]})" if ODOMETRY in of else "")
+            for trial, of in sets.items()
+        ]
+        self._told: set[int] = set()
+        self.late = Lateness(self._members, self._names, rate)
+        self._rate = rate
+        # In real time, there is no time for scans of the past.
+        self.rewinds = rate is None
+        self._returning: list[Successor] = []
+        self._weights = np.eye(len(sets))[0]
+        self._agreement = Agreement(len(sets), lost_track)
+        self._short = ShortRegistrations()
+        self._lost = False
+        self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
+        self._preparations = Preparations()
+        self._recent = RecentScans(warm_up)
+        self._last_motion = LastMotion()
+
+    @property
+    def faults(self) -> list[str]:
+        return [fault for member in self._members for fault in member.faults]
+
+    @property
+    def dead(self) -> frozenset[int]:
+        """Trial numbers of the members that a fault has ended, and that are not back yet."""
+        of_members = zip(self.trials, self._members, self.late.resting, strict=True)
+        return frozenset(t for t, member, rests in of_members if member.ended and not rests)
+
+    @property
+    def usage(self) -> Usage:
+        return Usage.total((member.usage for member in self._members), sum)
+
+    @property
+    def motions(self) -> Motions:
+        # Of a member before it was restarted.
+        members = dict(zip(self.trials, self._T_previous_current, strict=True))
+        return self._last_motion.motions._replace(members=members)
+
+    def prepare(self, scan: Scan) -> PreparedScan:
+        prepared = self._preparations.of(scan)
+        self.late.resting = self._resting
+        self.late.begin()
+        for member in self._present:
+            prepared.by(member)
+        return prepared
+
+    @property
+    def _present(self) -> list[OdometryInstance]:
+        """Members that take the next scan; those apart come first."""
+        return [self._members[i] for i in self._apart_first if not self.late.absent[i]]
+
+    def apply(self, selection: Selection) -> None:
+        # Members without a weight get 0.
+        weights = {selection.trial: 1.0} if selection.weights is None else selection.weights
+        if unknown := sorted(set(weights) - set(self.trials)):
+            held, others = (", ".join(map(str, trials)) for trials in (self.trials, unknown))
+            raise OdometryError(
+                f"the bank holds trials {held}, not {others}: select among its members, or make it "
+                f"with these trials"
+            )
+        self._weights = np.array([weights.get(trial, 0.0) for trial in self.trials], np.float64)
+        self._lost = selection.lost
+        self._asked = np.isin(self.trials, list(selection.restart))
+        self._resting = np.isin(self.trials, list(selection.resting))
+        self._waking = (self._waking | self.late.resting) & ~self._resting
+
+    def start(
+        self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self.late.resting = self._resting
+        self.late.settle()
+        self._returning.clear()
+        for member in self._present:
+            member.start(prepared.by(member), T_odom_sensor, T_previous_current)
+        self._T_previous_current = self._member_motions(T_odom_sensor)
+        self.late.given(T_odom_sensor)
+        self._agreement.start()
+        self._short.start(prepared.stamp, prepared.scan.points)
+        self._recent.start(prepared, T_odom_sensor, T_previous_current)
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+        self._asked[:] = self._waking[:] = False
+        self._tell()
+
+    def submit(self, prepared: PreparedScan) -> None:
+        # One that was woken after this scan was prepared begins with the next one.
+        woken = self._waking & ~self.late.absent
+        self._waking &= ~woken
+        # Those that work go first: before they begin, the woken ones cannot go on in their place.
+        self.late.absent |= woken
+        self._restart(self._asked)
+        self.late.absent &= ~woken
+        self._restart(woken)
+        self._asked[:] = False
+        self._submitted = prepared
+        for member in self._present:
+            member.submit(prepared.by(member))
+
+    def collect(self) -> Registration:
+        scan, before = self._submitted, self._recent.last
+        seconds = (scan.stamp - before.scan.stamp) * 1e-9
+        registrations = self.late.collect(self._apart_first[::-1], seconds)
+        self._tell()
+        T_previous_current = self._member_motions(before.T_odom_sensor)
+        self._T_previous_current = T_previous_current
+        self._short.add(scan.stamp, scan.scan.points)
+        agreeing = self._agreement.judge(
+            T_previous_current, seconds, self._weights, self._short, self._lost
+        )
+        if not agreeing.any():
+            T_odom_sensor = np.full((4, 4), np.nan)
+            self._last_motion.move(T_odom_sensor)
+            return Registration(T_odom_sensor, registered=False)
+        T_moved = self._agreement.T_previous_current
+        T_odom_sensor = rectify(self._recent.last.T_odom_sensor @ T_moved)
+        self._recent.add(scan, T_odom_sensor)
+        self.late.given(T_odom_sensor)
+        self._last_motion.move(T_odom_sensor)
+        self._catch_up()
+        self._restart(self._agreement.due)
+        registered = np.array([registration.registered for registration in registrations])
+        return Registration(T_odom_sensor, bool(registered[agreeing].any()))
+
+    def close(self) -> None:
+        for member in self._members:
+            member.close()
+
+    def _member_motions(self, T_odom_previous: Poses) -> Poses:
+        return np.array([self.late.motion(i, T_odom_previous) for i in range(len(self._members))])
+
+    def _restart(self, members: NDArray[np.bool_]) -> None:
+        """Restart members at the bank's pose, but for those that have given up or are late."""
+        members = members & ~np.array([member.given_up for member in self._members])
+        members &= ~self.late.working
+        due = [self._members[i] for i in self._apart_first if members[i]]
+        successors = [self._recent.replay_to(member) for member in due]
+        # Somebody has to go on meanwhile.
+        if self._rate is None or (self.late.absent | members).all():
+            catch_up_together(successors)
+            for i in np.flatnonzero(members).tolist():
+                self.late.back(i, self._recent.last.T_odom_sensor)
+        else:
+            self._returning += successors
+            self.late.away |= members
+            self.late.absent |= members
+        self.restarts += int(members.sum())
+        self._agreement.restarted(members)
+        self._tell()
+
+    def _catch_up(self) -> None:
+        """Let those that restart see the newest scan, and one of them scans of the past."""
+        for one in self._returning:
+            one.waiting.append(self._recent.last)
+        if not self._returning or self._returning[0].odometry.busy:
+            return
+        first = self._returning[0]
+        first.catch_up(CATCH_UP)
+        if not first.waiting:
+            i = self._members.index(first.odometry)
+            self.late.back(i, self._recent.last.T_odom_sensor)
+            self._agreement.restarted(np.arange(len(self._members)) == i)
+            del self._returning[0]
+
+    def _tell(self) -> None:
+        """Log which members have ended, or are back, since this was last called."""
+        for i, (name, member) in enumerate(zip(self._names, self._members, strict=True)):
+            if self.late.resting[i]:
+                continue
+            if member.ended and i not in self._told:
+                self._told.add(i)
+                why = member.faults[-1] if member.faults else "it was closed"
+                _log.warning("%s ended: %s; the bank goes on without it", name, why)
+            elif not member.ended and i in self._told:
+                self._told.remove(i)
+                _log.warning("%s is back", name)

@@ -1,1 +1,0 @@
-"""Figures as data, drawn for papers and for the report."""

@@ -1,0 +1,89 @@
+"""The command line."""
+
+import logging
+from typing import Annotated, Any
+
+import typer
+
+from adaptune.commands import offline, online, reference, report, tools
+from adaptune.commands import tools as importing
+from adaptune.commands.terminal import Commands, errors, say
+
+# Every command imports what it needs, so that `adaptune --help` answers at once.
+
+app = typer.Typer(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    name="adaptune",
+    cls=Commands,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help=(
+        "Tune the parameters of a LiDAR odometry, and keep tuning them while the robot drives.\n\n"
+        "A study is a YAML file: an odometry, its parameters, and sequences for training and test. "
+        "Its folder keeps all results. Run the same command again to resume it.\n\n"
+        "    adaptune inspect  my.bag               # what is in a recording\n\n"
+        "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
+        "    adaptune reference my.bag              # a reference without ground truth\n\n"
+        "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
+        "    adaptune learn    configs/demo.yaml my.bag    # learn from another drive\n\n"
+        "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
+        "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
+        "    adaptune switching configs/demo.yaml   # what a switch costs\n\n"
+        "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
+        "    adaptune oracle   configs/demo.yaml    # what was there to gain, in hindsight?\n\n"
+        "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
+        "    adaptune report   configs/demo.yaml    # all of it as a page to look at\n\n"
+        "    adaptune record   configs/demo.yaml    # replays to look at in Rerun or Foxglove"
+    ),
+)
+
+models = typer.Typer(no_args_is_help=True, cls=Commands, help="Look at error models.")
+models.command()(tools.show)
+app.add_typer(models, name="model")
+for _command in (
+    *(tools.inspect, tools.cache, tools.serve),
+    *(offline.simulate, reference.reference),
+    *(offline.offline, offline.learn, offline.trials, offline.validate, offline.oracle),
+    *(online.online, online.switching, online.compare, online.record),
+    *(report.report, importing.import_rustle),
+):
+    app.command()(_command)
+
+
+def _version(show: bool) -> None:
+    if show:
+        import adaptune
+
+        say(f"adaptune {adaptune.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Show more messages.")] = False,
+    _: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    from rich.highlighter import NullHighlighter
+    from rich.logging import RichHandler
+
+    plain: Any = {"markup": False, "highlighter": NullHighlighter(), "keywords": []}
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(message)s",
+        datefmt="[%X]",
+        handlers=[RichHandler(console=errors, show_path=False, show_level=False, **plain)],
+    )
+    for chatty in ("matplotlib", "numba", "asyncio"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+def main() -> None:
+    """Run the command line."""
+    app(prog_name="adaptune")
+
+
+if __name__ == "__main__":
+    main()

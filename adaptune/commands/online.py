@@ -1,0 +1,508 @@
+"""Commands of the online stage."""
+
+import logging
+import os
+import shlex
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import numpy as np
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from adaptune.commands.terminal import (
+    Folder,
+    Override,
+    StudyFile,
+    begin_work,
+    console,
+    load,
+    progress,
+    say,
+    say_next_of_study,
+    say_next_online,
+)
+from adaptune.errors import AdaptuneError
+from adaptune.report.paper import plain
+from adaptune.selection import Selection
+from online.replay import Progressed
+
+if TYPE_CHECKING:
+    from offline.config import OfflineStudy
+    from online.compare import ComparedReplays
+    from online.statistics import ComparisonRow
+
+
+log = logging.getLogger(__name__)
+
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        help="Replay in real time, so many times as fast as it was recorded.",
+        show_default="as fast as it goes, no scan dropped",
+    ),
+]
+
+
+Pin = Annotated[
+    list[str],
+    typer.Option(
+        metavar="KEY=VALUE",
+        help="Hold a parameter at this value in all sets but the baseline. May be repeated.",
+    ),
+]
+
+
+Mode = Annotated[
+    str | None,
+    typer.Option(
+        help="On a robot, what to drive: baseline, fixed, paired or paper.",
+        show_default="the first of online.rules",
+    ),
+]
+
+
+def online(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
+    ] = None,
+    again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
+    rate: Rate = None,
+    pin: Pin = [],  # noqa: B006
+    untrained: Annotated[
+        bool,
+        typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
+    ] = False,
+    thorough: Annotated[
+        bool, typer.Option("--thorough", help="All modes that there are to compare with, too.")
+    ] = False,
+    ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")
+    ] = False,
+    mode: Mode = None,
+) -> None:
+    """Replay the test sequences: baseline, fixed, and adaptive by every rule.
+
+    Once a second, an adaptive replay describes the newest scan and selects a parameter set with the
+    error model. Each replay writes its trajectory (TUM), every selection with its predicted error,
+    and the time of each scan (CSV). Before, it estimates the reference of sequences that have none.
+
+    With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
+    if the study names no test.
+
+    With `--thorough`, it replays all modes to compare with (`online.also`): one set at a time and
+    the bank, whatever is driven, the bank without live evidence, with even weights, random sets,
+    and the untrained bank.
+
+    With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
+    so are scans that wait too long.
+
+    With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C.
+    """
+    if untrained:
+        _check_untrained(model, mode)
+    if thorough and (untrained or ros or ros2):
+        raise AdaptuneError("--thorough is for replays with a model; leave out the other option")
+    override = [*override, *_as_overrides(rate, pin, thorough=thorough)]
+    loaded = load(study, override, folder)
+    if ros or ros2:
+        if (ros and ros2) or rate is not None:
+            raise AdaptuneError("give only one of --ros, --ros2 and --rate")
+        _drive(loaded, mode, model, untrained=untrained, ros2=ros2)
+        return
+    if mode is not None:
+        raise AdaptuneError(f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed")
+    made, n = _replay(loaded, model, again, untrained)
+    there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
+    say(f"{there}: {loaded.folder / 'replays'}/")
+    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+
+
+def _check_untrained(model: Path | None, mode: str | None) -> None:
+    """Refuse options that contradict --untrained."""
+    if model is not None:
+        raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
+    if mode is not None:
+        raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
+
+
+def _as_overrides(rate: float | None, pin: Sequence[str], *, thorough: bool) -> list[str]:
+    """The options that stand for keys of the study."""
+    if wrong := [given for given in pin if "=" not in given]:
+        raise AdaptuneError(f"--pin {wrong[0]}: give a parameter and its value, KEY=VALUE")
+    given = [f"online.pin.{one}" for one in pin]
+    given += ["online.also=all"] if thorough else []
+    return given + ([] if rate is None else [f"online.real_time.rate={rate:g}"])
+
+
+@contextmanager
+def _on_one_core(study: "OfflineStudy") -> Iterator[None]:
+    """Bind this process to one core, and leave the others to what it starts."""
+    from adaptune.processes import pin as bind
+
+    # Ask for the number of cores before.
+    _ = study.mechanism
+    unbind = bind(os.getpid(), alone=True)
+    try:
+        yield
+    finally:
+        unbind()
+
+
+def _replay(
+    loaded: "OfflineStudy", model: Path | None, again: bool, untrained: bool
+) -> tuple[int, int]:
+    """Make the replays that are missing; how many were made, and how many there are."""
+    from adaptune.model import ErrorModel
+    from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
+    from online.run import run_replays, run_untrained
+
+    dashboard, path = Dashboard(), model or loaded.model_path
+    with _on_one_core(loaded), progress(dashboard) as show:
+        if untrained:
+            made = run_untrained(loaded, again, show, dashboard.look)
+        else:
+            made = run_replays(loaded, path, again, show, dashboard.look)
+    repeats = loaded.config.online.repeats
+    if untrained:
+        return made, len(sequences_without_model(loaded)) * len(WITHOUT_MODEL) * repeats
+    modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
+    return made, len(loaded.config.test) * len(modes) * repeats
+
+
+def _drive(
+    loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
+) -> None:
+    """Drive on a robot until Ctrl-C."""
+    from adaptune.ros.ros1 import local_ros1
+    from adaptune.ros.ros2 import Ros2
+    from online.modes import UNTRAINED, WITHOUT_MODEL
+    from online.robot import RobotDrive
+
+    mode = UNTRAINED if untrained else mode or loaded.rules[0]
+    path = None if mode in WITHOUT_MODEL else model or loaded.model_path
+    drive = RobotDrive(loaded, mode, path)
+    link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1(), Dashboard()
+    with closing(link), _on_one_core(loaded), progress(dashboard):
+        log.info("drive, %s: Ctrl-C ends it", mode)
+        driven = drive.run(link, dashboard.look)
+    dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
+    say(f"{driven.scans} scans{dropped}: {driven.folder}/")
+
+
+def switching(
+    study: StudyFile,
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    seconds: Annotated[
+        float, typer.Option(help="Seconds of every training sequence to use.", min=10.0)
+    ] = 60.0,
+) -> None:
+    """Measure what a change of parameters costs during a replay.
+
+    Replays the training sequences with the odometry's own parameters, and switches every 5 s to the
+    same parameters: with every mechanism that the odometry supports, and several warm-ups. The
+    study keeps the switch cost of one set at a time, which selections take into account.
+    """
+    loaded = load(study, override, folder)
+    from adaptune.report import tables as report
+    from adaptune.study.references import estimates_in_words
+    from online.switch_cost import measure_switching, switch_cost_in_words
+
+    with progress() as show:
+        rows, caption = measure_switching(loaded, seconds, show)
+    console.print(
+        report.table(
+            f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
+            rows,
+            caption,
+        )
+    )
+    for sentence in estimates_in_words(loaded, loaded.config.training):
+        say(sentence)
+    say(switch_cost_in_words(loaded))
+    say(f"Kept in {loaded.folder / 'switching.json'}.")
+    say_next_online(loaded.config.test, study, override, folder)
+
+
+def compare(
+    studies: Annotated[
+        list[Path],
+        typer.Argument(metavar="STUDY...", help="YAML or folder of a study, or of several."),
+    ],
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    to: Annotated[
+        Path | None,
+        typer.Option(help="Of several studies, where their tables go.", file_okay=False),
+    ] = None,
+) -> None:
+    """Compare the replays: what adapting gained, in words, tables and pictures.
+
+    *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
+    1, adapting is better. Intervals come from a paired block bootstrap. With six test sequences or
+    more, they speak of other sequences like these, else of these alone. Where an estimated
+    reference judged, they include its own error.
+
+    The study's folder receives CSV, JSON, Markdown, LaTeX, and a picture of every sequence. With
+    several studies, their errors also stand side by side.
+    """
+    if len(studies) == 1:
+        if to is not None:
+            raise AdaptuneError("--to is for several studies; one has its tables in its folder")
+        _compare_one(studies[0], override, folder)
+        return
+    if folder is not None:
+        raise AdaptuneError("--folder is for one study; several have their own under runs/")
+    _compare_several(studies, override, to)
+
+
+def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
+    from adaptune.study.study import MIN_RECORDINGS
+    from offline.search import TRIALS, more_trials
+
+    loaded = load(study, override, folder)
+    found = _compared(loaded)
+    say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    if found.rows[0].yardstick == "baseline":
+        say_next_of_study("look for better sets", "offline", study, override, folder)
+        return
+    say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
+    if found.unfinished:
+        say_next_of_study("replay what is missing", "online", study, override, folder)
+        return
+    n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
+    if n < MIN_RECORDINGS and more is not None:
+        why = f"try {TRIALS} sets; {MIN_RECORDINGS} training recordings tell of other recordings"
+        say_next_of_study(why, "offline", study, more, folder)
+    elif n < MIN_RECORDINGS:
+        first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
+        why = "find out what adapting gains elsewhere"
+        say_next_of_study(why, "offline", study, override, folder, first)
+    else:
+        say_next_of_study("all of it as a page to look at", "report", study, override, folder)
+
+
+def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
+    """Compare a study's replays, and print words and tables."""
+    from adaptune.report import tables as report
+    from online.compare import compare as compare_replays
+    from online.tables import tables
+
+    loaded.check()
+    begin_work()
+    found = compare_replays(loaded)
+    for said in found.words:
+        say(said)
+    for made in tables(found.rows, loaded.config.sub_trajectory):
+        console.print(*report.tables_within(made, console.width), sep="\n")
+    return found
+
+
+def _compare_several(studies: list[Path], override: list[str], to: Path | None) -> None:
+    from adaptune.report import tables as report
+    from online.tables import side_by_side
+
+    loaded = [load(study, override, None) for study in studies]
+    if len({one.name for one in loaded}) < len(loaded):
+        raise AdaptuneError("two of the studies have the same name; rename one of the files")
+    if len(lengths := {one.config.sub_trajectory for one in loaded}) > 1:
+        found = " and ".join(f"{length:g}" for length in sorted(lengths))
+        raise AdaptuneError(
+            f"sub_trajectory: the studies have errors over {found} m, which cannot be compared"
+        )
+    rows: dict[str, list[ComparisonRow]] = {}
+    for one in loaded:
+        console.rule(one.name)
+        rows[one.name] = _compared(one).rows
+    console.rule("side by side")
+    made = side_by_side(rows)
+    for listing in made:
+        console.print(*report.tables_within(listing, console.width), sep="\n")
+    folder = to or loaded[0].folder.with_name("+".join(rows))
+    report.write_tables(folder, " and ".join(rows), made)
+    say(f"Tables: {folder}/")
+
+
+# Commands that make something to look at.
+
+
+class RecordingFormat(StrEnum):
+    """What replays are written as."""
+
+    RERUN = "rerun"
+    MCAP = "mcap"
+    PARQUET = "parquet"
+
+
+def record(
+    study: StudyFile,
+    sequences: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SEQUENCE]...", help="Of the study.", show_default="all that were replayed"
+        ),
+    ] = None,
+    to: Annotated[
+        list[RecordingFormat],
+        typer.Option(
+            help="What to write. May be repeated.",
+            show_default="all whose packages are installed",
+        ),
+    ] = [],  # noqa: B006
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+) -> None:
+    """Write replays as recordings to look at, with Rerun or Foxglove, and as Parquet.
+
+    A recording holds the paths of all modes and of the reference, one scan a second, and over time
+    the chosen parameters or weights, the predicted, estimated and true errors, and the time that
+    each step took. The replays stay as they are.
+    """
+    loaded = load(study, override, folder)
+    from online.recordings import replayed_sequences
+    from online.rerun_recording import installed_formats, record_replays
+
+    loaded.check()
+    formats = list(map(str, to)) or installed_formats()
+    names = replayed_sequences(loaded, sequences or ())
+    with progress() as show:
+        written = [path for name in names for path in record_replays(loaded, name, formats, show)]
+    for path in written:
+        say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+    suffixes = {path.suffix: path for path in written}
+    if ".parquet" in suffixes:
+        say("Parquet: pandas, Polars, DuckDB and others read it.")
+    if ".mcap" in suffixes:
+        say(f"Foxglove: choose `Open local file`, and {suffixes['.mcap']}.")
+    if ".rrd" in suffixes:
+        say(f"Next: {shlex.join(['rerun', str(suffixes['.rrd'])])}    # look at it")
+    for missing in (f for f in RecordingFormat if f not in formats and not to):
+        say(f"Not written: {missing}; `pip install 'adaptune[{missing}]'` adds it.")
+
+
+# What a replay, or a drive, does now: a dashboard for the terminal.
+
+
+NEWEST = 1000
+"""Scans, and selections, whose milliseconds are shown."""
+
+
+class _Line(NamedTuple):
+    name: str
+    words: str
+    style: str = ""
+
+
+class Dashboard:
+    """Shows what was told last; rich renders it as often as it likes."""
+
+    def __init__(self) -> None:
+        self._what = ""
+
+    def look(self, what: str, total: int, progressed: Progressed) -> None:
+        """Take note of a scan.
+
+        Parameters
+        ----------
+        what
+            What is replayed or driven; where it changes, all begins anew.
+        total
+            How many scans there are; 0 if nobody knows.
+        progressed
+            How far it is.
+        """
+        now = time.perf_counter()
+        if what != self._what:
+            self._what, self._begun = what, now
+            self._first = progressed.step.stamp
+            self._scan_ms: deque[float] = deque(maxlen=NEWEST)
+            self._selection_ms: deque[float] = deque(maxlen=NEWEST)
+            self._restarts = self._n_choices = self._rejected = 0
+            self._choice = None
+        step, choice = progressed.step, progressed.choice
+        self._now, self._total, self._progressed = now, total, progressed
+        self._scan_ms.append(1e3 * (step.prepare_seconds + step.register_seconds))
+        self._restarts += step.unhealthy is not None
+        if choice is not None and choice is not self._choice:
+            self._n_choices += 1
+            self._rejected += bool(choice.why_not)
+            self._selection_ms.append(1e3 * choice.seconds)
+        self._choice = choice
+
+    def __rich__(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        table.add_column(style="bold")
+        table.add_column()
+        for name, words, style in self._lines() if self._what else ():
+            table.add_row(Text(name), Text(words, style))
+        return table
+
+    def _lines(self) -> Iterator[_Line]:
+        at, real_time = self._progressed, self._progressed.real_time
+        driven = (at.step.stamp - self._first) * 1e-9
+        speed = driven / max(self._now - self._begun, 1e-9)
+        yield _Line(self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded")
+        of = f" of {self._total}" if self._total else ""
+        restarts = f", restarted {self._restarts} times" if self._restarts else ""
+        yield _Line("scans", f"{at.done}{of}{restarts}; {_in_ms(self._scan_ms)} a scan")
+        if real_time is not None:
+            late = 1e3 * np.array(list(real_time.late)[-NEWEST:])
+            words = f"pose {_in_ms(late)} after the scan; scans dropped: {real_time.dropped}"
+            if real_time.missed:
+                words += f", selections missed: {real_time.missed}"
+            is_late = real_time.dropped + real_time.missed > 0
+            yield _Line("latency", words, "yellow" if is_late else "")
+        if self._choice is None:
+            return
+        rejected = f", {self._rejected} not applied" if self._rejected else ""
+        yield _Line("selections", f"{self._n_choices}{rejected}; {_in_ms(self._selection_ms)}")
+        yield from _chosen(self._choice.selection)
+        if why := self._choice.why_not or self._choice.fallen_back:
+            yield _Line("warning", why, "yellow")
+
+
+def _chosen(selection: Selection) -> Iterator[_Line]:
+    """Of a selection: the set or weights, what is predicted, and what was measured."""
+    if selection.weights is None:
+        values = ", ".join(
+            f"{name} {_short(value)}" for name, value in selection.parameters.items()
+        )
+        yield _Line("chosen", f"trial {selection.trial}: {values}")
+    else:
+        yield _Line("weights", _weights(selection.weights))
+    if np.isfinite(selection.predicted_error):
+        fixed = f"{selection.predicted_fixed:.3f} %"
+        yield _Line("predicted", f"{selection.predicted_error:.3f} %, of the fixed set {fixed}")
+    if np.isfinite(selection.estimated_error):
+        low, high = selection.estimated_low, selection.estimated_high
+        words = f"{selection.estimated_error:.3f} % ({low:.3f}-{high:.3f} %)"
+        yield _Line("measured", words)
+    if selection.lost:
+        yield _Line("lost", "do not rely on the pose", "bold red")
+
+
+def _weights(weights: Mapping[int, float]) -> str:
+    heaviest = sorted(weights.items(), key=lambda pair: -pair[1])
+    return ", ".join(f"trial {trial} {100.0 * weight:.0f} %" for trial, weight in heaviest)
+
+
+def _short(value: object) -> str:
+    return plain(value) if isinstance(value, int | float) else str(value)
+
+
+def _in_ms(values: Iterable[float]) -> str:
+    """Median and 99th percentile."""
+    half, most = np.percentile(list(values) or [0.0], (50, 99))
+    return f"{half:.1f} ms (99 %: {most:.1f})"

@@ -1,0 +1,226 @@
+"""Commands that need no study: recordings, the cache, odometries for other programs, models."""
+
+import logging
+import os
+import sys
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from adaptune.commands.terminal import Show, begin_work, console, progress, say, say_next
+from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
+
+if TYPE_CHECKING:
+    from adaptune.recording.inspect import Inspection
+    from adaptune.reference.check import MeasuredReference
+
+
+def inspect(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="A bag, a folder, or a file of poses.", show_default=False
+        ),
+    ],
+    png: Annotated[
+        Path | None, typer.Option(help="Draw the first scan to this PNG or SVG.", dir_okay=False)
+    ] = None,
+    deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
+) -> None:
+    """Show what is in a recording, what each stage lacks, and how to name it in a study."""
+    from adaptune.recording.inspect import draw_inspection, render_inspection
+    from adaptune.recording.inspect import inspect as inspect_file
+
+    begin_work()
+    measured, accuracy = None, "`--deep` also measures how wrong it is"
+    if deep:
+        with progress() as show:
+            found = inspect_file(file, deep, show)
+            measured, accuracy = _measured(found, show)
+    else:
+        found = inspect_file(file)
+    console.print(render_inspection(found, accuracy), crop=False)
+    _begin_study(found, measured)
+    if png is not None:  # last: the lines of the study are to be copied in one piece
+        draw_inspection(found, png)
+        say(f"First scan: {png}")
+
+
+UNKNOWN = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
+"""The length of sub-trajectories to propose where the path is not known."""
+
+
+def _measured(found: "Inspection", show: Show) -> "tuple[MeasuredReference | None, str]":
+    """Registrations along the reference, and what they tell; None where there is none to measure.
+
+    Only what can be used to train is measured.
+    """
+    if found.reference is None or not found.name or found.missing.get("offline"):
+        return None, ""
+    from adaptune.recording.opening import open_sequence
+    from adaptune.reference.check import (
+        accuracy_words,
+        advice,
+        measure_reference,
+        proposed_sub_trajectory,
+    )
+
+    try:
+        scans = open_sequence(found.config())
+        if (reference := scans.reference()) is None:
+            return None, ""
+        measured = measure_reference(scans, reference, partial(show, "registering"))
+    except AdaptuneError as error:
+        return None, f"its error cannot be measured: {error}"
+    length = proposed_sub_trajectory(reference, measured)
+    usual = proposed_sub_trajectory(reference)
+    words = accuracy_words(measured, usual, length), advice(measured, reference)
+    return measured, "; ".join(filter(None, words))
+
+
+def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> None:
+    """Print the rest of a study of this recording alone, and the command that begins it."""
+    from adaptune.reference.check import TRAINING, proposed_sub_trajectory
+
+    if not (name := found.name):
+        return
+    if found.missing.get("offline"):
+        say(
+            "Next: mend what is lacking, see docs/your-bag.md; where only the reference does not "
+            "serve, write `reference: estimated`"
+        )
+        return
+    share, length = f"{100 * TRAINING:.0f}", UNKNOWN
+    if found.reference is not None:
+        length = str(proposed_sub_trajectory(found.reference, measured))
+    say(
+        f"training: [{name}: 0-{share}%]\ntest: [{name}: {share}-100%]\n"
+        f"sub_trajectory: {length}\n"
+        "odometry: {name: gicp}    # or another one, see docs/your-odometry.md\n"
+    )
+    first = f"put the lines from `sequences:` on in {name}.yaml; then "
+    say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
+
+
+class CacheAction(StrEnum):
+    """What to do with the cache."""
+
+    LIST = "list"
+    CLEAR = "clear"
+
+
+def cache(
+    action: Annotated[CacheAction, typer.Argument(help="List or clear it.")] = CacheAction.LIST,
+) -> None:
+    """List or clear the decoded recordings on disk.
+
+    adaptune decodes a bag once, and then maps it into memory. `ADAPTUNE_CACHE` names another
+    folder; `ADAPTUNE_CACHE_GB` limits its size (50), and 0 turns it off.
+    """
+    from adaptune.recording.cache import clear_cache
+    from adaptune.recording.inspect import render_cache
+
+    if action is CacheAction.CLEAR:
+        say(f"Freed {clear_cache() / 1e9:.2f} GB. Bags are decoded again when they are read.")
+    else:
+        console.print(render_cache())
+        say_next("free all of it", "cache", "clear")
+
+
+def serve(
+    odometry: Annotated[
+        str | None,
+        typer.Argument(help="The only odometry to serve.", show_default="as each hello asks"),
+    ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(help="Serve every connection to tcp://HOST:PORT or unix:PATH instead."),
+    ] = None,
+) -> None:
+    """Serve an odometry to another program, over standard input and output.
+
+    The odometry's own output goes to standard error; an odometry in a process of its own reports it
+    with its faults. `docs/your-odometry.md` describes the messages.
+    """
+    from adaptune.odometry import serving
+
+    begin_work()
+    if listen is not None:
+        if odometry is None:
+            raise AdaptuneError("--listen serves one odometry: give its name")
+        serving.listen(listen, odometry, lambda at: say(f"{odometry} at {at}"))
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        serving.serve(sys.stdin.buffer, writer, odometry)
+
+
+def show(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="An error model, or a study's folder.", show_default=False
+        ),
+    ],
+) -> None:
+    """Describe an error model: its sets, sequences, provenance, and validation."""
+    from adaptune.model import ErrorModel
+    from adaptune.model.error_model import render
+    from adaptune.study.study import CONFIGURATION, MODEL
+
+    file = file / MODEL if file.is_dir() else file
+    console.print(render(ErrorModel.load(file), file))
+    if (study := file.parent / CONFIGURATION).exists():
+        other = [] if file.name == MODEL else ["--model", file]
+        why = "replay the test sequences with it"
+        say_next(why, "online", study, "--folder", file.parent, *other)
+
+
+# Studies from the files of other programs.
+
+
+_log = logging.getLogger(__name__)
+
+
+def import_rustle(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="RUSTLE's tests, or a tuning, as YAML.", show_default=False
+        ),
+    ],
+    algorithms: Annotated[Path, typer.Option(help="RUSTLE's algorithms.")] = Path(
+        "algorithms.yaml"
+    ),
+    datasets: Annotated[Path, typer.Option(help="RUSTLE's data sets.")] = Path("datasets.yaml"),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The study to write.", dir_okay=False)
+    ] = Path("study.yaml"),
+    overwrite: Annotated[bool, typer.Option(help="Replace existing studies.")] = False,
+) -> None:
+    """Make studies of RUSTLE's tests and tunings.
+
+    A test gives a study for each of its algorithms and speeds, a tuning gives one. What has no
+    counterpart is logged, and stands in the comments of the study.
+    """
+    from adaptune.study.rustle import import_rustle as make_studies
+
+    studies, skipped = make_studies(file, algorithms, datasets)
+    paths = [output]
+    if len(studies) > 1:
+        paths = [
+            output.with_name(f"{output.stem}_{study.name}{output.suffix}") for study in studies
+        ]
+    if len(set(paths)) < len(paths):
+        raise AdaptuneError(f"{file}: two tests have the same name; give each its own")
+    if there := [str(path) for path in paths if path.exists() and not overwrite]:
+        raise AdaptuneError(f"{', '.join(there)}: exists; name another -o, or add --overwrite")
+    for note in dict.fromkeys((*skipped, *(note for study in studies for note in study.notes))):
+        _log.warning("%s", note)
+    for path, study in zip(paths, studies, strict=True):
+        write_text(path, study.text)
+        say(f"{path}: {study.about}")
+    say_next("read its comments; then run trials, fit the error model", "offline", paths[0])

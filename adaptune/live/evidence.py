@@ -1,0 +1,538 @@
+"""What the errors of an odometry, or of a bank's members, were over the last metres."""
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, invert, rectify, rotation_angle
+from adaptune.live.hops import (
+    LENGTHS,
+    METRES,
+    SECONDS,
+    Hop,
+    HopCloud,
+    HopErrors,
+    Hops,
+    LiveSquares,
+    live_squares,
+    register,
+    windows,
+)
+from adaptune.odometry.base import Motions
+from adaptune.recording.scan import Scan
+from adaptune.selection import Selection
+
+# An odometry's own error, estimated without ground truth from chains of hops.
+#
+# A hop is shorter than the sub-trajectories whose error is wanted, and an odometry's errors over a
+# few metres are much like the registration's. So hops that follow each other are chained, until
+# they
+# reach over a sub-trajectory. There the odometry's errors, above all those of its rotation, are
+# several times the chain's.
+
+
+COVERED = 0.5
+"""Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
+NEARLY = 0.8
+"""A chain that reaches over this share of the length is long enough."""
+GROWTH = -0.15
+"""The error over some metres, as a share of them, grows with this power of the metres."""
+UNSURE = 0.3
+"""Standard deviation of the logarithm of an estimate that rests on one chain; and of one that is
+scaled to e times the metres of its chains."""
+HOP_ERROR = 0.05
+"""Metres by which a hop itself is wrong where registrations are worst, as among plants."""
+
+
+class OwnError(NamedTuple):
+    """An odometry's own error, estimated without ground truth, in percent of the distance."""
+
+    mean: float
+    low: float  # 95 % interval
+    high: float
+
+
+class Link(NamedTuple):
+    """A hop, and what the odometry believed of its ends."""
+
+    start: float  # metres driven
+    end: float
+    seconds: float  # time of its end
+    T_odom_start: Poses
+    T_odom_end: Poses
+    hop: Hop
+
+
+class _Chain(NamedTuple):
+    """The odometry's error over a chain of hops."""
+
+    start: float  # metres driven
+    end: float
+    seconds: float
+    error: float  # metres
+    hops: int  # how many
+
+
+class OwnErrors:
+    """Chains of the last hops.
+
+    Parameters
+    ----------
+    length
+        Metres of the sub-trajectories whose mean error is estimated.
+    whole
+        Whether to keep the chains of a whole recording, not only the last ones.
+    """
+
+    def __init__(self, length: float, whole: bool = False):
+        self._length, self._whole = length, whole
+        self._links: deque[Link] = deque()
+        self._chains: deque[_Chain] = deque()
+
+    def add(self, link: Link) -> None:
+        """Add the newest hop."""
+        self._links.append(link)
+        while link.end - self._links[0].end > self._length + LENGTHS[0] / COVERED:
+            self._links.popleft()
+        self._chains.append(_chain(self._links, self._length))
+        if self._whole:
+            return
+        until, behind = link.seconds - SECONDS, link.end - max(METRES, self._length)
+        while self._chains[0].seconds < until and self._chains[0].start < behind:
+            self._chains.popleft()
+
+    def interrupt(self) -> None:
+        """Let no later chain begin at a hop so far: in between, the poses are unknown."""
+        self._links.clear()
+
+    def clear(self) -> None:
+        """Forget the hops so far."""
+        self._links.clear()
+        self._chains.clear()
+
+    @property
+    def begin(self) -> float:
+        """Metres driven where the oldest chain begins that counts."""
+        return min(chain.start for chain in self._chains)
+
+    def estimate(self) -> OwnError | None:
+        """The mean error over the last chains; None without any."""
+        if not self._chains:
+            return None
+        start, end, _, error, hops = np.array(self._chains).T
+        reach = end - start
+        # Of a whole recording, the last chain may be a short one.
+        usual = float(reach.max() if self._whole else reach[-1])
+        long = reach >= NEARLY * min(self._length, usual)
+        start, end, reach, error, hops = (of[long] for of in (start, end, reach, error, hops))
+        times = max(1.0, self._length / float(reach.mean()))
+        mean = times**GROWTH * float((100.0 * error / reach).mean())
+        deviation = UNSURE * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
+        factor = float(np.exp(1.96 * deviation))
+        # Some of it, or all, may be what the hops are wrong by.
+        of_hops = times**GROWTH * float((100.0 * HOP_ERROR * np.sqrt(hops) / reach).mean())
+        low = float(np.sqrt(max(0.0, mean**2 - of_hops**2))) / factor
+        return OwnError(mean, low, mean * factor)
+
+
+def _chain(links: deque[Link], length: float) -> _Chain:
+    """Chain hops from the newest back until they reach over a length, or none is near enough."""
+    first = newest = links[-1]
+    covered, n = newest.end - newest.start, 1
+    T = _completed(newest)
+    for link in reversed(links):
+        if newest.end - first.start >= NEARLY * length:
+            break
+        if link.end > first.start:
+            continue
+        metres = covered + link.end - link.start
+        if metres < COVERED * (newest.end - link.start):
+            break
+        T = _completed(link) @ (invert(link.T_odom_end) @ first.T_odom_start) @ T
+        first, covered, n = link, metres, n + 1
+    T_odom = invert(first.T_odom_start) @ newest.T_odom_end
+    error = float(np.linalg.norm(T_odom[:3, 3] - T[:3, 3]))
+    # Between the hops it errs, too, and not in the same direction.
+    error *= float(np.sqrt((newest.end - first.start) / covered))
+    return _Chain(first.start, newest.end, newest.seconds, error, n)
+
+
+def _completed(link: Link) -> Poses:
+    """The hop's motion; in directions that it cannot tell, the odometry's."""
+    T_odom = invert(link.T_odom_start) @ link.T_odom_end
+    T: NDArray[np.float64] = link.hop.T_start_end.copy()
+    unknown = np.eye(3) - link.hop.projection
+    T[:3, 3] = link.hop.projection @ T[:3, 3] + unknown @ T_odom[:3, 3]
+    return T
+
+
+SPACING = 1.0
+"""Metres between scans that may be the start or the end of a hop."""
+LOST = 10.0
+"""Percent of a hop. An odometry that is more wrong has lost track."""
+DOUBTFUL = 5.0
+"""Percent of a hop. One that differs so much from the odometry must be confirmed by another."""
+TWICE = 2
+"""Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
+_APART = 0.3
+"""Metres between guesses that are worth a registration each."""
+_GUESSES = 3
+_TRY_AGAIN = 5
+"""After so many shorter hops, a long one is tried again."""
+_FEWEST_DIRECTIONS = 1.5
+"""A hop must tell the motion in two directions at least."""
+_FULL_TURN = 10.0
+"""Metres at which a difference in rotation counts as one in translation, in radians."""
+
+
+class Measured(NamedTuple):
+    """A hop, and the stamps of its scans in nanoseconds."""
+
+    start: int
+    end: int
+    hop: Hop
+
+
+@dataclass(frozen=True, eq=False)
+class _Anchor:
+    """A scan at which a hop may start or end, and where everybody believed it to be."""
+
+    stamp: int
+    metres: float  # driven until there
+    cloud: HopCloud
+    T_odom_sensor: Poses  # (1 + n_members, 4, 4): of the odometry or bank, then of its members
+    no_pose: NDArray[np.intp]  # (1 + n_members,): scans without a pose so far
+
+
+class _Found(NamedTuple):
+    """A hop, and where it starts and ends."""
+
+    start: _Anchor
+    end: _Anchor
+    hop: Hop
+    by_odometry: bool = True  # whether its own motion was the guess
+
+    def errors(self) -> NDArray[np.float64]:
+        """Of the odometry and the members, percent of the hop, of shape (1 + n_members, 3)."""
+        moved = invert(self.start.T_odom_sensor) @ self.end.T_odom_sensor
+        apart = (moved[:, :3, 3] - self.hop.T_start_end[:3, 3]) @ self.hop.projection.T
+        return np.asarray(100.0 / (self.end.metres - self.start.metres) * apart)
+
+
+class LiveEvidence:
+    """Measures errors by hops, see `adaptune.live.hops`.
+
+    Show it every scan with `observe`; once a second, `measure` registers a scan, which takes some
+    tens of milliseconds. Points that have times are motion-compensated, by the odometry's last
+    motion. Memory is bounded: it keeps the scans of the last metres, one a metre, and the errors of
+    the last hops.
+
+    Parameters
+    ----------
+    members
+        Trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
+    length
+        Metres of the sub-trajectories whose mean error `own_error` estimates.
+
+    Attributes
+    ----------
+    lost : bool
+        Whether the odometry or bank has lost track, as far as the last hops tell.
+    """
+
+    def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):
+        self.members = members
+        self._own = OwnErrors(length)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as before a new recording."""
+        self.lost = False
+        self._last: tuple[int, Scan] | None = None
+        self._T_odom_sensor = np.tile(np.eye(4), (1 + len(self.members), 1, 1))
+        self._no_pose = np.zeros(1 + len(self.members), np.intp)
+        self._without = np.full(1 + len(self.members), -np.inf)
+        self._metres = 0.0
+        self._newest: _Anchor | None = None
+        self._anchors: deque[_Anchor] = deque()
+        self._measured = -np.inf
+        self._short = 0
+        self._rejected = self._disagreeing = 0
+        n = 1 + len(self.members)
+        self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
+        self._own.clear()
+        self._wrong = np.zeros(n, np.intp)
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan, before it is registered; see `adaptune.selector.Selector.observe`."""
+        if self._last is not None:
+            self._move(*self._last, motions)
+        self._last = stamp, scan
+
+    def _move(self, before: int, scan: Scan, motions: Motions) -> None:
+        """Take note of the motion that ended at the scan before."""
+        T = np.stack(
+            [motions.T_previous_current, *(motions.members[trial] for trial in self.members)]
+        )
+        finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
+        self._no_pose = self._no_pose + ~finite
+        self._without[~finite] = before * 1e-9
+        # Without a pose, the health check lets the odometry go on; so does this.
+        T[~finite] = T[0] if finite[0] else np.eye(4)
+        # The first scan is where the odometry starts, whatever motion it was given.
+        if self._newest is None:
+            T[:] = np.eye(4)
+        self._T_odom_sensor = rectify(self._T_odom_sensor @ T)
+        # The straight way since the last anchor: a robot that stands does not drive by jitter.
+        if self._anchors:
+            last = self._anchors[-1]
+            way = invert(last.T_odom_sensor[0]) @ self._T_odom_sensor[0]
+            self._metres = last.metres + float(np.linalg.norm(way[:3, 3]))
+        seconds = 0.0 if self._newest is None else (before - self._newest.stamp) * 1e-9
+        if self._newest is not None and finite[0]:
+            # This, not the motion before it, is how the sensor moved while it took the last scan.
+            self._newest.cloud.moved(T[0], seconds)
+        self._newest = _Anchor(
+            before,
+            self._metres,
+            HopCloud(scan, T[0], seconds),
+            self._T_odom_sensor,
+            self._no_pose,
+        )
+        if not self._anchors or self._metres - self._anchors[-1].metres >= SPACING:
+            self._anchors.append(self._newest)
+            # Before the start of the longest hop, one more is kept, to confirm it.
+            while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
+                self._anchors.popleft()
+
+    def measure(self) -> Measured | None:
+        """Register the newest scan whose motion is known to one some metres before.
+
+        Nothing is measured before the first hop is complete, nor where the sensor has moved less
+        than a metre since the last one. A hop that contradicts the odometry counts only if a
+        registration to another scan says the same: where a scene repeats itself, one can be wrong
+        by metres.
+
+        Returns
+        -------
+        Measured or None
+            None if no registration was accepted.
+        """
+        end = self._newest
+        if end is None or end.metres - self._measured < SPACING:
+            return None
+        starts = self._starts(end)
+        if not starts:
+            return None
+        self._measured = end.metres
+        found = self._register(starts, end)
+        # On an open plain only height can be told; that is no loss of track.
+        if found is not None and np.trace(found.hop.projection) < _FEWEST_DIRECTIONS:
+            return None
+        if found is None or not self._is_confirmed(found):
+            self._rejected += 1
+            self._update_lost()
+            return None
+        self._take(found)
+        return Measured(found.start.stamp, found.end.stamp, found.hop)
+
+    def _starts(self, end: _Anchor) -> list[_Anchor]:
+        """Where a hop may start, in the order in which that is tried."""
+        long, short = (
+            next((a for a in reversed(self._anchors) if end.metres - a.metres >= length), None)
+            for length in LENGTHS
+        )
+        first, second = long, short
+        if long is not None and 0 < self._short < _TRY_AGAIN:
+            self._short += 1
+            first, second = short, long
+        return [a for a in (first, second) if a is not None and a.stamp < end.stamp]
+
+    def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> _Found | None:
+        """The first registration that is accepted.
+
+        The odometry's own motion is the guess. Only where the last registration was rejected, too,
+        members that disagree with it are asked: where a scene repeats itself, one that is lost
+        finds a registration as well.
+        """
+        guesses = [self._guesses(start, end) for start in starts]
+        for first, stop in ((0, 1), (1, _GUESSES))[: 2 if self._rejected else 1]:
+            for start, of_start in zip(starts, guesses, strict=True):
+                hop = register(start.cloud, end.cloud, of_start[first:stop])
+                if end.metres - start.metres >= LENGTHS[0]:
+                    self._short = int(hop is None)
+                if hop is not None:
+                    return _Found(start, end, hop, first == 0)
+        return None
+
+    def _guesses(self, start: _Anchor, end: _Anchor) -> list[Poses]:
+        """The odometry's motion, and those of members that disagree with it."""
+        tried: list[Poses] = []
+        for T in invert(start.T_odom_sensor) @ end.T_odom_sensor:
+            if all(_apart(T, other) > _APART for other in tried) and len(tried) < _GUESSES:
+                tried.append(T)
+        return tried
+
+    def _is_confirmed(self, found: _Found) -> bool:
+        """Whether a hop agrees with the odometry, or a hop from another scan agrees with it."""
+        wrong, end = found.errors()[0], found.end
+        if np.linalg.norm(wrong) <= DOUBTFUL:
+            return True
+        at = self._anchors.index(found.start)
+        # The scan before, so that it spans the same way; at the begin of a drive the scan after.
+        other = self._anchors[at - 1 if at else 1]
+        if other.stamp >= end.stamp:
+            return False
+        guess = invert(other.T_odom_sensor[0]) @ end.T_odom_sensor[0]
+        if not found.by_odometry:
+            between = invert(other.T_odom_sensor[0]) @ found.start.T_odom_sensor[0]
+            guess = between @ found.hop.T_start_end
+        hop = register(other.cloud, end.cloud, [guess])
+        return hop is not None and _alike(wrong, _Found(other, end, hop).errors()[0])
+
+    def _take(self, found: _Found) -> None:
+        """Compare with what was measured."""
+        start, end, hop, _ = found
+        errors = found.errors()
+        errors[end.no_pose > start.no_pose] = np.nan
+        ends = start.metres, end.metres, end.stamp * 1e-9
+        measured = np.isfinite(errors).all(axis=1)
+        # Those that are back count as measured, not as lost.
+        self._hops = self._hops.filled(measured & np.isfinite(self._without))
+        self._hops = self._hops.with_hop(errors, *ends)
+        self._without[measured] = -np.inf
+        if np.isfinite(errors[0]).all():
+            self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
+        self._rejected = 0
+        # A scan without a pose says nothing of the rest of the hop.
+        with np.errstate(invalid="ignore"):
+            wrong = np.linalg.norm(errors, axis=1) > LOST
+        self._wrong = np.where(wrong, self._wrong + 1, 0)
+        self._disagreeing = int(self._wrong[0])
+        self._update_lost()
+
+    def _update_lost(self) -> None:
+        self.lost = max(self._rejected, self._disagreeing) >= TWICE
+
+    def _told_to_restart(self) -> frozenset[int]:
+        """Trial numbers of the members that two hops in a row have shown to be lost.
+
+        Each is told once. Then only hops that begin after that count against it.
+        """
+        told = self._wrong >= TWICE
+        told[0] = False
+        self._wrong = np.where(told, 0, self._wrong)
+        self._no_pose = self._no_pose + told
+        return frozenset(np.array(self.members, np.intp)[told[1:]].tolist())
+
+    def present(self) -> NDArray[np.bool_]:
+        """Which members may have weight, of shape (n_members,).
+
+        One that gave no pose for a scan gets weight again once a hop that begins after that scan
+        has measured it, or after `SECONDS` with poses. All may have some if none is present.
+        """
+        now = 0.0 if self._newest is None else self._newest.stamp * 1e-9
+        present = np.asarray(now - self._without[1:] > SECONDS)
+        return present if present.any() else ~present
+
+    def squares(self, members: Collection[int] | None = None) -> LiveSquares | None:
+        """What the last hops say of members, or of a single odometry; None without any.
+
+        Parameters
+        ----------
+        members
+            Trial numbers of some of the bank's; None for all.
+        """
+        chosen = self.members if members is None else members
+        columns = [i for i, trial in enumerate(self.members, 1) if trial in chosen] or [0]
+        return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
+
+    def forget(self) -> None:
+        """Forget the hops so far, for the odometry has got another set.
+
+        The next one begins at the newest scan.
+        """
+        self._hops = HopErrors(*(array[:0] for array in self._hops))
+        self._own.clear()
+        self._anchors.clear()
+        self._measured = -np.inf
+        self._wrong[:] = 0
+        self._rejected = self._disagreeing = 0
+        self.lost = False
+
+    def own_error(self) -> OwnError | None:
+        """The odometry's, or the bank's, own error over the last metres; None without any hop."""
+        return self._own.estimate()
+
+    def estimated(self, selection: Selection) -> Selection:
+        """A selection with what is measured."""
+        error = self.own_error()
+        if error is None:
+            return selection._replace(lost=self.lost)
+        return selection._replace(
+            estimated_error=error.mean,
+            estimated_low=error.low,
+            estimated_high=error.high,
+            lost=self.lost,
+            restart=self._told_to_restart(),
+        )
+
+
+def _alike(error: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether two errors, of shape (3,), have about the same direction and length."""
+    apart = np.linalg.norm(error - other)
+    return bool(apart < min(np.linalg.norm(error), np.linalg.norm(other)))
+
+
+def _apart(T: Poses, other: Poses) -> float:
+    """How far two motions are apart, in metres; a radian counts as much as ten metres."""
+    moved = invert(other) @ T
+    return float(np.linalg.norm(moved[:3, 3]) + _FULL_TURN * rotation_angle(moved))
+
+
+# Hops along a recording whose poses are known, at least in part.
+
+
+PERIOD = 1_000_000_000
+"""Nanoseconds from one registration to the next."""
+
+
+def hops_along(
+    scans: Iterable[tuple[Scan, Poses]], advance: Callable[[int], None] = lambda _: None
+) -> Hops:
+    """Register scans directly to those some metres before, once a second.
+
+    The known poses take the odometry's place: they give each registration its first guess. Where
+    they are unknown, nothing is measured.
+
+    Parameters
+    ----------
+    scans
+        Scans with their poses, each of shape (4, 4), NaN where it is unknown.
+    advance
+        Called after every scan with how many are done.
+    """
+    live = LiveEvidence()
+    found: list[tuple[int, int, Hop]] = []
+    frame_of: dict[int, int] = {}
+    due, last, step = 0, np.full((4, 4), np.nan), np.eye(4)
+    for i, (scan, T) in enumerate(scans):
+        before, step = step, invert(last) @ T if i else np.eye(4)
+        if not np.isfinite(step).all():
+            live.reset()
+        # The motion over the scan before, as an odometry knows it.
+        known = before if np.isfinite(before).all() else np.eye(4)
+        live.observe(scan.stamp, scan, Motions(known, {}))
+        frame_of[scan.stamp] = i
+        due = due if i else scan.stamp
+        if scan.stamp >= due:
+            due += (int(scan.stamp - due) // PERIOD + 1) * PERIOD
+            if (one := live.measure()) is not None:
+                found.append((frame_of[one.start], frame_of[one.end], one.hop))
+        last = T
+        advance(i + 1)
+    return Hops.of(found)

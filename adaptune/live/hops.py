@@ -1,0 +1,335 @@
+"""Direct registrations over some metres: how the sensor moved, measured without ground truth.
+
+The newest scan is registered to one about ten metres before it, by GICP (Segal et al., RSS 2009) on
+small_gicp (Koide, JOSS 2024). No error adds up over the scans in between.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.geometry import Poses, rectify, squared_ranges
+from adaptune.recording.recording import compensate
+from adaptune.recording.scan import Scan
+
+LENGTHS = (10.0, 5.0)
+"""Metres of a hop: the second where the first is rejected, as in narrow caves."""
+NOISE = 0.02
+"""Metres by which a registration is wrong, about."""
+MIN_INLIERS = 0.35
+"""Least share of points near a point of the other scan; a registration with fewer is rejected."""
+DEGENERATE = 0.002
+"""A direction is unknown if its information is less than this share of the best direction's."""
+_CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
+_FEWEST = 100
+"""Points; small_gicp crashes on an empty target, and three points always converge."""
+_REACHES = (2.0, 0.5)
+"""Metres of the greatest distance of correspondences, one registration after the other."""
+_ITERATIONS = 20
+_OF_A_PLANE = 0.5
+"""Information that small_gicp ascribes to a pair of points along their plane; there is none."""
+
+
+class Hop(NamedTuple):
+    """A registration that was accepted."""
+
+    T_start_end: Poses
+    # Of shape (3, 3): keeps of a vector in the start's frame what the registration can tell.
+    projection: NDArray[np.float64]
+
+
+class Hops(NamedTuple):
+    """Hops along a sequence, in order of time."""
+
+    start: NDArray[np.intp]  # (n,): frames
+    end: NDArray[np.intp]
+    T_start_end: Poses  # (n, 4, 4)
+    projection: NDArray[np.float64]  # (n, 3, 3): see `Hop`
+
+    def hop(self, i: int) -> Hop:
+        """One of them."""
+        return Hop(self.T_start_end[i], self.projection[i])
+
+    def part(self, first: int, stop: int) -> "Hops":
+        """Those between the frames from `first` to before `stop`, whose numbers begin anew."""
+        inside = (self.start >= first) & (self.end < stop)
+        return Hops(
+            self.start[inside] - first,
+            self.end[inside] - first,
+            self.T_start_end[inside],
+            self.projection[inside],
+        )
+
+    @classmethod
+    def of(cls, hops: Sequence[tuple[int, int, Hop]]) -> "Hops":
+        """Gather hops with their frames."""
+        start, end = (np.array([hop[i] for hop in hops], np.intp) for i in (0, 1))
+        found = [[hop[0] for *_, hop in hops], [hop[1] for *_, hop in hops]]
+        T, projection = (
+            np.array(arrays).reshape(-1, n, n) for arrays, n in zip(found, (4, 3), strict=True)
+        )
+        return cls(start, end, T, projection)
+
+
+class HopCloud:
+    """A scan, prepared for registrations when it is first needed.
+
+    Parameters
+    ----------
+    scan
+        The scan.
+    T_previous_current
+        The sensor's motion from the scan before, or to the next one where that is known, of shape
+        (4, 4), for motion compensation.
+    seconds
+        How long that motion took; 0 for no compensation.
+    """
+
+    def __init__(self, scan: Scan, T_previous_current: Poses, seconds: float):
+        self._scan: Scan | None = scan
+        self._motion = T_previous_current, seconds
+        self._cloud: Any = None
+
+    def moved(self, T_current_next: Poses, seconds: float) -> None:
+        """Learn the motion to the next scan; it counts if the scan was not needed before."""
+        self._motion = T_current_next, seconds
+
+    @property
+    def prepared(self) -> Any:
+        """Cloud with covariances, and its tree; None if there are too few points."""
+        if self._scan is not None:
+            self._cloud, self._scan = _prepare(self._scan, *self._motion), None
+        return self._cloud
+
+
+def _prepare(scan: Scan, T_previous_current: Poses, seconds: float) -> Any:
+    import small_gicp  # takes long to import
+
+    if seconds > 0.0:
+        scan = compensate(scan, T_previous_current, seconds)
+    points = scan.points[squared_ranges(scan.points) >= _MIN_RANGE**2].astype(np.float64)
+    if len(points) < _FEWEST:
+        return None
+    cloud, tree = small_gicp.preprocess_points(
+        points, downsampling_resolution=_CELL, num_neighbors=_NEIGHBOURS, num_threads=1
+    )
+    return (cloud, tree) if cloud.size() >= _FEWEST else None
+
+
+def register(
+    start: HopCloud, end: HopCloud, guesses: Iterable[Poses], min_inliers: float = MIN_INLIERS
+) -> Hop | None:
+    """Register two scans; the first guess that leads to a sound registration wins.
+
+    Parameters
+    ----------
+    start, end
+        The scans.
+    guesses
+        Of ``T_start_end``, each of shape (4, 4).
+    min_inliers
+        Least share of points near a point of the other scan.
+
+    Returns
+    -------
+    Hop or None
+        None if all of them are rejected.
+    """
+    if start.prepared is None or end.prepared is None:
+        return None
+    (target, tree), (source, _) = start.prepared, end.prepared
+    for guess in guesses:
+        result = _align(target, source, tree, guess)
+        T = rectify(result.T_target_source)
+        if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
+            return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)
+    return None
+
+
+def _align(target: Any, source: Any, tree: Any, T_target_guess: Poses) -> Any:
+    import small_gicp
+
+    for reach in _REACHES:
+        result = small_gicp.align(
+            *(target, source, tree),
+            init_T_target_source=T_target_guess,
+            max_correspondence_distance=reach,
+            max_iterations=_ITERATIONS,
+            num_threads=1,
+        )
+        T_target_guess = result.T_target_source
+    return result
+
+
+def _known_directions(result: Any) -> NDArray[np.float64]:
+    """Projection, in the end's frame, on the directions of translation that are well determined.
+
+    Parameters
+    ----------
+    result
+        What small_gicp found.
+    """
+    information = np.asarray(result.H)
+    of_rotation = information[:3, :3] + 1e-9 * np.eye(3)
+    # What is known of the translation if the rotation is not.
+    marginal = information[3:, 3:] - information[3:, :3] @ np.linalg.solve(
+        of_rotation, information[:3, 3:]
+    )
+    values, vectors = np.linalg.eigh(marginal)
+    found = values - _OF_A_PLANE * result.num_inliers
+    known = vectors[:, found >= DEGENERATE * values[-1]]
+    return np.asarray(known @ known.T)
+
+
+# How wrong the members of a bank were over the last hops, and what that says of their weights.
+
+
+SECONDS, METRES = 30.0, 30.0
+"""A hop counts as long as it is no older, or no farther behind, than this."""
+CLIP = 5.0
+"""Percent of a hop by which a member may differ from the best one, for weights: beyond that it is
+lost, and how far says nothing more."""
+
+
+class HopErrors(NamedTuple):
+    """Errors over some hops, the newest last."""
+
+    # (n_hops, n_members, 3): percent of the hop, in the frame of its start; NaN where a member gave
+    # no pose.
+    errors: NDArray[np.float64]
+    start: NDArray[np.float64]  # (n_hops,): metres driven at the start of each hop
+    end: NDArray[np.float64]  # (n_hops,): and at its end
+    seconds: NDArray[np.float64]  # (n_hops,): time of its end
+
+    def with_hop(
+        self, errors: NDArray[np.float64], start: float, end: float, seconds: float
+    ) -> "HopErrors":
+        """Add a hop, and drop those that no longer count."""
+        added = HopErrors(
+            np.concatenate([self.errors, errors[None]]),
+            np.append(self.start, start),
+            np.append(self.end, end),
+            np.append(self.seconds, seconds),
+        )
+        return added.recent(end, seconds)
+
+    def filled(self, members: NDArray[np.bool_]) -> "HopErrors":
+        """Let some members be as wrong as the worst one was, where they gave no pose.
+
+        So they are neither lost nor at an advantage over hops that say nothing of them.
+
+        Parameters
+        ----------
+        members
+            Of shape (n_members,).
+        """
+        lengths = np.linalg.norm(self.errors, axis=-1)
+        missing = np.isnan(lengths)
+        worst = np.where(missing, -1.0, lengths).argmax(axis=1)
+        of_worst = self.errors[np.arange(len(worst)), worst][:, None]
+        gaps = (missing & members)[..., None]
+        return self._replace(errors=np.where(gaps, of_worst, self.errors))
+
+    def recent(self, metres: float, seconds: float) -> "HopErrors":
+        """Those that count when so much was driven, at this time."""
+        young = seconds - self.seconds <= SECONDS
+        kept = np.flatnonzero(young | (metres - self.start <= METRES))
+        return HopErrors(*(array[kept] for array in self))
+
+
+class LiveSquares(NamedTuple):
+    """Mean products of the errors of members over hops."""
+
+    products: NDArray[np.float64]  # (n_members, n_members): percent squared
+    noise: float  # percent squared: what of each of them is the registrations' own
+    windows: float  # number of hops that share no part of the path
+
+
+def live_squares(hops: HopErrors) -> LiveSquares | None:
+    """Mean products of the errors over hops; None if there is no hop.
+
+    The registration's error is common to all members. It adds the same to all products, so it
+    does not change the minimum-variance weights.
+    """
+    n_hops = len(hops.errors)
+    if not n_hops:
+        return None
+    length = hops.end - hops.start
+    errors, missing = clip_to_best(hops.errors)
+    products = np.einsum("hix,hjx->ij", errors, errors) / n_hops
+    products += np.diag(missing.mean(axis=0)) * CLIP**2
+    noise = float(((100.0 * NOISE / length) ** 2).mean())
+    return LiveSquares(products, noise, windows(hops.start, hops.end))
+
+
+def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
+    """How many stretches of a path that overlap amount to as much as if they did not.
+
+    Parameters
+    ----------
+    start, end
+        Metres driven, of shape (n,).
+    """
+    order = np.argsort(start)
+    start, end = start[order], end[order]
+    length = float((end - start).mean())
+    reached = np.maximum.accumulate(end)
+    new = np.maximum(0.0, end[1:] - np.maximum(start[1:], reached[:-1]))
+    return max(1.0, (float(end[0] - start[0]) + float(new.sum())) / length)
+
+
+def clip_to_best(
+    errors: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Clip errors at `CLIP` from those of the member with the least error of each hop.
+
+    Parameters
+    ----------
+    errors
+        Of shape (n_hops, n_members, 3); NaN where a member gave no pose.
+
+    Returns
+    -------
+    errors : ndarray of the same shape
+        The best member's where there was none.
+    missing : ndarray of shape (n_hops, n_members)
+        Where there was none.
+    """
+    missing = np.asarray(~np.isfinite(errors).all(axis=-1))
+    known = np.where(missing[..., None], np.nan, errors)
+    known[missing.all(axis=1)] = 0.0
+    best = np.nanargmin(np.linalg.norm(known, axis=-1), axis=1)
+    centre = known[np.arange(len(known)), best][:, None]
+    apart = np.where(missing[..., None], 0.0, known - centre)
+    lengths = np.linalg.norm(apart, axis=-1, keepdims=True)
+    return centre + apart * np.minimum(1.0, CLIP / np.maximum(lengths, 1e-9)), missing
+
+
+def blend(
+    prior: NDArray[np.float64], prior_windows: float, live: LiveSquares | None
+) -> NDArray[np.float64]:
+    """Mean products of a prior and of what was measured, each weighted by its number of windows.
+
+    What is measured is scaled to the prior: only how members compare counts, as in the prior, and
+    not how hard the place is for all of them. Without the registrations' own part, the harmonic
+    means of the members' squares are then the same.
+
+    Parameters
+    ----------
+    prior
+        Of shape (n_members, n_members).
+    prior_windows
+        How many windows it counts as.
+    live
+        None if nothing was measured.
+    """
+    if live is None:
+        return prior
+    squares = live.products.diagonal()
+    # Registrations that are as wrong as the members say little; never divide by nothing.
+    own = np.maximum(squares - live.noise, 0.25 * squares) + 1e-12
+    scale = (1.0 / own).mean() / (1.0 / np.maximum(prior.diagonal(), 1e-12)).mean()
+    total = prior_windows + live.windows
+    return np.asarray((prior_windows * prior + live.windows * scale * live.products) / total)

@@ -1,0 +1,661 @@
+"""What selection rules learn from, and what they have in common."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from adaptune.metrics import FAILURE, cap
+from adaptune.selection import Selection
+from adaptune.space import ParameterSets
+
+# The evidence about a scene: the training frames that look like it.
+
+
+NOVEL = 0.1
+"""Familiarity below which evidence counts less and less."""
+_QUANTILES = 10
+"""Of the distances of each training sequence's frames from the other sequences."""
+
+
+class Evidence(NamedTuple):
+    """The training frames nearest to some scans."""
+
+    # (n_scans, n_near): for each training sequence, numbers of its frames that are nearest to each
+    # scan.
+    frames: tuple[NDArray[np.intp], ...]
+    squared: NDArray[np.float64]  # (n_scans, n_sequences): mean squared distance of these frames
+    # (n_scans,): share of the training frames that are farther from the other sequences than each
+    # scan is from all of them; NaN of a single sequence, which has no others.
+    familiarity: NDArray[np.float64]
+
+    @property
+    def trust(self) -> NDArray[np.float64]:
+        """See `trust_in`."""
+        return trust_in(self.familiarity)
+
+    def weights(self, sharpness: float) -> NDArray[np.float64]:
+        """Weights of the training sequences: the nearer their frames, the larger.
+
+        Returns
+        -------
+        ndarray of shape (n_scans, n_sequences)
+            Each row adds up to 1.
+        """
+        # Where the median is zero, every sequence has the very same place in it.
+        spread = np.median(self.squared, axis=1, keepdims=True)
+        spread[spread == 0.0] = 1.0
+        least = self.squared.min(axis=1, keepdims=True)
+        weights = np.exp(-sharpness * (self.squared - least) / spread)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def means(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Mean over the near frames of every sequence.
+
+        Parameters
+        ----------
+        values
+            One entry for each training frame, of shape (n_frames, ...).
+
+        Returns
+        -------
+        ndarray of shape (n_scans, n_sequences, ...)
+        """
+        means = np.empty((*self.squared.shape, *values.shape[1:]))
+        for s, frames in enumerate(self.frames):
+            # All frames are near to every scan: the mean is the same.
+            same = frames.strides[0] == 0
+            of = values[frames[:1]] if same else values[frames]
+            means[:, s] = of.mean(axis=1, dtype=np.float64)
+        return means
+
+
+def trust_in(familiarity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far evidence counts, from 0 to 1: fully where familiarity is unknown."""
+    return np.asarray(np.fmin(1.0, familiarity / NOVEL))
+
+
+class NearestFrames:
+    """Finds the evidence about scenes.
+
+    Parameters
+    ----------
+    n_frames
+        Near frames of each sequence.
+    """
+
+    def __init__(self, n_frames: int):
+        self.n_frames = n_frames
+
+    def fit(self, features: NDArray[np.float64], sequence: NDArray[np.intp]) -> Self:
+        """Learn from the training frames.
+
+        Parameters
+        ----------
+        features
+            Of shape (n_frames, n_features).
+        sequence
+            Number of each frame's sequence, of shape (n_frames,).
+        """
+        self.members_ = [np.flatnonzero(sequence == s) for s in np.unique(sequence)]
+        self.features_ = [features[members] for members in self.members_]
+        self.distances_ = self._distances_between_sequences()
+        return self
+
+    def about(self, features: NDArray[np.float64]) -> Evidence:
+        """Find the evidence about scans.
+
+        Parameters
+        ----------
+        features
+            Of shape (n_scans, n_features).
+        """
+        squared = np.empty((len(features), len(self.members_)))
+        frames = []
+        for s, (members, own) in enumerate(zip(self.members_, self.features_, strict=True)):
+            squared[:, s], nearest = _nearest(own, features, self.n_frames)
+            frames.append(members[nearest])
+        return Evidence(tuple(frames), squared, self._familiarity(squared.min(axis=1)))
+
+    def _familiarity(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not len(self.distances_):
+            return np.full(len(squared), np.nan)
+        below = np.searchsorted(self.distances_, squared, side="left")
+        return np.asarray(1.0 - below / len(self.distances_))
+
+    def _distances_between_sequences(self) -> NDArray[np.float64]:
+        """Sorted distances of training frames from the other sequences, as many of each."""
+        if len(self.members_) < 2:
+            return np.empty(0)
+        some = [features[:: max(1, len(features) // _QUANTILES)] for features in self.features_]
+        number = np.repeat(np.arange(len(some)), [len(features) for features in some])
+        queries = np.concatenate(some)
+        squared = np.full(len(queries), np.inf)
+        for s, features in enumerate(self.features_):
+            others = number != s
+            found, _ = _nearest(features, queries[others], self.n_frames)
+            squared[others] = np.minimum(squared[others], found)
+        at = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+        quantiles: Sequence[NDArray[np.float64]] = [
+            np.quantile(squared[number == s], at) for s in range(len(some))
+        ]
+        return np.sort(np.concatenate(quantiles))
+
+
+def _nearest(
+    features: NDArray[np.float64], queries: NDArray[np.float64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Mean squared distance of the `n` frames nearest to each query, and their numbers."""
+    from scipy.spatial.distance import cdist  # not needed to load a model
+
+    squared = cdist(queries, features, "sqeuclidean")
+    if n >= len(features):
+        everything = np.broadcast_to(np.arange(len(features)), squared.shape)
+        return squared.mean(axis=1), everything
+    nearest = np.argpartition(squared, n - 1, axis=1)[:, :n]
+    return np.take_along_axis(squared, nearest, axis=1).mean(axis=1), nearest
+
+
+# What parameter sets cost: CPU time a scan, alone and together.
+
+
+ROUNDING = 1e-9
+"""By how much a sum of costs may exceed a budget."""
+
+
+class SetCost(NamedTuple):
+    """Milliseconds of CPU time a scan."""
+
+    register: float
+    prepare: float
+    preparation: int  # sets with the same number share prepared scans
+
+    @property
+    def alone(self) -> float:
+        """Of one instance."""
+        return self.register + self.prepare
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What sets cost, as it was measured in the trials.
+
+    Attributes
+    ----------
+    sets : dict
+        By trial number, its `SetCost`.
+    evidence : float
+        Milliseconds of CPU time a scan that live evidence takes.
+    """
+
+    sets: Mapping[int, SetCost]
+    evidence: float
+
+    def __contains__(self, trial: object) -> bool:
+        return trial in self.sets
+
+    def alone(self, trial: int) -> float:
+        """Milliseconds of CPU time a scan of one instance, no live evidence; NaN if unknown."""
+        return self.sets[trial].alone if trial in self.sets else np.nan
+
+    def adaptive(self, trials: Iterable[int]) -> float:
+        """Milliseconds of CPU time a scan of several instances together, with live evidence.
+
+        Instances with the same preparation share prepared scans.
+        """
+        known = [self.sets.get(trial, SetCost(np.nan, np.nan, -1)) for trial in trials]
+        prepare: dict[int, float] = {}
+        for one in known:
+            prepare[one.preparation] = max(one.prepare, prepare.get(one.preparation, 0.0))
+        return sum(one.register for one in known) + sum(prepare.values()) + self.evidence
+
+    def dump(self) -> dict[str, Any]:
+        """Plain data, for files."""
+        return {
+            "evidence": self.evidence,
+            "sets": [[trial, *cost] for trial, cost in self.sets.items()],
+        }
+
+    @classmethod
+    def load(cls, data: Mapping[str, Any]) -> Self:
+        """Read what `dump` returned; a ValueError, TypeError or KeyError if it is no such thing."""
+        sets = {
+            int(trial): SetCost(float(register), float(prepare), int(preparation))
+            for trial, register, prepare, preparation in data["sets"]
+        }
+        return cls(sets, float(data["evidence"]))
+
+
+class Spending(NamedTuple):
+    """How a bank may spend a budget.
+
+    Attributes
+    ----------
+    costs : Costs
+    budget : float
+        Milliseconds of CPU time a scan, all members and live evidence together.
+    thrifty : bool
+        Whether the next member is the one that lowers the error most for its cost.
+    """
+
+    costs: Costs
+    budget: float = np.inf
+    thrifty: bool = False
+
+    def allows(self, members: Sequence[int]) -> bool:
+        """Whether a bank of these trials stays within the budget; of unknown cost, none does."""
+        return self.costs.adaptive(members) <= self.budget + ROUNDING
+
+    def price(self, members: Sequence[int], more: int) -> float:
+        """What another member adds to the cost of a bank, one microsecond at least."""
+        together = self.costs.adaptive([*members, more]) - self.costs.adaptive(members)
+        return max(together, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Errors of parameter sets on the frames of several sequences.
+
+    Attributes
+    ----------
+    features : ndarray of shape (n_frames, n_features)
+        Descriptors of the frames' scans, scaled.
+    sequence : ndarray of shape (n_frames,)
+        Number of each frame's sequence. Views of a sequence share its number, for they show the
+        same place.
+    errors : ndarray of shape (n_frames, n_sets)
+        Sub-trajectory RTE in percent: infinite where the track was lost, NaN where the set was not
+        run (usually on all frames of a sequence, or on none). Every frame has a sub-trajectory.
+    sets : ParameterSets
+        The columns of `errors`.
+    fixed : int
+        Trial number of the fixed set.
+    candidates : tuple of int, optional
+        Trial numbers of the sets to choose among, the fixed one included; the rule finds them if
+        None.
+    allowed : tuple of int, optional
+        Trial numbers of the sets that a budget allows, the fixed one included; all sets if None.
+    vectors : ndarray of shape (n_frames, n_candidates, 3), optional
+        Errors of the candidates as vectors in the frame of the sub-trajectory's start; not finite
+        where the track was lost. See `adaptune.metrics.sub_trajectory_vectors`.
+    """
+
+    features: NDArray[np.float64]
+    sequence: NDArray[np.intp]
+    errors: NDArray[np.float32]
+    sets: ParameterSets
+    fixed: int
+    candidates: tuple[int, ...] | None = None
+    vectors: NDArray[np.float32] | None = None
+    allowed: tuple[int, ...] | None = None
+
+    def allows(self) -> NDArray[np.bool_]:
+        """Which sets may be chosen, of shape (n_sets,)."""
+        if self.allowed is None:
+            return np.ones(len(self.sets), np.bool_)
+        return np.isin(self.sets.trials, self.allowed)
+
+    @property
+    def fixed_errors(self) -> NDArray[np.float64]:
+        """Capped errors of the fixed set, of shape (n_frames,)."""
+        return cap(self.errors[:, self.sets.column(self.fixed)])
+
+
+def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Mean capped error of every set; each sequence has the same weight.
+
+    Parameters
+    ----------
+    errors
+        Percent, of shape (n_frames, n_sets); NaN where a set was not run.
+    sequence
+        Number of each frame's sequence, of shape (n_frames,).
+
+    Returns
+    -------
+    ndarray of shape (n_sets,)
+        Percent. Frames without an error do not count. Where a set has no error on a whole sequence,
+        its mean is infinite: sequences differ more than sets do, so means over different sequences
+        cannot be compared.
+    """
+    capped = cap(errors)
+    means = []
+    for s in np.unique(sequence):
+        of_sequence = capped[sequence == s]
+        known = ~np.isnan(of_sequence)
+        if known.all():
+            means.append(of_sequence.mean(axis=0))
+            continue
+        number = known.sum(axis=0)
+        total = np.where(known, of_sequence, 0.0).sum(axis=0)
+        means.append(np.where(number > 0, total / np.maximum(number, 1), np.inf))
+    return np.asarray(np.mean(means, axis=0))
+
+
+def complementary(data: TrainingData, size: int, spending: Spending | None = None) -> list[int]:
+    """Choose sets so that at every training frame one of them does well.
+
+    The search is greedy and begins with the fixed set. Each next set is the one that lowers the
+    mean error most if the best of the chosen sets were known at every frame.
+
+    Parameters
+    ----------
+    data
+        A set that was not run on every sequence is not chosen.
+    size
+        Number of sets; fewer where another one would lower nothing.
+    spending
+        What a bank of them may cost; anything when left out.
+
+    Returns
+    -------
+    list of int
+        Trial numbers, the fixed set's first.
+    """
+    everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
+    capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
+    chosen = [data.fixed]
+    least = data.fixed_errors
+    while len(chosen) < size:
+        means = mean_errors(np.minimum(capped, least[:, None]), data.sequence)
+        now = means[data.sets.column(data.fixed)]
+        if spending is not None:
+            means = np.where([spending.allows([*chosen, t]) for t in data.sets], means, np.inf)
+        best = int(np.argmin(means))
+        # A set that is chosen already lowers nothing.
+        if not means[best] < now:
+            break
+        chosen.append(data.sets.trials[best])
+        least = np.minimum(least, capped[:, best])
+    return chosen
+
+
+class Rule(ABC):
+    """A way to choose a parameter set for a scan.
+
+    Attributes
+    ----------
+    gated : bool
+        Whether the fixed set is kept for scans of another sensor than in training; class
+        attribute.
+    """
+
+    gated: ClassVar[bool] = False
+
+    @abstractmethod
+    def fit(self, data: TrainingData) -> Self:
+        """Learn, and compute whatever does not depend on the scan."""
+
+    @abstractmethod
+    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Predict the error of every set for one scan.
+
+        Parameters
+        ----------
+        feature
+            The scan's scaled descriptor, of shape (n_features,).
+
+        Returns
+        -------
+        ndarray of shape (n_sets,)
+            Percent; infinite for sets that are not candidates.
+        """
+
+    @abstractmethod
+    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
+        """Choose a set, or weights, for one scan.
+
+        Parameters
+        ----------
+        feature
+            The scan's scaled descriptor, of shape (n_features,).
+        current
+            Trial number of the set that the odometry has now, for rules with a switch cost.
+        """
+
+
+# Selection by the paired expected ratio.
+
+
+ERROR_FLOOR = 0.02
+"""Percent, added to both errors of a ratio so that none is divided by zero."""
+BASELINE = 0
+"""Trial number of the baseline; of several odometries, that of the first."""
+
+
+class PairedSettings(BaseModel):
+    """Settings of the paired rule."""
+
+    # A file of a later version may hold more.
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    adapt: bool = True  # if not, the rule keeps the fixed set as long as that does as predicted
+    # Number of complementary sets to choose among, the fixed one included; all sets if None.
+    # Candidates that the training data name come first.
+    n_sets: PositiveInt | None = 3
+    # How fast a sequence's weight falls with the distance of its nearest frames.
+    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
+    # Standard deviation of the Gaussian over parameter sets, in the unit cube.
+    width: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 0.12
+    n_frames: PositiveInt = 300  # nearest frames of each sequence
+    # Logarithm of the ratio below which a set is preferred to the fixed one.
+    threshold: Annotated[float, Field(le=0.0, allow_inf_nan=False)] = -0.1
+    # Standard errors, estimated from how much the sequences differ, that are added to a ratio.
+    caution: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.5
+
+
+class Near(NamedTuple):
+    """Errors on the training frames nearest to some scans."""
+
+    evidence: Evidence
+    # (n_scans, n_sequences, n_candidates): mean error of every candidate, and of the baseline, in
+    # percent, mixed with that of its neighbours.
+    errors: NDArray[np.float64]
+    fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean error of the fixed set
+
+
+class Ratios(NamedTuple):
+    """Ratios of errors to the fixed set's."""
+
+    expected: NDArray[np.float64]  # (n_scans, n_candidates)
+    cautious: NDArray[np.float64]  # the same with `caution` standard errors added
+    # (n_scans, n_sequences): of the training sequences, adding up to 1.
+    weights: NDArray[np.float64]
+
+
+class PairedExpectedRatio(Rule):
+    """Compare every set with the fixed one on the same frames, and choose by the expected ratio.
+
+    For each training sequence, the rule divides a set's mean error on the frames nearest to the
+    scan by the fixed set's on the same frames. Sequences are weighted by how near those frames
+    are, neighbouring sets share their evidence, and a set must promise enough to replace the fixed
+    one. A rare failure weighs as much as it costs, and what makes a sequence hard for all sets
+    cancels out.
+
+    The rule chooses among sets that were run on every sequence, unless the data name candidates;
+    other sets count as neighbours. A sequence on which neither a set nor a close one was run does
+    not speak for it: its ratio counts as 1.
+
+    The farther a scan is from all training sequences, compared with how far these are from each
+    other, the more every ratio is drawn to 1. Beyond all of them the rule takes the fixed set.
+
+    Where a set does worse than predicted, what was measured of it counts instead. Then the baseline
+    is a candidate, too: in a place unlike all training, it is the best guess there is.
+
+    Parameters
+    ----------
+    settings
+        `offline.tuning` chooses them on the training sequences.
+    switch_cost
+        What a switch must promise besides, as a share of the fixed set's error.
+    """
+
+    gated = True
+
+    def __init__(self, settings: PairedSettings | None = None, switch_cost: float = 0.0):
+        self.settings = settings or PairedSettings()
+        self.switch_cost = switch_cost
+
+    def fit(self, data: TrainingData) -> Self:
+        """See `Rule.fit`."""
+        self.data_ = data
+        self.candidates_ = self._candidates()
+        self._known = self._with_baseline()
+        self._fixed_at = self.candidates_.index(data.fixed)
+        self.fixed_errors_ = data.fixed_errors
+        self.errors_ = self._mixed_errors()
+        self.nearest_ = NearestFrames(self.settings.n_frames).fit(data.features, data.sequence)
+        return self
+
+    def _candidates(self) -> tuple[int, ...]:
+        data, n_sets = self.data_, self.settings.n_sets
+        if not self.settings.adapt:
+            return (data.fixed,)
+        if data.candidates is not None:
+            return data.candidates
+        if n_sets is None:
+            complete = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
+            complete[data.sets.column(data.fixed)] = True
+            return tuple(data.sets.trials[c] for c in np.flatnonzero(complete))
+        return tuple(complementary(data, n_sets))
+
+    def _with_baseline(self) -> tuple[int, ...]:
+        """The candidates, and behind them the baseline if it is none of them but may be chosen."""
+        data = self.data_
+        if BASELINE in self.candidates_ or BASELINE not in data.sets:
+            return self.candidates_
+        column = data.sets.column(BASELINE)
+        was_run = np.isfinite(mean_errors(data.errors[:, [column]], data.sequence)).all()
+        may_be = was_run and data.allows()[column]
+        return (*self.candidates_, BASELINE) if may_be else self.candidates_
+
+    def _mixed_errors(self) -> NDArray[np.float32]:
+        """Error of the candidates and the baseline on every frame, mixed with their neighbours'.
+
+        They are mixed before ratios are taken, for a ratio of means is linear in its numerator.
+        """
+        data = self.data_
+        unit = data.sets.unit
+        columns = data.sets.columns(self._known)
+        squared = ((unit[:, None] - unit[columns]) ** 2).sum(axis=2)
+        kernel = np.exp(-0.5 * squared / self.settings.width**2)
+        kernel /= kernel.sum(axis=0)
+        errors = np.minimum(data.errors, np.float32(FAILURE))
+        # Where a set was not run, the fixed one's error makes it neither better nor worse.
+        fixed = self.fixed_errors_[:, None].astype(np.float32)
+        return np.asarray(np.where(np.isnan(errors), fixed, errors) @ kernel.astype(np.float32))
+
+    def near(self, features: NDArray[np.float64]) -> Near:
+        """Find the errors on the training frames nearest to scans.
+
+        Parameters
+        ----------
+        features
+            Of shape (n_scans, n_features).
+        """
+        evidence = self.nearest_.about(features)
+        fixed = evidence.means(self.fixed_errors_)
+        return Near(evidence, evidence.means(self.errors_), fixed)
+
+    def choices(self, near: Near, settings: PairedSettings) -> list[int]:
+        """Trial number of the best candidate for each scan, by other settings than those fitted.
+
+        The settings may differ in `sharpness`, `threshold` and `caution`.
+        """
+        ratios = self._ratios(near, settings)
+        best = _best(ratios.cautious[:, : len(self.candidates_)], self._fixed_at, settings)
+        return [self.candidates_[position] for position in best]
+
+    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Rule.predict`.
+
+        For the fixed set too, this is the mixed ratio times its error; `select` returns the error
+        itself.
+        """
+        near = self.near(feature[None])
+        predicted = np.full(len(self.data_.sets), np.inf)
+        expected, _, weights = _expected_ratios(near, self.settings)
+        n = len(self.candidates_)
+        columns = self.data_.sets.columns(self.candidates_)
+        predicted[columns] = expected[0, :n] * float(weights[0] @ near.fixed[0])
+        return predicted
+
+    def select(
+        self,
+        feature: NDArray[np.float64],
+        current: int | None = None,
+        measured: Mapping[int, float] | None = None,
+    ) -> Selection:
+        """See `Rule.select`.
+
+        Parameters
+        ----------
+        feature
+            The scan's scaled descriptor, of shape (n_features,).
+        current
+            Trial number of the set that the odometry has now.
+        measured
+            By trial number, errors in percent of sets that did worse than predicted.
+        """
+        measured = measured or {}
+        near = self.near(feature[None])
+        (expected,), (cautious,), (weights,) = self._ratios(near, self.settings)
+        (best,) = _best(cautious[None, : len(self.candidates_)], self._fixed_at, self.settings)
+        fixed = float(weights @ near.fixed[0])
+        if self._known[best] in measured:
+            errors = dict(zip(self._known, (cautious * fixed).tolist(), strict=True))
+            errors.update(measured)
+            # Far from all training, all ratios are 1.
+            of_known = [(errors[trial], trial != BASELINE) for trial in self._known]
+            best = min(range(len(of_known)), key=of_known.__getitem__)
+        familiarity = float(near.evidence.familiarity[0])
+        at = self._known.index(current) if current in self._known else None
+        # In a place unlike all training, a switch back to the fixed set need not pay. Nor need a
+        # switch away from a set that is expected to be worse than the fixed one.
+        weighs = self.settings.adapt and self.switch_cost > 0.0 and not familiarity < NOVEL
+        weighs = weighs and current not in measured
+        if weighs and at is not None and cautious[best] + self.switch_cost >= cautious[at] <= 1.0:
+            best = at
+        trial = self._known[best]
+        return Selection(
+            trial,
+            self.data_.sets[trial],
+            predicted_error=float(expected[best]) * fixed,
+            predicted_fixed=fixed,
+            familiarity=familiarity,
+            n_sequences=float(1.0 / (weights @ weights)),
+        )
+
+    def _ratios(self, near: Near, settings: PairedSettings) -> Ratios:
+        """Ratios of all in `near` to the fixed set's error."""
+        ratios = _expected_ratios(near, settings)
+        # Neither mixing nor caution is for the set that all are compared with.
+        ratios.expected[:, self._fixed_at] = ratios.cautious[:, self._fixed_at] = 1.0
+        return ratios
+
+
+def _expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
+    """Ratio of every candidate's error to the fixed set's."""
+    ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
+    weights = near.evidence.weights(settings.sharpness)
+    expected = np.einsum("qs,qsc->qc", weights, ratio)
+    variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
+    # One over the number of sequences that this rests on. The fewer they are, the less they show
+    # how much they differ: one alone is taken to differ as much as all sequences do.
+    share = (weights**2).sum(axis=1)[:, None]
+    error = np.sqrt(share * (variance + share * ratio.var(axis=1)))
+    trust = near.evidence.trust[:, None]
+    expected = 1.0 + trust * (expected - 1.0)
+    return Ratios(expected, expected + trust * settings.caution * error, weights)
+
+
+def _best(
+    cautious: NDArray[np.float64], fixed_at: int, settings: PairedSettings
+) -> NDArray[np.intp]:
+    """Position of the best candidate for each scan, of shape (n_scans,)."""
+    worth = np.log(cautious.min(axis=1)) < settings.threshold
+    return np.where(worth, cautious.argmin(axis=1), fixed_at)

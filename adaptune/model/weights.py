@@ -1,0 +1,449 @@
+"""Weights of the members of a bank, whose motions are averaged."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+)
+
+from adaptune.bank.agreement import share
+from adaptune.live.hops import LiveSquares, blend
+from adaptune.metrics import FAILURE
+from adaptune.model.rules import (
+    ERROR_FLOOR,
+    Evidence,
+    NearestFrames,
+    Rule,
+    Spending,
+    TrainingData,
+    mean_errors,
+)
+from adaptune.selection import Selection
+from adaptune.space import ParameterSets
+
+UNFAMILIAR = 0.2
+"""Share of the prior's windows that remain where a scan is unlike all training."""
+DOUBT = 4.0
+"""Mean square of a member that nobody has tried, in that of the first one."""
+SMOOTHING = 5
+"""Selections whose weights are averaged: errors cancel each other while weights stay the same."""
+POOL = 64
+"""A bank's members are searched for among this many of the best sets."""
+
+
+class BankSettings(BaseModel):
+    """Settings of a bank's weights."""
+
+    # A file of a later version may hold more.
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    adapt: bool = True  # if not, the fixed set keeps all the weight
+    # How fast a sequence's weight falls with the distance of its nearest frames.
+    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
+    n_frames: PositiveInt = 300  # nearest frames of each sequence
+    # Minimum share of the weight that the fixed set keeps where nothing was measured.
+    min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    # Added to the members' mean squares, as a share of their harmonic mean: the larger, the more
+    # even are the weights.
+    even: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.05
+    # How many windows of live evidence the training counts as.
+    prior_windows: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 3.0
+    # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
+    # member that has lost track is left out of the mean, and does not cost what it would alone.
+    clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
+    # How many of the last members rest where the training knows the place.
+    reserve: NonNegativeInt = 0
+
+
+class MemberWeights(NamedTuple):
+    """Weights of a bank's members, period after period."""
+
+    members: tuple[int, ...]  # trial numbers, the fixed set's first
+    weights: NDArray[np.float64]  # (n_periods, n_members)
+
+
+class NearProducts(NamedTuple):
+    """Products of errors on the training frames nearest to some scans."""
+
+    members: tuple[int, ...]  # trial numbers
+    evidence: Evidence
+    # (n_scans, n_sequences, n_members, n_members): mean products of the members' errors, percent
+    # squared.
+    products: NDArray[np.float64]
+    fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean squared error of the fixed set
+
+    def of(self, members: Collection[int]) -> "NearProducts":
+        """Those of some of the members."""
+        kept = [i for i, trial in enumerate(self.members) if trial in members]
+        products = self.products[:, :, kept][..., kept]
+        return self._replace(members=tuple(self.members[i] for i in kept), products=products)
+
+
+class BankRule(Rule):
+    """Weigh the members of a bank so that the mean of their motions has the least expected error.
+
+    While errors are small, the error of a weighted mean of motions is the weighted mean of the
+    errors. With weights w its mean square is w'Sw, where S_jk is the mean product of the errors of
+    members j and k, which are vectors: two members that err in different directions are worth more
+    together than the better one alone (as with forecasts: Bates and Granger, Operational Research
+    Quarterly 1969).
+
+    For each training sequence S is taken over the frames nearest to the scan and divided by the
+    fixed set's mean square there. Sequences weigh as in `PairedExpectedRatio`, and no weight is
+    negative.
+
+    What is measured while the robot drives (`adaptune.live`) is blended with it, each weighted by
+    the number of its windows. The less familiar the scene, the fewer the training counts as.
+
+    The weights of a single scan are noise in part, and members' errors of some seconds cancel only
+    while the weights stay the same. So a bank applies the mean over a few selections, see
+    `smooth_weights`.
+
+    Parameters
+    ----------
+    settings
+        `offline.tuning` chooses them on the training sequences.
+    """
+
+    gated = True
+
+    def __init__(self, settings: BankSettings | None = None):
+        self.settings = settings or BankSettings()
+
+    def fit(self, data: TrainingData) -> Self:
+        """See `Rule.fit`.
+
+        Raises
+        ------
+        ValueError
+            If the data name no members, the fixed set first, or hold no error vectors of them.
+        """
+        members = data.candidates
+        if members is None or data.vectors is None or members[0] != data.fixed:
+            raise ValueError("a bank needs members, the fixed set first, and their error vectors")
+        self.data_ = data
+        self.members_ = members
+        self.products_ = np.empty((len(data.features), len(members), len(members)), np.float32)
+        for s in np.unique(data.sequence):
+            frames = data.sequence == s
+            vectors, lost = clip_errors(data.vectors[frames], 0, self.settings.clip)
+            self.products_[frames] = np.einsum("ijx,ikx->ijk", vectors, vectors)
+            self.products_[frames] += lost[:, :, None] ** 2 * np.eye(len(members))
+        self.fixed_squares_ = self.products_[:, 0, 0].astype(np.float64)
+        self.nearest_ = NearestFrames(self.settings.n_frames).fit(data.features, data.sequence)
+        return self
+
+    def near(self, features: NDArray[np.float64]) -> NearProducts:
+        """Find the products of errors on the training frames nearest to scans.
+
+        Parameters
+        ----------
+        features
+            Of shape (n_scans, n_features).
+        """
+        evidence = self.nearest_.about(features)
+        products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
+        return NearProducts(self.members_, evidence, products, fixed)
+
+    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Rule.predict`; the error of each member alone."""
+        near = self.near(feature[None])
+        weights = near.evidence.weights(self.settings.sharpness)
+        predicted = np.full(len(self.data_.sets), np.inf)
+        squares = np.einsum("qs,qsjj->qj", weights, near.products)
+        predicted[self.data_.sets.columns(self.members_)] = np.sqrt(squares[0])
+        return predicted
+
+    def select(
+        self,
+        feature: NDArray[np.float64],
+        current: int | None = None,  # noqa: ARG002 - nothing is switched
+    ) -> Selection:
+        """See `Rule.select`; by the training alone."""
+        return self.weigh(self.near(feature[None]), None)
+
+    def predicted_fixed(self, near: NearProducts) -> float:
+        """Root mean square of the fixed set's error that is expected for one scan, in percent."""
+        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
+        return float(np.sqrt(of_sequences @ near.fixed[0]))
+
+    def weigh(self, near: NearProducts, live: LiveSquares | None) -> Selection:
+        """Weigh members for one scan; the others get no weight.
+
+        Parameters
+        ----------
+        near
+            Of the scan, and of the members to weigh.
+        live
+            What was measured of them, in their order; None if nothing was.
+        """
+        (weights,), (ratio,) = bank_weights(near, self.settings, [live])
+        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
+        fixed = self.predicted_fixed(near)
+        of_members = dict.fromkeys(self.members_, 0.0)
+        of_members |= dict(zip(near.members, weights.tolist(), strict=True))
+        return weighted_selection(self.data_.sets, of_members)._replace(
+            predicted_error=float(ratio) * fixed,
+            predicted_fixed=fixed,
+            familiarity=float(near.evidence.familiarity[0]),
+            n_sequences=float(1.0 / (of_sequences @ of_sequences)),
+        )
+
+
+def weighted_selection(sets: ParameterSets, weights: Mapping[int, float]) -> Selection:
+    """A selection of a bank's weights; its set is that of the heaviest member."""
+    heaviest = max(weights, key=weights.__getitem__)
+    return Selection(heaviest, sets[heaviest], weights)
+
+
+def bank_weights(
+    near: NearProducts, settings: BankSettings, live: Sequence[LiveSquares | None]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights of the members, and the root mean square that is expected of their mean.
+
+    Parameters
+    ----------
+    near
+        Of some scans.
+    settings
+        How to weigh.
+    live
+        What was measured of the members before each scan.
+
+    Returns
+    -------
+    weights : ndarray of shape (n_scans, n_members)
+    ratio : ndarray of shape (n_scans,)
+        To the fixed set's.
+    """
+    relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
+    of_sequences = near.evidence.weights(settings.sharpness)
+    trust = near.evidence.trust[:, None, None]
+    learned = np.einsum("qs,qsjk->qjk", of_sequences, relative)
+    learned = trust * learned + (1.0 - trust) * _untried(len(near.members))
+    windows = settings.prior_windows * (UNFAMILIAR + (1.0 - UNFAMILIAR) * near.evidence.trust)
+    squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
+    weights = np.array([minimum_variance_weights(of_scan, settings.even) for of_scan in squares])
+    measured = np.array([0.0 if one is None else one.windows for one in live])
+    kept = settings.min_fixed_share * windows / (windows + measured)
+    weights *= (1.0 - kept)[:, None]
+    weights[:, 0] += kept
+    if not settings.adapt:
+        weights[:] = np.eye(len(near.members))[0]
+    mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)
+    # Where the fixed set has no error, there is none to be gained on.
+    of_fixed = np.maximum(squares[:, 0, 0], 1e-12)
+    return weights, np.sqrt(mean_square / of_fixed)
+
+
+def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.float64]:
+    """Weights of members of which the training says nothing.
+
+    Until something is measured, the first member has all the weight. From then on, the others get
+    theirs as far as the measurements confirm them.
+
+    Parameters
+    ----------
+    n_members
+        Number of members.
+    live
+        What was measured of them.
+
+    Returns
+    -------
+    ndarray of shape (n_members,)
+    """
+    if live is None:
+        return np.asarray(np.eye(n_members)[0])
+    prior = _untried(n_members)
+    return minimum_variance_weights(blend(prior, BankSettings().prior_windows, live))
+
+
+def _untried(n_members: int) -> NDArray[np.float64]:
+    """Mean products of the errors of members of which the training says nothing."""
+    return np.diag([1.0, *[DOUBT] * (n_members - 1)])
+
+
+def among(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Weights of the members that are present, adding up to 1; the others have none.
+
+    Parameters
+    ----------
+    weights
+        Of shape (n_members,).
+    present
+        Of the same shape.
+    """
+    if present.all():
+        return weights
+    shares = share(weights, present)
+    return np.asarray(shares / shares.sum())
+
+
+def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
+
+    Parameters
+    ----------
+    weights
+        Of shape (n_selections, n_members).
+
+    Returns
+    -------
+    ndarray of shape (n_selections, n_members)
+    """
+    total = weights.copy()
+    for k in range(1, SMOOTHING):
+        total[k:] += weights[:-k]
+    return np.asarray(total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHING)[:, None])
+
+
+def clip_errors(
+    vectors: NDArray[np.float32], fixed_at: int, clip: float = BankSettings().clip
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Clip the errors on the frames of a sequence.
+
+    Parameters
+    ----------
+    vectors
+        Percent, of shape (n_frames, n_sets, 3); not finite where the track was lost.
+    fixed_at
+        Column of the fixed set.
+    clip
+        See `BankSettings`.
+
+    Returns
+    -------
+    vectors : ndarray of shape (n_frames, n_sets, 3)
+        Zero where the track was lost.
+    lost : ndarray of shape (n_frames, n_sets)
+        What counts there instead, in no direction; zero elsewhere.
+    """
+    lengths = np.linalg.norm(vectors, axis=-1)
+    lost = ~(lengths <= FAILURE)
+    of_fixed = np.where(lost[:, fixed_at], FAILURE, lengths[:, fixed_at])
+    most = clip * np.sqrt((of_fixed**2).mean() + ERROR_FLOOR**2)
+    share = np.minimum(1.0, most / np.maximum(lengths, 1e-9))
+    kept = np.where(lost[..., None], 0.0, vectors) * np.where(lost, 0.0, share)[..., None]
+    return kept.astype(np.float32), np.where(lost, most, 0.0).astype(np.float32)
+
+
+def minimum_variance_weights(
+    squares: NDArray[np.float64], even: float = BankSettings().even
+) -> NDArray[np.float64]:
+    """Weights w, none negative and adding up to 1, for which w'Sw is least.
+
+    Parameters
+    ----------
+    squares
+        S, of shape (n, n).
+    even
+        See `BankSettings`.
+
+    Returns
+    -------
+    ndarray of shape (n,)
+    """
+    n = len(squares)
+    harmonic = 1.0 / (1.0 / np.maximum(squares.diagonal(), 1e-12)).mean()
+    squares = squares + np.eye(n) * (even * harmonic + 1e-9 * squares.diagonal().max() + 1e-12)
+    # Up to a factor they are those for which w'Sw - 2 sum w is least.
+    weights = np.linalg.solve(squares, np.ones(n))
+    if weights.min() < 0.0:
+        from scipy.optimize import nnls  # not needed to load a model
+
+        root = np.linalg.cholesky(squares)
+        weights, _ = nnls(root.T, np.linalg.solve(root, np.ones(n)))
+    return np.asarray(weights / weights.sum())
+
+
+def choose_members(
+    vectors: Sequence[Mapping[int, NDArray[np.float32]]],
+    errors: Sequence[NDArray[np.floating]],
+    sets: ParameterSets,
+    fixed: int,
+    size: int,
+    spending: Spending | None = None,
+) -> list[int]:
+    """Choose sets whose errors cancel each other.
+
+    The search is greedy and begins with the fixed set. Each next member is the one that most
+    lowers the mean over the sequences of the root mean square of a weighted mean, if the best
+    weights in every sequence were known.
+
+    Parameters
+    ----------
+    vectors
+        For every sequence the error vectors by trial number, each of shape (n_frames, 3), see
+        `clip_errors`. A set without them is not chosen.
+    errors
+        Of every sequence, percent, of shape (n_frames, n_sets); NaN where a set was not run. A set
+        that was not run on every sequence is not chosen.
+    sets
+        The columns of `errors`.
+    fixed
+        Trial number of the fixed set.
+    size
+        How many to choose, if there are as many.
+    spending
+        What they may cost; anything when left out.
+
+    Returns
+    -------
+    list of int
+        Trial numbers, the fixed set's first.
+    """
+    number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
+    means = mean_errors(np.concatenate(errors), number)
+    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf]
+    pool = [fixed, *(t for t in best if t != fixed and all(t in known for known in vectors))]
+    squares = []
+    for known in vectors:
+        few, lost = clip_errors(np.stack([known[trial] for trial in pool], axis=1), 0)
+        rows = few.transpose(0, 2, 1).reshape(-1, len(pool)).astype(np.float64)
+        products = (rows.T @ rows + np.diag((lost.astype(np.float64) ** 2).sum(axis=0))) / len(few)
+        squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
+    chosen = [0]
+    while len(chosen) < min(size, len(pool)):
+        next_one = _next_member(squares, pool, chosen, spending)
+        if next_one is None:
+            break
+        chosen.append(next_one)
+    return [pool[j] for j in chosen]
+
+
+def _next_member(
+    squares: list[NDArray[np.float64]],
+    pool: Sequence[int],
+    chosen: Sequence[int],
+    spending: Spending | None,
+) -> int | None:
+    """The set that most lowers the error of those chosen, or most for its cost; None if none may.
+
+    It is a place in `pool`, as those in `chosen` are.
+    """
+    rest = [j for j in range(len(pool)) if j not in chosen]
+    members = [pool[j] for j in chosen]
+    if spending is not None:
+        rest = [j for j in rest if spending.allows([*members, pool[j]])]
+    lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
+    if spending is not None and spending.thrifty:
+        now = _root_mean_square(squares, list(chosen))
+        lowered = {j: (rms - now) / spending.price(members, pool[j]) for j, rms in lowered.items()}
+    return min(rest, key=lowered.__getitem__, default=None)
+
+
+def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:
+    of_members = [s[np.ix_(members, members)] for s in squares]
+    return float(
+        np.mean([np.sqrt(w @ s @ w) for s in of_members for w in [minimum_variance_weights(s)]])
+    )

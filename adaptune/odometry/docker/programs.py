@@ -1,0 +1,263 @@
+"""Programs in Docker images that read a recording and leave a trajectory."""
+
+import contextlib
+import socket
+import tempfile
+import time
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from adaptune import processes
+from adaptune.errors import OdometryError
+from adaptune.files import temporary_prefix
+from adaptune.odometry.base import Description, Usage
+from adaptune.odometry.docker.engine import (
+    Container,
+    ContainerSettings,
+    Mount,
+    copy_regular,
+    costs,
+    default_user,
+    image_digest,
+    kept_log,
+    make_shared,
+    remove_shared,
+)
+from adaptune.odometry.program import (
+    FileSettings,
+    ProgramInput,
+    WholeRun,
+    check_arguments,
+    read_output,
+)
+from adaptune.odometry.remote import FIRST_ANSWER, Limits, UserProgram, announced_by
+from adaptune.odometry.template import Template, replace
+from adaptune.space import ParameterSet
+from adaptune.trajectory import Trajectory
+
+_OUTPUT = "/output"
+_BETWEEN_LOOKS = 0.1
+"""Seconds."""
+
+
+class DockerCommandSettings(ContainerSettings, FileSettings):
+    """An image with a program, and its files.
+
+    Attributes
+    ----------
+    command : list of str
+        The program and its arguments, see `CommandSettings`; by default the image's own.
+    """
+
+    command: tuple[str, ...] = ()
+
+
+class DockerCommand(WholeRun):
+    """A program in a container, once on a whole recording.
+
+    The recording is below ``/data``, the template's copy is ``/parameters`` with the template's
+    suffix, and the trajectory is expected in ``/output``.
+    """
+
+    settings_type = DockerCommandSettings
+
+    @staticmethod
+    def describe(settings: DockerCommandSettings) -> Description:  # noqa: ARG004
+        """The study defines the parameters, and nothing can change on the way."""
+        return Description(space=None, live=False, whole=True)
+
+    @staticmethod
+    def check(settings: DockerCommandSettings, parameters: ParameterSet) -> None:
+        """Raise an `OdometryError` if the image is not here, or a parameter has no way to it."""
+        image_digest(settings.image)
+        check_arguments(settings.command, settings.template, parameters)
+
+    @property
+    def called(self) -> str:
+        return str(self.settings.image)
+
+    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
+        shared = make_shared(folder / "shared")
+        output = make_shared(shared / "output")
+        nested = output
+        for part in Path(self.settings.output).parts[:-1]:
+            nested = make_shared(nested / part)
+        source = given.path.resolve()
+        inside = "/data" if source.is_dir() else f"/data/{source.name}"
+        mounts = [Mount(source, inside), Mount(output, _OUTPUT, writable=True)]
+        values: dict[str, Any] = {"input": inside, "output": f"{_OUTPUT}/{self.settings.output}"}
+        values |= {"points": given.points, "imu": given.imu}
+        if self.settings.template is not None:
+            mounts.append(self._fill(folder))
+            values["parameters"] = mounts[-1].target
+        values |= self.parameters
+        container = Container(
+            self.settings,
+            self._limits.memory,
+            [replace(argument, values) for argument in self.settings.command],
+            mounts,
+            user=(user := default_user(self.settings)),
+            environment={"ADAPTUNE_POINTS": given.points, "ADAPTUNE_IMU": given.imu},
+        )
+        with closing(container):
+            failure = self._watch(container, len(given.stamps))
+            self._words = container.last_lines()
+            about = costs(self._usage, {}) | ({"fault": failure} if failure else {})
+            with kept_log(given.logs, self.settings, self.parameters, about) as kept:
+                if kept is not None:
+                    (kept / "output.log").write_bytes(container.log())
+        checked = folder / "checked"
+        copy_regular(output / self.settings.output, output, checked / self.settings.output)
+        remove_shared(shared, self.called, user)
+        if failure is not None:
+            raise OdometryError(failure)
+        return read_output(checked, self.settings, given.stamps)
+
+    def _fill(self, folder: Path) -> Mount:
+        template = Template(Path(self.settings.template))
+        file = folder / template.path.name
+        file.write_text(template.fill(self.parameters), encoding="utf-8")
+        file.chmod(0o644)
+        return Mount(file, f"/parameters{template.path.suffix}")
+
+    def _watch(self, container: Container, n: int) -> str | None:
+        """Wait for the end; how it ended if not well."""
+        begin, memory, cpu = time.perf_counter(), 0.0, 0.0
+        while (code := container.ended()) is None:
+            used = container.used()
+            cpu, memory = max(cpu, used.cpu), max(memory, used.memory)
+            seconds = time.perf_counter() - begin
+            self._usage = Usage(cpu, memory, seconds / n)
+            if seconds > self._limits.seconds * n:
+                limit = f"isolation.seconds = {self._limits.seconds:g}"
+                return f"it took longer than {limit} for each scan"
+            time.sleep(_BETWEEN_LOOKS)
+        if container.out_of_memory:
+            return f"out of isolation.memory = {self._limits.memory:g} GB"
+        return processes.verdict(code) if code else None
+
+
+# Programs in Docker images that receive scans and return poses, one after the other.
+
+
+_FOLDER = "/adaptune"
+_BETWEEN_SOCKET_LOOKS = 0.02
+"""Seconds."""
+
+
+class DockerProcessSettings(ContainerSettings):
+    """An image with a program that speaks `adaptune.odometry.wire`.
+
+    Attributes
+    ----------
+    command : list of str
+        The program and its arguments; by default the image's own. It must listen at the Unix socket
+        ``{socket}``, which the variable ADAPTUNE_SOCKET names, too.
+    settings : dict
+        Settings that the program receives.
+    """
+
+    command: tuple[str, ...] = ()
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+
+class DockerProcess(UserProgram):
+    """An odometry in a container, which it keeps from start to start; a new one after a fault.
+
+    Parameters
+    ----------
+    parameters, limits
+        See `Isolated`.
+    settings
+        The image.
+    """
+
+    settings_type = DockerProcessSettings
+
+    def __init__(self, parameters: ParameterSet, settings: DockerProcessSettings, limits: Limits):
+        super().__init__(settings.image, parameters, settings, limits)
+        self._hello = {"odometry": None, "settings": settings.settings}
+        self._settings = settings
+        self._container: Container | None = None
+        self._folder: Path | None = None
+
+    @staticmethod
+    def describe(settings: DockerProcessSettings) -> Description:
+        """What the program reports about itself; an error if it cannot be reached."""
+        return _describe(settings.model_dump_json(), image_digest(settings.image))
+
+    def close(self) -> None:
+        super().close()
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+        if self._folder is not None:
+            remove_shared(self._folder, self.name, default_user(self._settings))
+            self._folder = None
+
+    def _connect(self) -> processes.SocketStream:
+        self._folder = folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        folder.chmod(0o777)  # for any user of the image
+        inside = f"{_FOLDER}/odometry.sock"
+        self._container = Container(
+            self._settings,
+            self._limits.memory,
+            [replace(argument, {"socket": inside}) for argument in self._settings.command],
+            [Mount(folder, _FOLDER, writable=True)],
+            user=default_user(self._settings),
+            environment={"ADAPTUNE_SOCKET": inside},
+        )
+        connection = self._reach(folder / "odometry.sock")
+        connection.settimeout(max(self._limits.seconds, FIRST_ANSWER))
+        return processes.SocketStream(connection)
+
+    def _reach(self, path: Path) -> socket.socket:
+        """Connect as soon as the program listens."""
+        assert self._container is not None
+        begin, what = time.monotonic(), "it does not listen at its socket"
+        while time.monotonic() - begin < FIRST_ANSWER:
+            connection = socket.socket(socket.AF_UNIX)
+            with contextlib.suppress(OSError):
+                connection.connect(str(path))
+                return connection
+            connection.close()
+            if (ended := self._ended()) is not None:
+                what = f"{ended} before it listened at its socket"
+                break
+            time.sleep(_BETWEEN_SOCKET_LOOKS)
+        words = self._container.last_lines()
+        self.close()
+        what = f"{self.name}: {what}"
+        raise OdometryError(f"{what}: {words}" if words else what)
+
+    def _verdict(self, what: str) -> str:
+        """Add how the program ended, if it did, and the last lines that it wrote."""
+        if self._container is None:
+            return what
+        for _ in range(10):
+            if (ended := self._ended()) is not None:
+                what = ended
+                break
+            time.sleep(0.05)
+        words = self._container.last_lines()
+        return f"{what}: {words}" if words else what
+
+    def _ended(self) -> str | None:
+        """How the program ended; None while it runs."""
+        assert self._container is not None
+        if (code := self._container.ended()) is None:
+            return None
+        if self._container.out_of_memory:
+            return f"out of isolation.memory = {self._limits.memory:g} GB"
+        return processes.verdict(code)
+
+
+@cache
+def _describe(settings: str, digest: str) -> Description:  # noqa: ARG001 - another image, another
+    return announced_by(
+        DockerProcess({}, DockerProcessSettings.model_validate_json(settings), Limits())
+    )

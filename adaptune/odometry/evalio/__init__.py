@@ -1,1 +1,0 @@
-"""The odometries that evalio carries, compiled."""

@@ -1,0 +1,599 @@
+"""Odometries in programs that read a recording and a parameter file and write a trajectory."""
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from logging import getLogger
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator
+
+from adaptune import processes
+from adaptune.errors import OdometryError, UnavailableError, nearest
+from adaptune.files import replacing_folder, temporary_folder
+from adaptune.geometry import Poses, invert, rotation_angle, steps
+from adaptune.metrics import travelled, window_ends
+from adaptune.odometry.base import (
+    BaseSettings,
+    Description,
+    LastMotion,
+    Motions,
+    OdometryInstance,
+    Registration,
+    Usage,
+)
+from adaptune.odometry.remote import Arguments, Limits, pose_fault
+from adaptune.odometry.template import Template, check_names, placeholders, replace
+from adaptune.recording.config import SequenceConfig, Transform, resolve, to_pose
+from adaptune.recording.export import IMU, POINTS, Layout, export
+from adaptune.recording.scan import Recording, Scan
+from adaptune.ros.link import LinkError
+from adaptune.selection import Selection
+from adaptune.space import ParameterSet
+from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tum
+
+# The recording that a program reads: the sequence's own bag, or one that is written for it.
+
+
+class ProgramInput(NamedTuple):
+    """A recording as a program reads it, the topics in it, and what is known of its n scans."""
+
+    path: Path
+    points: str
+    imu: str  # empty if there is none
+    stamps: NDArray[np.int64]  # nanoseconds, of shape (n,)
+    T_ref_sensor: Poses | None  # of shape (n, 4, 4), NaN where there is no reference
+    logs: Path | None = None  # folder for what a program leaves behind, one folder a parameter set
+
+
+def program_input(
+    sequence: Recording, config: SequenceConfig, about: Any, folder: Path, layout: Layout
+) -> ProgramInput:
+    """Find or write the recording of a sequence for a program that reads `layout`.
+
+    Parameters
+    ----------
+    sequence, config
+        The sequence and its description.
+    about
+        All that the sequence depends on, as plain data. A recording with another is replaced.
+    folder
+        Where to keep what is written. Processes wait for each other.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    own = _own_bag(config, layout)
+    name = {"bag": "input.bag", "ros2": "input", "kitti": "input"}[layout]
+    with (folder.parent / f".{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if _about(folder) != about:
+            stamps: list[int] = []
+            with replacing_folder(folder) as temporary:
+                temporary.mkdir()
+                if own is None:
+                    scans = _note_stamps(sequence, stamps)
+                    export(scans, sequence.imu(), temporary / name, layout)
+                else:
+                    stamps += [scan.stamp for scan in sequence]
+                np.save(temporary / "stamps.npy", np.array(stamps, np.int64))
+                (temporary / "about.json").write_text(json.dumps(about), encoding="utf-8")
+        at = np.load(folder / "stamps.npy")
+    reference = sequence.reference()
+    T_ref_sensor = None if reference is None else reference.at(at)
+    if own is None:
+        imu = "" if sequence.imu() is None else IMU
+        return ProgramInput(folder / name, POINTS, imu, at, T_ref_sensor)
+    source: Any = getattr(sequence, "source", None)
+    imu = "" if config.imu is None else config.imu.topic or ""
+    return ProgramInput(own, config.points or source.points, imu, at, T_ref_sensor)
+
+
+def _note_stamps(sequence: Recording, stamps: list[int]) -> Iterator[Scan]:
+    for scan in sequence:
+        stamps.append(scan.stamp)
+        yield scan
+
+
+def _own_bag(config: SequenceConfig, layout: Layout) -> Path | None:
+    """The sequence's bag, if it is a single one, used as it is, and of the right kind."""
+    if not isinstance(config.bag, str) or layout == "kitti":
+        return None
+    plain = SequenceConfig(bag=config.bag)
+    changes = ("start", "stop", "stride", "part", "views", "compensate")
+    if any(getattr(config, key) != getattr(plain, key) for key in changes):
+        return None
+    path = Path(config.bag)
+    right = path.is_file() and path.suffix == ".bag"
+    if layout == "ros2":
+        right = (path / "metadata.yaml").exists()
+    return path if right else None
+
+
+def _about(folder: Path) -> Any:
+    try:
+        return json.loads((folder / "about.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+# Notice poses that belong to another frame than the LiDAR's, and references that do.
+
+
+_FEWEST, _SHORTEST = 10, 5.0
+"""Frames, and metres, below which nothing is said of a reference."""
+_MOVED = 0.2
+"""Metres that an odometry moves while the reference moves one."""
+_APART, _EXPLAINED = 20.0, 0.3
+"""Degrees between an odometry's motions and the reference's, and the share that may be left."""
+_SWAPPED = 45.0
+"""Degrees between them that no rotation explains."""
+_TURNED, _OTHERS = np.radians(3.0), 0.1
+"""Radians of a turn, and the share of turns that may be otherwise than the others."""
+_BACKWARDS = 120.0
+"""Degrees from which a reference may be reversed in time."""
+
+
+def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
+    """Refuse poses that move as the reference does, but along other axes.
+
+    The rotation that aligns displacements over a metre with those of the reference (Kabsch, Acta
+    Cryst. 1976) must not remove most of their difference.
+    """
+    if T_ref_sensor is None:
+        return
+    ends = window_ends(T_ref_sensor, 1.0)
+    starts = np.flatnonzero((ends >= 0) & np.isfinite(T_own_sensor[:, 0, 0]))
+    starts = starts[np.isfinite(T_own_sensor[ends[starts], 0, 0])]
+    if len(starts) < 10:
+        return
+    own, truth = (
+        (invert(T[starts]) @ T[ends[starts]])[:, :3, 3] for T in (T_own_sensor, T_ref_sensor)
+    )
+    U, _, Vt = np.linalg.svd(truth.T @ own)
+    T_truth_own = np.eye(4)
+    T_truth_own[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    before = np.linalg.norm(own - truth, axis=1).mean()
+    after = np.linalg.norm(own @ T_truth_own[:3, :3].T - truth, axis=1).mean()
+    if before > 0.3 and after < 0.2 * before:
+        angle = np.degrees(rotation_angle(T_truth_own))
+        raise OdometryError(
+            f"the program's poses are those of another frame: turned by {angle:.0f} degrees, they "
+            f"are the reference's; give the LiDAR's pose in it (odometry.settings.extrinsic)"
+        )
+
+
+def contradiction(T_odom_sensor: Poses, T_ref_sensor: Poses) -> str | None:
+    """What a reference looks like whose motions contradict an odometry's nearly everywhere.
+
+    Directions over a metre, not their lengths, are compared, and turns: a rotation (Kabsch) must
+    explain most of what they differ by. Noise and lost tracks are not explained by any.
+
+    Parameters
+    ----------
+    T_odom_sensor
+        Poses of shape (n, 4, 4), which owe nothing to the reference.
+    T_ref_sensor
+        The reference's, of shape (n, 4, 4); NaN where it is unknown.
+
+    Returns
+    -------
+    str or None
+        What has become of the reference, as in "it looks turned by about 90 degrees"; None if it
+        does not contradict the odometry, or too little is known.
+    """
+    T_own, T_true = _motions(T_odom_sensor, T_ref_sensor, 1.0)
+    # An odometry that stands still says nothing.
+    moved = np.linalg.norm(T_own[:, :3, 3], axis=1) > _MOVED
+    if moved.sum() < max(_FEWEST, 0.5 * len(moved)) or travelled(T_ref_sensor)[-1] < _SHORTEST:
+        return None
+    apart, left = _apart(T_own[moved, :3, 3], T_true[moved, :3, 3])
+    if apart > _APART and left < _EXPLAINED * apart:
+        return _turned(apart, T_odom_sensor, T_ref_sensor)
+    same = _same_turns(*_motions(T_odom_sensor, T_ref_sensor, _SHORTEST))
+    if same > 1.0 - _OTHERS and apart > _SWAPPED:
+        return "its orientations fit, but its positions do not: it looks as if axes were swapped"
+    if same < _OTHERS and apart < _APART:
+        return "its turns go the other way: it looks mirrored, or its z axis points down"
+    return None
+
+
+def _motions(T_odom_sensor: Poses, T_ref_sensor: Poses, length: float) -> tuple[Poses, Poses]:
+    """Motions of both while the reference moves so many metres."""
+    ends = window_ends(T_ref_sensor, length)
+    starts = np.flatnonzero(ends >= 0)
+    own, true = (invert(T[starts]) @ T[ends[starts]] for T in (T_odom_sensor, T_ref_sensor))
+    return own, true
+
+
+def _same_turns(T_own: Poses, T_true: Poses) -> float:
+    """Share of the turns that go the same way; NaN if there are few."""
+    from scipy.spatial.transform import Rotation
+
+    if len(T_own) < _FEWEST:
+        return np.nan
+    own, true = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (T_own, T_true))
+    turning = np.minimum(np.linalg.norm(own, axis=1), np.linalg.norm(true, axis=1)) > _TURNED
+    same = (own * true).sum(axis=1)[turning] > 0.0
+    return float(same.mean()) if len(same) >= _FEWEST else np.nan
+
+
+def _apart(own: Poses, true: Poses) -> tuple[float, float]:
+    """Median angle between displacements in degrees, and what a rotation leaves of it."""
+    own, true = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (own, true))
+    U, _, Vt = np.linalg.svd(true.T @ own)
+    R_true_own = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    both = ((v * true).sum(axis=1).clip(-1.0, 1.0) for v in (own, own @ R_true_own.T))
+    before, after = (float(np.degrees(np.median(np.arccos(cosine)))) for cosine in both)
+    return before, after
+
+
+def _turned(degrees: float, T_odom_sensor: Poses, T_ref_sensor: Poses) -> str:
+    """Tell a turned reference from one that runs backwards, by speeds and turn rates."""
+    turned = f"it looks turned by about {5 * round(degrees / 5)} degrees"
+    if degrees < _BACKWARDS:
+        return turned
+    own, true = (
+        np.nan_to_num([np.linalg.norm(T[:, :3, 3], axis=1), rotation_angle(T)])
+        for T in (steps(T_odom_sensor), steps(T_ref_sensor))
+    )
+    smooth = np.ones(min(10, own.shape[1])) / 10.0
+    own, true = ([np.convolve(v, smooth, "same") for v in pair] for pair in (own, true))
+    forwards, backwards = _alike(own, true), _alike(own, [v[::-1] for v in true])
+    if backwards > forwards + 0.1:
+        return "it looks reversed in time"
+    return turned if forwards > backwards + 0.1 else f"{turned}, or reversed in time"
+
+
+def _alike(own: Sequence[NDArray[np.float64]], true: Sequence[NDArray[np.float64]]) -> float:
+    """Sum of the correlations between these series."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        each = [np.asarray(np.corrcoef(pair))[0, 1] for pair in zip(own, true, strict=True)]
+    return float(np.nan_to_num(each).sum())
+
+
+# Odometries that run once on a whole recording.
+
+
+_log = getLogger(__name__)
+
+_COVERAGE = 0.9
+"""Least share of the scans, and of the way, for which there must be poses."""
+
+
+class WholeSettings(BaseSettings):
+    """What all odometries that run whole recordings may set.
+
+    Attributes
+    ----------
+    extrinsic : Transform, optional
+        The LiDAR's pose in the frame whose poses the program writes.
+    """
+
+    extrinsic: Transform | None = None
+
+
+class WholeRun(OdometryInstance):
+    """An odometry that runs once on a whole recording, and its trajectory.
+
+    It cannot restart on the way: where `start` places it elsewhere, its motions go on from there.
+
+    Parameters
+    ----------
+    parameters
+        A value for every parameter.
+    settings
+        What is set once.
+    limits
+        What it may use: memory, and time for all scans together.
+    read
+        Gives the recording at the first start; None if scans are only prepared.
+    """
+
+    faults: Sequence[str] = ()
+    _words = ""  # the last lines that the program wrote
+
+    def __init__(
+        self,
+        parameters: ParameterSet,
+        settings: Any,
+        limits: Limits,
+        read: Callable[[], ProgramInput] | None = None,
+    ):
+        self.parameters, self.settings = dict(parameters), settings
+        self._limits, self._read_input = limits, read
+        self._T_own_sensor: dict[int, Poses] | None = None
+        self._T_odom_own = np.eye(4)
+        self._usage = Usage(0.0, None)
+        self._last_motion = LastMotion()
+
+    @classmethod
+    def instance(cls, *given: Any) -> Self:
+        """Make an instance, as all programs of the user are made."""
+        return cls(*given)
+
+    @property
+    def usage(self) -> Usage:
+        """What the program has used, with all processes that it has started."""
+        return self._usage
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
+
+    @property
+    @abstractmethod
+    def called(self) -> str:
+        """What messages call the program."""
+
+    @abstractmethod
+    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
+        """Run the program, in an empty folder that is removed afterwards.
+
+        Sets `_usage` and `_words`. A `TrajectoryError` or an `OdometryError` is a fault.
+        """
+
+    def prepare(self, scan: Scan) -> NDArray[np.int64]:
+        return np.array(scan.stamp, np.int64)  # nothing else is needed
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        if self._T_own_sensor is None:
+            if self._read_input is None:
+                raise OdometryError("a program runs on a recording, not on single scans")
+            given = self._read_input()
+            poses = self._run(given)
+            self._T_own_sensor = dict(zip(given.stamps.tolist(), poses, strict=True))
+        self._T_odom_own = T_odom_sensor @ invert(self._own(prepared))
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+
+    def submit(self, prepared: NDArray[np.int64]) -> None:
+        self._submitted = prepared
+
+    def collect(self) -> Registration:
+        T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
+        self._last_motion.move(T_odom_sensor)
+        return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
+
+    def apply(self, selection: Selection) -> None:  # noqa: ARG002
+        raise OdometryError(
+            "a program that runs whole recordings cannot change its parameters: give it one set"
+        )
+
+    def close(self) -> None:
+        pass  # the program has ended
+
+    def _own(self, stamp: NDArray[np.int64]) -> Poses:
+        assert self._T_own_sensor is not None
+        return self._T_own_sensor.get(int(stamp), np.full((4, 4), np.nan))
+
+    def _run(self, given: ProgramInput) -> Poses:
+        """Poses at the scans' stamps, of shape (n, 4, 4), NaN where the program wrote none."""
+        T_own_sensor, failure = np.full((len(given.stamps), 4, 4), np.nan), None
+        with temporary_folder() as folder:
+            try:
+                trajectory = self.trajectory(given, folder)
+                if self.settings.extrinsic is not None:
+                    T = trajectory.T_world_sensor @ to_pose(self.settings.extrinsic)
+                    trajectory = Trajectory(trajectory.stamps, T)
+                T_own_sensor = poses_at(trajectory, given.stamps)
+                failure = _lacking(T_own_sensor, given)
+            except UnavailableError:
+                raise
+            except (TrajectoryError, OdometryError, LinkError) as error:
+                failure = str(error)
+        if failure is not None:
+            self._fault(failure)
+        try:
+            check_frame(T_own_sensor, given.T_ref_sensor)
+        except OdometryError as error:
+            what = f"{self.called}, with {self.parameters}: {error}"
+            raise OdometryError(self._quoting(what)) from error
+        return T_own_sensor
+
+    def _quoting(self, what: str) -> str:
+        """What happened, and the last lines that the program wrote, if any."""
+        return f"{what}: {self._words}" if self._words else what
+
+    def _fault(self, what: str) -> None:
+        what = self._quoting(what)
+        self.faults = [*self.faults, what]
+        _log.warning("%s with %s: %s", self.called, self.parameters, what)
+
+
+def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:
+    """What is said where too few scans have poses, or too little of the way."""
+    known = np.isfinite(T_own_sensor[:, 0, 0])
+    seconds = 1e-9 * (given.stamps - given.stamps[0])
+    until = f"the last at {seconds[known][-1]:.1f} s of {seconds[-1]:.1f} s" if known.any() else ""
+    if known.mean() < _COVERAGE:
+        return f"it gave poses for {known.sum()} of {len(known)} scans, {until}"
+    if given.T_ref_sensor is not None:
+        metres = np.nan_to_num(np.linalg.norm(steps(given.T_ref_sensor)[:, :3, 3], axis=1))
+        covered = metres[known[:-1] & known[1:]].sum()
+        if covered < _COVERAGE * metres.sum():
+            way = f"{covered:.0f} m of {metres.sum():.0f} m"
+            return f"it gave poses for {way} of the way, {until}"
+    return None
+
+
+def poses_at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
+    """Poses at the scans' stamps.
+
+    Programs stamp a scan at its start or at its end: the scan before the first pose and the one
+    after the last get the motion next to them.
+    """
+    spacing = np.diff(stamps)
+    gap = max(1.0, 3e-9 * float(np.median(spacing))) if len(spacing) else 1.0
+    T = trajectory.at(stamps, gap)
+    known = np.flatnonzero(np.isfinite(T[:, 0, 0]))
+    if len(known) > 1:
+        first, last = known[[0, -1]]
+        if first == 1 and np.isfinite(T[2]).all():
+            T[0] = T[1] @ invert(T[2]) @ T[1]
+        if last == len(T) - 2 and np.isfinite(T[-3]).all():
+            T[-1] = T[-2] @ invert(T[-3]) @ T[-2]
+    elif not len(known):
+        begin, end = (1e-9 * trajectory.stamps[[0, -1]]).tolist()
+        raise OdometryError(
+            f"its poses are of {begin:.3f} s to {end:.3f} s, the scans of "
+            f"{1e-9 * stamps[0]:.3f} s to {1e-9 * stamps[-1]:.3f} s"
+        )
+    return T
+
+
+_PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
+
+
+class FileSettings(WholeSettings):
+    """The files of a program that reads a recording.
+
+    Attributes
+    ----------
+    template : str, optional
+        A parameter file: YAML, JSON or TOML, also in the layouts of ROS 1 and ROS 2.
+    output : str
+        Name of the trajectory that it leaves.
+    format : {"tum", "kitti", "evalio"}
+        Format of the trajectory.
+    input : {"bag", "ros2", "kitti"}
+        What the program reads.
+    """
+
+    template: Annotated[str, AfterValidator(resolve)] | None = None
+    output: str = "trajectory.tum"
+    format: Literal["tum", "kitti", "evalio"] = "tum"
+    input: Layout = "bag"
+
+
+class CommandSettings(FileSettings):
+    """A program and its files.
+
+    Attributes
+    ----------
+    command : list of str
+        The program and its arguments. In these ``{input}`` is the recording, ``{parameters}`` the
+        file made from the template, ``{output}`` the path of the trajectory, ``{points}`` and
+        ``{imu}`` are topics, ``{study}`` is the folder of the study's file, and the name of any
+        parameter stands for its value.
+    version : str, optional
+        Version of the program. Change it where its file stays the same and the program does not, as
+        with a shared library: results of the version before do not count any more.
+    """
+
+    command: Arguments
+    version: str | None = None
+
+
+class Command(WholeRun):
+    """A program that runs once on a whole recording, and its trajectory; see `WholeRun`."""
+
+    settings_type = CommandSettings
+
+    @staticmethod
+    def describe(settings: CommandSettings) -> Description:  # noqa: ARG004
+        """The study defines the parameters, and nothing can change on the way."""
+        return Description(space=None, live=False, whole=True)
+
+    @staticmethod
+    def check(settings: CommandSettings, parameters: ParameterSet) -> None:
+        """Raise an `OdometryError` if there is no such program, or no way for a parameter to it."""
+        program = settings.command[0]
+        if shutil.which(program) is None:
+            raise OdometryError(f"command: there is no program {program!r}")
+        check_arguments(settings.command, settings.template, parameters)
+
+    @property
+    def called(self) -> str:
+        return str(self.settings.command[0])
+
+    def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
+        here = folder / "run"
+        here.mkdir()
+        output = here / self.settings.output
+        output.parent.mkdir(parents=True, exist_ok=True)
+        command = self._command(given, output, folder)
+        failure = self._execute(command, here, folder / "output", len(given.stamps))
+        if failure is not None:
+            raise OdometryError(failure)
+        return read_output(here, self.settings, given.stamps)
+
+    def _command(self, given: ProgramInput, output: Path, folder: Path) -> list[str]:
+        values: dict[str, Any] = {"input": given.path.resolve(), "output": output}
+        values |= {"points": given.points, "imu": given.imu}
+        if self.settings.template is not None:
+            template = Template(Path(self.settings.template))
+            values["parameters"] = folder / template.path.name
+            values["parameters"].write_text(template.fill(self.parameters), encoding="utf-8")
+        values |= self.parameters
+        return [replace(argument, values) for argument in self.settings.command]
+
+    def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:
+        """Run the program; how it ended if not well."""
+        begin = time.perf_counter()
+        with log.open("wb") as file:
+            program = processes.Program(
+                command,
+                self._limits.memory,
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+            )
+            with closing(program):
+                ended = in_time = program.wait(self._limits.seconds * n)
+                if ended is None:
+                    ended = program.end()
+        with log.open("rb") as written:
+            self._words = processes.last_lines(written)
+        if ended is not None:
+            self._usage = Usage(ended.cpu, ended.memory, (time.perf_counter() - begin) / n)
+        if in_time is None:
+            return f"it took longer than isolation.seconds = {self._limits.seconds:g} for each scan"
+        return processes.verdict(in_time.code) if in_time.code else None
+
+
+def read_output(folder: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:
+    """Read the trajectory that a program left in a folder; `stamps` of shape (n,) are the scans'.
+
+    Raises
+    ------
+    OdometryError, TrajectoryError
+        If there is none, or it holds something else.
+    """
+    path = folder / settings.output
+    if not path.exists():
+        raise OdometryError(f"it left no {settings.output}")
+    try:
+        if settings.format == "kitti":
+            poses = read_kitti(path)
+            if len(poses) > len(stamps):
+                counted = f"{len(poses)} poses without stamps for {len(stamps)} scans"
+                raise OdometryError(f"{settings.output} has {counted}")
+            trajectory = Trajectory(stamps[: len(poses)], poses)
+        else:
+            trajectory = read_tum(path)
+    except TrajectoryError as error:
+        raise TrajectoryError(str(error).replace(f"{folder}{os.sep}", "")) from error
+    for number, T in enumerate(trajectory.T_world_sensor):
+        if what := pose_fault(T):
+            raise OdometryError(f"{settings.output}, pose {number + 1}: {what}")
+    return trajectory
+
+
+def check_arguments(command: Sequence[str], template: str | None, parameters: ParameterSet) -> None:
+    """Raise an `OdometryError` if there is no way for a parameter to a program."""
+    known = [*_PLACEHOLDERS, *parameters]
+    for argument in command:
+        for name in placeholders(argument):
+            if name not in known:
+                raise OdometryError(f"command: {{{name}}} is nothing; {nearest(name, known)}")
+    check_names(parameters, None if template is None else Template(Path(template)), command)

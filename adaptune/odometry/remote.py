@@ -1,0 +1,469 @@
+"""Odometries in processes of their own: a crash ends that process and nothing else.
+
+A small server imports the odometry once and forks a fresh process for every start. That takes
+milliseconds, and global state of the odometry ends with its process.
+"""
+
+import contextlib
+import logging
+import socket
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_validator
+
+from adaptune import processes
+from adaptune.errors import OdometryError, StrictModel, UnavailableError
+from adaptune.geometry import Poses
+from adaptune.odometry import wire
+from adaptune.odometry.base import (
+    BaseSettings,
+    Description,
+    LastMotion,
+    Motions,
+    OdometryInstance,
+    Registration,
+    Usage,
+)
+from adaptune.processes import available, next_core
+from adaptune.recording.scan import Scan
+from adaptune.selection import Selection
+from adaptune.space import ParameterSet
+
+MOST_FAULTS = 10
+"""An instance with so many faults does not start again: the rest of its sequence is lost."""
+
+_TOLERANCE = 1e-3
+"""By how much a rotation times its transpose may differ from the identity."""
+
+SERVICE = processes.Service("adaptune.odometry.serving", tuple(processes.ONE_THREAD.items()))
+"""What a server does with an odometry."""
+
+_log = logging.getLogger(__name__)
+
+
+def _in_study(argument: str, info: ValidationInfo) -> str:
+    folder = (info.context or {}).get("folder")
+    return argument if folder is None else argument.replace("{study}", str(folder))
+
+
+Arguments = Annotated[tuple[Annotated[str, AfterValidator(_in_study)], ...], Field(min_length=1)]
+"""A program and its arguments; ``{study}`` in them is the folder of the study's file."""
+
+
+class Limits(StrictModel):
+    """Limits of an odometry in a process of its own.
+
+    Attributes
+    ----------
+    seconds : float
+        Time for one scan.
+    memory : float
+        Gigabytes, in addition to what the process begins with.
+    """
+
+    seconds: float = Field(10.0, gt=0, le=1e6)
+    memory: float = Field(4.0, gt=0, le=1e6)
+
+    @property
+    def bounds(self) -> processes.Bounds:
+        """The limits as a server takes them."""
+        late = f"a scan took longer than isolation.seconds = {self.seconds:g}"
+        full = f"out of isolation.memory = {self.memory:g} GB"
+        return processes.Bounds(self.seconds, self.memory, late, full)
+
+
+class Faulting(OdometryInstance):
+    """An instance that may go wrong, and notes it.
+
+    Parameters
+    ----------
+    name, parameters
+        The odometry.
+    """
+
+    faults: Sequence[str] = ()
+
+    def __init__(self, name: str, parameters: ParameterSet):
+        self.name = name
+        self.parameters = dict(parameters)
+        self._last_motion = LastMotion()
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it had so many faults that it does not start again."""
+        return len(self.faults) >= MOST_FAULTS
+
+    def note_fault(self, what: str) -> Registration:
+        """Note a fault and end; the pose of a scan with a fault."""
+        self.close()
+        if what not in self.faults:
+            _log.warning("%s with %s: %s", self.name, self.parameters, what)
+        self.faults = [*self.faults, what]
+        if self.given_up:
+            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
+        return Registration(np.full((4, 4), np.nan), registered=False)
+
+
+class Isolated(Faulting):
+    """An odometry that lives in another process, a new one with every start.
+
+    If that process ends, or returns an invalid pose, this is a *fault*: the pose of that scan is
+    NaN, and so are all that follow until a new start. A fault quotes the last lines that the
+    odometry wrote.
+
+    Parameters
+    ----------
+    name
+        The odometry.
+    parameters, settings
+        See `Odometry`.
+    limits
+        What each process may use.
+    """
+
+    apart = True
+    _fresh = True  # each start needs a new process
+
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, limits: Limits):
+        super().__init__(name, parameters)
+        self._cpu = self._cpu_before = self._memory = 0.0  # as the other processes report
+        self._hello: dict[str, Any] = {
+            "odometry": name,
+            "settings": settings.model_dump(mode="json"),
+        }
+        self._limits = limits
+        self._stream: processes.SocketStream | None = None
+        self._busy = False
+        # Nothing else limits TBB's threads, and it sums in the order in which they finish.
+        self._core = next_core()
+
+    @property
+    def ended(self) -> bool:
+        return self._stream is None
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(self._cpu, self._memory, elsewhere=self._cpu)
+
+    @property
+    def busy(self) -> bool:
+        return self._busy
+
+    def ready(self, seconds: float) -> bool:
+        return self._stream is None or self._stream.ready(seconds)
+
+    def prepare(self, scan: Scan) -> Scan:
+        return scan  # the other process prepares
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+        if self._fresh:
+            self.close()
+        if self._stream is None:
+            if self.given_up:
+                return
+            try:
+                self._stream = self._connect()
+            except UnavailableError:
+                raise
+            except OdometryError as error:
+                # One that has run can be gone for good.
+                if not self.faults:
+                    raise
+                self.note_fault(str(error))
+                return
+            self._ask(wire.hello(**self._hello, parameters=self.parameters))
+        self._ask(
+            {"type": "start", "stamp": prepared.stamp},
+            **wire.scan_arrays(prepared),
+            pose=T_odom_sensor,
+            motion=T_previous_current,
+        )
+
+    def submit(self, prepared: Scan) -> None:
+        self._submitted, self._busy = prepared.stamp, True
+        self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
+
+    def collect(self) -> Registration:
+        registration = self._registration()
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _registration(self) -> Registration:
+        """The answer to the submitted scan; NaN if there is none, or a wrong one."""
+        answer, lost = self._receive(), Registration(np.full((4, 4), np.nan), registered=False)
+        self._busy = False
+        if answer is None:
+            return lost
+        try:
+            T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
+            late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
+            cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
+            wrong = pose_fault(T_odom_sensor)
+            if late:
+                wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
+            wrong = wrong and f"a pose {wrong}"
+        except KeyError as error:
+            wrong = f"an answer without {error}"
+        except (TypeError, ValueError) as error:
+            wrong = f"an answer of other types ({error})"
+        if wrong:
+            return self.note_fault(f"it gave {wrong}")
+        self._cpu = self._cpu_before + cpu
+        self._memory = max(self._memory, memory)
+        return Registration(T_odom_sensor.copy(), bool(registered))
+
+    def apply(self, selection: Selection) -> None:
+        self.configure(selection.parameters)
+
+    def configure(self, parameters: ParameterSet) -> None:
+        """Change parameters between scans; the others stay."""
+        self.parameters |= parameters
+        self._ask({"type": "configure", "parameters": parameters})
+
+    def close(self) -> None:
+        if self._stream is not None:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            self._stream = None
+            self._cpu_before = self._cpu
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _ask(self, header: dict[str, Any], **arrays: Any) -> processes.Message | None:
+        self._send(header, **arrays)
+        return self._receive()
+
+    def _send(self, header: dict[str, Any], **arrays: Any) -> None:
+        if self._stream is not None:
+            # A process that does not listen any more has said why, or has ended.
+            with contextlib.suppress(OSError):
+                processes.send(self._stream, header, **arrays)
+
+    def _receive(self) -> processes.Message | None:
+        """Wait for the answer; None if there is none."""
+        if self._stream is None:
+            return None
+        answer, what = None, "its process ended"
+        try:
+            answer = processes.receive(self._stream)
+        except TimeoutError:
+            what = f"a scan took longer than isolation.seconds = {self._limits.seconds:g}"
+        except OSError:
+            pass
+        except processes.WireError as error:
+            what = str(error)
+        if answer is None:
+            self.note_fault(self._verdict(what))
+            return None
+        kind, message = map(answer.header.get, ("type", "message"))
+        if kind == "refused":
+            raise OdometryError(f"{self.name}: {message}")
+        if kind == "fault":
+            self.note_fault(str(message))
+            return None
+        return answer
+
+    def _connect(self) -> processes.SocketStream:
+        """A stream to a new process, which first receives a hello."""
+        bounds = self._limits.bounds._replace(core=self._core)
+        try:
+            return processes.connect(SERVICE, self.name, "converse", bounds)
+        except processes.HostError as error:
+            raise OdometryError(str(error)) from error
+
+    def _verdict(self, what: str) -> str:
+        """Add to `what` how the process ended; here the process itself reports that."""
+        return what
+
+
+def pose_fault(T_odom_sensor: Poses) -> str | None:
+    """What is wrong with a pose, if anything."""
+    if T_odom_sensor.shape != (4, 4):
+        return f"of shape {T_odom_sensor.shape}"
+    if not np.isfinite(T_odom_sensor).all():
+        return "that is not finite"
+    R = T_odom_sensor[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "that is not rigid"
+    return None
+
+
+# Odometries in programs of the user that receive scans and return poses, one after the other.
+
+
+FIRST_ANSWER = 60.0
+"""Seconds that a program may need to begin."""
+
+
+def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
+    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``; else an error."""
+    kind, colon, rest = address.partition(":")
+    if kind == "unix" and colon and rest:
+        return socket.AF_UNIX, rest
+    host, _, port = rest.removeprefix("//").rpartition(":")
+    if kind != "tcp" or not host or not port.isdigit():
+        raise OdometryError(f"address: {address!r} is neither tcp://HOST:PORT nor unix:PATH")
+    return socket.AF_INET, (host, int(port))
+
+
+class ProcessSettings(BaseSettings):
+    """How to reach a program that speaks `adaptune.odometry.wire`.
+
+    Attributes
+    ----------
+    command : list of str, optional
+        Starts the program, which uses its standard input and output.
+    address : str, optional
+        Where the program listens: ``tcp://HOST:PORT`` or ``unix:PATH``.
+    settings : dict
+        Settings that the program receives.
+    version : str, optional
+        Version of the program. Change it where its file stays the same and the program does not, as
+        with a container or a shared library: results of the version before do not count any more.
+    """
+
+    command: Arguments | None = None
+    address: str | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+    version: str | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.command is None) == (self.address is None):
+            raise ValueError("give a command or an address")
+        return self
+
+
+class UserProgram(Isolated):
+    """An odometry in a program of the user, wherever that runs.
+
+    Each instance has its own program or connection. It keeps that from start to start, and needs a
+    new one only after a fault.
+    """
+
+    _fresh = False
+
+    @classmethod
+    def instance(
+        cls,
+        parameters: ParameterSet,
+        settings: Any,
+        limits: Limits,
+        read: object = None,  # noqa: ARG003
+    ) -> Self:
+        """Make an instance, as all programs of the user are made; it reads no recording."""
+        make: Any = cls
+        made: Self = make(parameters, settings, limits)
+        return made
+
+    def _receive(self) -> processes.Message | None:
+        """Wait for the answer; only the first may take longer than a scan."""
+        answer = super()._receive()
+        if self._stream is not None:
+            self._stream.limit(self._limits.seconds)
+        return answer
+
+
+class Process(UserProgram):
+    """An odometry in a program of the user on this machine.
+
+    Parameters
+    ----------
+    parameters, limits
+        See `Isolated`.
+    settings
+        How to reach the program.
+    """
+
+    settings_type = ProcessSettings
+
+    def __init__(self, parameters: ParameterSet, settings: ProcessSettings, limits: Limits):
+        name = settings.command[0] if settings.command else str(settings.address)
+        super().__init__(name, parameters, settings, limits)
+        self._hello = {"odometry": None, "settings": settings.settings}
+        self._reach = settings
+        self._socket: socket.socket | None = None
+        self._program: processes.Program | None = None
+        self._written: Any = None
+
+    @staticmethod
+    def describe(settings: ProcessSettings) -> Description:
+        """What the program reports about itself; an error if it cannot be reached."""
+        return _describe(settings.model_dump_json())
+
+    def close(self) -> None:
+        super().close()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        if self._program is not None:
+            self._program.close()
+            self._program = None
+
+    def _connect(self) -> processes.SocketStream:
+        address = self._reach.address
+        if address is None:
+            self._socket = self._begin(self._reach.command or ())
+        else:
+            family, where = parse_address(address)
+            self._socket = socket.socket(family)
+            try:
+                self._socket.connect(where)
+            except OSError as error:
+                self._socket.close()
+                what = f"nothing listens at {address} ({error.strerror})"
+                raise OdometryError(f"{what}: start the program there first") from error
+        self._socket.settimeout(max(self._limits.seconds, FIRST_ANSWER))
+        return processes.SocketStream(self._socket)
+
+    def _begin(self, command: tuple[str, ...]) -> socket.socket:
+        here, there = socket.socketpair()
+        self._written = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
+        with there:
+            self._program = processes.Program(
+                command,
+                self._limits.memory,
+                stdin=there.fileno(),
+                stdout=there.fileno(),
+                stderr=self._written,
+                # A program may use several cores, unless this process must not.
+                core=self._core if available() == 1 else None,
+            )
+        return here
+
+    def _verdict(self, what: str) -> str:
+        """Add how the program ended, if it did, and the last lines that it wrote."""
+        if self._program is None:
+            return what.replace("its process ended", "it ended the conversation")
+        if (ended := self._program.wait(0.5)) is not None:
+            what = processes.verdict(ended.code)
+        return processes.quoting(what, self._written)
+
+
+@cache
+def _describe(settings: str) -> Description:
+    return announced_by(Process({}, ProcessSettings.model_validate_json(settings), Limits()))
+
+
+def announced_by(program: UserProgram) -> Description:
+    """What a program reports about itself; it is ended then."""
+    try:
+        program._stream = program._connect()
+        answer = program._ask(wire.hello(**program._hello, parameters={}))
+        if answer is None:
+            raise OdometryError(program.faults[-1])
+        return wire.announced(answer)
+    finally:
+        program.close()

@@ -1,0 +1,713 @@
+"""Messages between processes: a JSON header, and arrays as raw bytes."""
+
+import contextlib
+import ctypes
+import gc
+import itertools
+import json
+import math
+import os
+import re
+import resource
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from multiprocessing import get_context
+from multiprocessing.connection import wait
+from pathlib import Path
+from types import ModuleType
+from typing import Any, BinaryIO, NamedTuple, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import keeper
+from adaptune.errors import AdaptuneError, in_a_line
+from adaptune.keeper import Ended, adopt_orphans, keep
+
+_LENGTH = struct.Struct("<I")
+_LONGEST_HEADER = 1 << 24
+
+
+class Readable(Protocol):
+    """A stream of messages."""
+
+    def read(self, size: int, /) -> bytes:
+        """Read so many bytes; fewer only at the end."""
+
+
+class Writable(Protocol):
+    """A stream that takes messages."""
+
+    def write(self, data: bytes, /) -> Any:
+        """Take bytes."""
+
+    def writelines(self, lines: Iterable[Any], /) -> None:
+        """Take several buffers."""
+
+    def flush(self) -> None:
+        """Send what was taken."""
+
+
+class SocketStream:
+    """A socket as a stream of messages, which tells whether one has come.
+
+    Nothing is read ahead, so that what has come can be seen at the socket.
+    """
+
+    def __init__(self, connection: socket.socket):
+        self._socket = connection
+        self._writer = connection.makefile("wb")
+        self.write, self.writelines = self._writer.write, self._writer.writelines
+        self.flush = self._writer.flush
+
+    def read(self, size: int, /) -> bytes:
+        """Read so many bytes; fewer only at the end."""
+        data = bytearray()
+        while len(data) < size and (more := self._socket.recv(size - len(data))):
+            data += more
+        return bytes(data)
+
+    def ready(self, seconds: float) -> bool:
+        """Whether a message, or the end, is there, or comes in so many seconds."""
+        return bool(wait([self._socket], max(seconds, 0.0)))
+
+    def close(self) -> None:
+        """Close the socket."""
+        try:
+            self._writer.close()
+        finally:
+            self._socket.close()
+
+    def limit(self, seconds: float) -> None:
+        """Raise a `TimeoutError` where a message takes longer."""
+        self._socket.settimeout(seconds)
+
+    def end(self) -> None:
+        """End the conversation, for all processes that share the socket and threads that read."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+
+class WireError(AdaptuneError):
+    """A stream without messages of this version."""
+
+
+class Message(NamedTuple):
+    """A message: its header, ``type`` included, and its arrays by name."""
+
+    header: dict[str, Any]
+    arrays: dict[str, NDArray[Any]]
+
+
+def send(stream: Writable, header: Mapping[str, Any], **arrays: NDArray[Any] | None) -> None:
+    """Write a message; arrays that are None are left out."""
+    given = {name: np.ascontiguousarray(a) for name, a in arrays.items() if a is not None}
+    layout = [[name, a.dtype.str, list(a.shape)] for name, a in given.items()]
+    encoded = json.dumps({**header, "arrays": layout}).encode()
+    stream.write(_LENGTH.pack(len(encoded)) + encoded)
+    stream.writelines(a.data.cast("B") for a in given.values() if a.size)
+    stream.flush()
+
+
+def receive(stream: Readable) -> Message | None:
+    """Read a message, or None where the stream has ended; else there is a `WireError`."""
+    first = stream.read(_LENGTH.size)
+    if not first:
+        return None
+    try:
+        (length,) = _LENGTH.unpack(first)
+        if length > _LONGEST_HEADER:
+            raise WireError("the stream holds no message of adaptune's: write nothing else to it")
+        header = json.loads(_exactly(stream, length))
+        arrays = {}
+        for name, kind, shape in header.pop("arrays"):
+            data = _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize)
+            arrays[name] = np.frombuffer(data, kind).reshape(shape)
+    except (struct.error, ValueError, KeyError, TypeError) as error:
+        raise WireError(f"the stream holds no message of adaptune's ({error})") from error
+    return Message(header, arrays)
+
+
+def _exactly(stream: Readable, size: int) -> bytes:
+    data = stream.read(size)
+    if len(data) < size:
+        raise WireError("the stream ends in the middle of a message")
+    return data
+
+
+# User code in processes of its own: whatever it does there ends that process and nothing else.
+#
+# Python code is imported once, by a server that then forks a fresh process for each use of it.
+# Programs run under a keeper. Both end with this process, and so does all that they have started.
+
+
+IMPORT_SECONDS = 60.0
+"""An import of user code may take so long."""
+
+_TAIL, _LINES = 1 << 14, 5
+"""Messages quote the last lines, out of the last bytes, that a program wrote."""
+
+_CONTROL = re.compile(r"\x1b\[[0-9;]*[A-Za-z]|\x1b\][^\x07]*\x07?|[\x00-\x08\x0b-\x1f]")
+"""What colours a terminal, or sets its title."""
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Environment of programs that must not start threads of their own."""
+
+
+class HostError(AdaptuneError):
+    """User code that cannot be imported, or that does not answer."""
+
+
+class RefusedError(HostError):
+    """What user code, or what runs it, refuses in words of its own."""
+
+
+def verdict(code: int) -> str:
+    """How a process ended, by its exit code, or minus the signal's number."""
+    if code >= 0:
+        return f"its process ended with code {code}"
+    known = -code in set(signal.Signals)
+    by = signal.Signals(-code).name if known else f"signal {-code}"
+    return f"its process was ended by {by}"
+
+
+def last_lines(output: BinaryIO) -> str:
+    """The last lines that a process wrote to a file."""
+    size = output.seek(0, os.SEEK_END)
+    output.seek(max(size - _TAIL, 0))
+    return plain_lines(output.read())
+
+
+def plain_lines(written: bytes) -> str:
+    """The last lines of what a process wrote, without colours and empty ones."""
+    lines = _CONTROL.sub("", written.decode(errors="replace")).splitlines()
+    return " | ".join([line.strip() for line in lines if line.strip()][-_LINES:])
+
+
+def quoting(what: str, output: BinaryIO) -> str:
+    """What happened, and the last lines that a process wrote, if any."""
+    words = last_lines(output)
+    return f"{what}: {words}" if words else what
+
+
+class Program:
+    """A program of the user in a session of its own, under a keeper.
+
+    Parameters
+    ----------
+    command
+        The program and its arguments.
+    memory
+        Limit on the address space of each of its processes, in gigabytes.
+    core
+        The only core that it may use; None for those of this process.
+    streams
+        Of `subprocess.Popen`: its input and output, and its folder.
+    """
+
+    def __init__(
+        self, command: Sequence[str], memory: float, core: int | None = None, **streams: Any
+    ):
+        self._here, there = socket.socketpair()
+        under = [sys.executable, "-I", "-S", keeper.__file__, str(there.fileno()), str(memory)]
+        with there:
+            self._keeper = subprocess.Popen(
+                [*under, *command],
+                pass_fds=[there.fileno()],
+                env=os.environ | ONE_THREAD,
+                start_new_session=True,
+                **streams,
+            )
+        if core is not None:
+            # The keeper has not begun yet.
+            os.sched_setaffinity(self._keeper.pid, {core})
+
+    def wait(self, seconds: float) -> Ended | None:
+        """Wait for the program to end; None if it runs longer."""
+        self._here.settimeout(seconds)
+        try:
+            code, cpu, memory = self._here.recv(1 << 10).split()
+        except TimeoutError:
+            return None
+        except (OSError, ValueError):  # the keeper itself was killed
+            return Ended(-signal.SIGKILL, 0.0, 0.0)
+        return Ended(int(code), float(cpu), float(memory))
+
+    def end(self) -> Ended | None:
+        """End it with all that it has started, and say what it has used."""
+        with contextlib.suppress(OSError):
+            self._here.shutdown(socket.SHUT_WR)
+        return self.wait(5.0)
+
+    def close(self) -> None:
+        """End it with all that it has started."""
+        self._here.close()
+        self._keeper.wait()
+
+
+class Service(NamedTuple):
+    """What a server does with user code.
+
+    Attributes
+    ----------
+    module : str
+        Its function ``load(name)`` imports the user code. Others, of a stream to read, one to write
+        and the name, answer messages until the stream ends.
+    environment : dict
+        Additional variables.
+    """
+
+    module: str
+    environment: tuple[tuple[str, str], ...] = ()
+
+
+class Bounds(NamedTuple):
+    """Limits of a process that a server forks.
+
+    Attributes
+    ----------
+    seconds : float
+        Time for each message; 0 for no limit.
+    memory : float
+        Gigabytes, in addition to what the process begins with; 0 for no limit.
+    late, full : str
+        What is said where one of them is exceeded.
+    core : int, optional
+        The only core that it may use.
+    """
+
+    seconds: float = 0.0
+    memory: float = 0.0
+    late: str = "it took too long"
+    full: str = "out of memory"
+    core: int | None = None
+
+
+UNBOUNDED = Bounds()
+
+
+class Server(NamedTuple):
+    """A process that has imported user code, and the socket that asks it to fork."""
+
+    process: subprocess.Popen[bytes]
+    control: socket.socket
+
+
+@cache
+def server(service: Service, name: str) -> Server:
+    """Server of a piece of user code, started at the first call.
+
+    Raises
+    ------
+    HostError
+        If it cannot be imported, with the last lines that it wrote.
+    """
+    here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
+    path = os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)
+    arguments = [str(there.fileno()), str(IMPORT_SECONDS), service.module, name]
+    with there, tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            # Modules are found where this process finds them, and nowhere else.
+            [sys.executable, "-P", "-m", "adaptune.processes", *arguments],
+            pass_fds=[there.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            env=os.environ | dict(service.environment) | {"PYTHONPATH": path},
+            # Ctrl-C is for this process only.
+            start_new_session=True,
+        )
+        there.close()
+        try:
+            wrong = _wait_for_import(process, here)
+        except RefusedError:
+            process.wait()
+            raise
+        if wrong is not None:
+            here.close()
+            raise HostError(f"{name}: {quoting(wrong, output)}")
+    return Server(process, here)
+
+
+def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -> str | None:
+    """Wait until a server has imported user code; how it went wrong, if it did."""
+    control.settimeout(IMPORT_SECONDS)
+    what = f"it cannot be imported: that took longer than {IMPORT_SECONDS:g} s"
+    with contextlib.suppress(TimeoutError):
+        if answer := control.recv(1 << 16):
+            control.settimeout(None)
+            if refused := json.loads(answer):
+                raise RefusedError(refused)
+            return None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            what = f"it cannot be imported: {verdict(process.wait(1.0))}"
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    return what
+
+
+def connect(service: Service, name: str, do: str, bounds: Bounds) -> SocketStream:
+    """A stream to a fresh process, in which a function `do` of the service answers messages."""
+    if server(service, name).process.poll() is not None:
+        server.cache_clear()
+    here, there = socket.socketpair()
+    with there:
+        request = json.dumps([do, bounds]).encode()
+        socket.send_fds(server(service, name).control, [request], [there.fileno()])
+    return SocketStream(here)
+
+
+class Hosted:
+    """A conversation with user code in a process of its own, which the first message begins.
+
+    Parameters
+    ----------
+    service, name, do, bounds
+        See `connect`.
+    """
+
+    def __init__(self, service: Service, name: str, do: str, bounds: Bounds = UNBOUNDED):
+        self._to = service, name, do, bounds
+        self._stream: SocketStream | None = None
+
+    def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
+        """Send a message and wait for the answer.
+
+        Raises
+        ------
+        HostError
+            It names the user code, and says why there is no answer.
+        RefusedError
+            What the other process refuses.
+        """
+        if self._stream is None:
+            self._stream = connect(*self._to)
+        # A process that does not listen any more has said why, or has ended.
+        with contextlib.suppress(OSError):
+            send(self._stream, header, **arrays)
+        what = "its process ended"
+        with contextlib.suppress(OSError, WireError):
+            answer = receive(self._stream)
+            if answer is not None and answer.header.get("type") == "done":
+                return answer
+            if answer is not None and answer.header.get("type") == "refused":
+                raise RefusedError(str(answer.header["message"]))
+            what = what if answer is None else str(answer.header.get("message"))
+        self.close()
+        raise HostError(f"{self._to[1]}: {what}")
+
+    def close(self) -> None:
+        """End the process."""
+        if self._stream is not None:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            self._stream = None
+
+    def __del__(self) -> None:
+        self.close()
+
+
+def answer_all(
+    reader: Readable, writer: BinaryIO, answer: Callable[[Message], Mapping[str, Any]]
+) -> None:
+    """Answer messages until the stream ends; an `AdaptuneError` is passed on.
+
+    Parameters
+    ----------
+    reader, writer
+        The stream.
+    answer
+        Gives what the answer to a message holds; arrays in it are sent as such.
+    """
+    while (message := receive(reader)) is not None:
+        try:
+            found = answer(message)
+        except AdaptuneError as error:
+            send(writer, {"type": "refused", "message": str(error)})
+            continue
+        arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
+        rest = {key: value for key, value in found.items() if key not in arrays}
+        send(writer, {"type": "done", **rest}, **arrays)
+
+
+# Forks processes in which user code lives, see `adaptune.processes`.
+#
+# Run with the number of a socket, the time for the import, the module of a service and the name of
+# the user code. For every socket that it receives it forks a watcher, which forks the process and
+# reports how that ended.
+
+
+_LONGER = 5
+"""Seconds by which the limit on the import is longer here: it is for servers left behind."""
+
+
+def main(control: socket.socket, seconds: float, module: str, name: str) -> None:
+    """Fork a process for every socket received, until the other side closes."""
+    signal.alarm(math.ceil(seconds) + _LONGER)
+    service, refused = import_module(module), None
+    try:
+        service.load(name)
+    except AdaptuneError as error:
+        refused = str(error)
+    signal.alarm(0)
+    control.send(json.dumps(refused).encode())
+    while refused is None:
+        request, sockets, _, _ = socket.recv_fds(control, 1 << 12, 1)
+        if not sockets:
+            break
+        if os.fork() == 0:
+            control.close()
+            do, bounds = json.loads(request)
+            with socket.socket(fileno=sockets[0]) as connection:
+                _watch(connection, service, do, name, Bounds(*bounds))
+            os._exit(0)
+        os.close(sockets[0])
+        # Collect watchers that have ended, or they stay as zombies.
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG) != (0, 0):
+                pass
+    # With all that the import has started.
+    os.killpg(0, signal.SIGKILL)
+
+
+def _watch(
+    connection: socket.socket, service: ModuleType, do: str, name: str, bounds: Bounds
+) -> None:
+    """Run a process, end all that it has started, and report how it ended if that was not well."""
+    os.setsid()
+    adopt_orphans()
+    with tempfile.TemporaryFile() as output:
+        child = os.fork()
+        if child == 0:
+            os.setsid()
+            os.dup2(output.fileno(), 1)
+            os.dup2(output.fileno(), 2)
+            _run(connection, service, do, name, bounds)
+        code = keep(child, connection.fileno()).code
+        if code:
+            what = bounds.late if code == -signal.SIGALRM else verdict(code)
+            fault = {"type": "fault", "message": quoting(what, output)}
+            with contextlib.suppress(OSError), connection.makefile("wb") as writer:
+                send(writer, fault)
+
+
+def _run(
+    connection: socket.socket, service: ModuleType, do: str, name: str, bounds: Bounds
+) -> NoReturn:
+    """Answer messages and end the process."""
+    code = 1
+    try:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if bounds.core is not None:
+            os.sched_setaffinity(0, {bounds.core})
+        if bounds.memory:
+            statm = Path("/proc/self/statm")
+            pages = int(statm.read_text().split()[0]) if statm.exists() else 0
+            bound = pages * resource.getpagesize() + int(bounds.memory * 1e9)
+            resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
+        with connection.makefile("rb") as reader, connection.makefile("wb") as writer:
+            getattr(service, do)(_Timed(reader, bounds.seconds), writer, name)
+        code = 0
+    except MemoryError:
+        os.write(2, f"\n{bounds.full}\n".encode())
+    except BaseException as error:
+        os.write(2, f"\n{in_a_line(error)}\n".encode(errors="replace"))
+    finally:
+        # Exit handlers belong to the server.
+        os._exit(code)
+
+
+class _Timed:
+    """A stream with a time limit from every read to the next, at which the process dies.
+
+    The signal has no handler, so it also works inside compiled code.
+    """
+
+    def __init__(self, stream: BinaryIO, seconds: float):
+        self._stream = stream
+        self._seconds = seconds
+
+    def read(self, size: int) -> bytes:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        data = self._stream.read(size)
+        signal.setitimer(signal.ITIMER_REAL, self._seconds)
+        return data
+
+
+if __name__ == "__main__":
+    main(socket.socket(fileno=int(sys.argv[1])), float(sys.argv[2]), sys.argv[3], sys.argv[4])
+
+
+# Which cores a process may use.
+
+
+def resident_megabytes() -> float:
+    """Memory that this process takes at present, without the files that it maps.
+
+    Where the system does not tell, the most so far.
+    """
+    try:
+        _, resident, shared, *_ = Path("/proc/self/statm").read_text(encoding="ascii").split()
+    except OSError:
+        return 1e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return 1e-6 * (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE")
+
+
+def release_memory() -> None:
+    """Give memory that is free back to the system, so that what comes next is measured alone.
+
+    Threads that prepare scans leave hundreds of megabytes to the C library, which keeps them.
+    """
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # glibc has it
+        trim(0)
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Let large arrays that are made meanwhile go back to the system as soon as they are free.
+
+    By default, the C library keeps them among small ones. Where a process holds many arrays of
+    different sizes and replaces them time after time, as prepared scans, the holes between them
+    then take several times what they hold. It costs some time for each array.
+    """
+    global _apart  # noqa: PLW0603 - the setting is that of the process
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is None:  # only glibc has it
+        yield
+        return
+    _apart += 1
+    mallopt(_M_MMAP_THRESHOLD, _LARGE)
+    try:
+        yield
+    finally:
+        _apart -= 1
+        if not _apart:
+            mallopt(_M_MMAP_THRESHOLD, _LARGEST)
+
+
+_M_MMAP_THRESHOLD, _LARGE, _LARGEST = -3, 256 * 1024, 32 * 1024**2
+"""The number of the setting in malloc.h; bytes of arrays that are kept apart, and to what glibc
+raises that by itself as such arrays become free."""
+_apart = 0
+"""In how many blocks of `apart` this process is."""
+_before: set[int] | None = None
+"""Cores that this process had before it was pinned alone."""
+_numbers = itertools.count(1)
+
+
+def available() -> int:
+    """Number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def shared_cores() -> set[int]:
+    """The cores of this process and of those that work beside it, see `pin`; empty if unknown."""
+    if _before is None and hasattr(os, "sched_getaffinity"):
+        return os.sched_getaffinity(0)
+    return set(_before or ())
+
+
+def together() -> int:
+    """How many they are."""
+    return len(shared_cores()) or available()
+
+
+def pin(core: int, alone: bool = False) -> Callable[[], None]:
+    """Keep this process on one core, if the system can, and return a function that undoes it.
+
+    Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
+    by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
+    beyond the last core restart at the first.
+
+    Parameters
+    ----------
+    core
+        Number of the core, among those of this process.
+    alone
+        Whether this process is the only one at work: then `next_core` gives others the rest.
+    """
+    global _before  # noqa: PLW0603 - the cores are those of the process
+    if not hasattr(os, "sched_setaffinity"):
+        return lambda: None
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
+    _before = cores if alone else None
+
+    def unpin() -> None:
+        global _before  # noqa: PLW0603
+        os.sched_setaffinity(0, cores)
+        _before = None
+
+    return unpin
+
+
+def next_core() -> int | None:
+    """Core for another process that works beside this one; None if the system cannot keep it there.
+
+    Each call gives the next core, after the one that `pin` gives to the number of this process.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return None
+    cores = sorted(_before or os.sched_getaffinity(0))
+    return cores[(os.getpid() + next(_numbers)) % len(cores)]
+
+
+def other_core(number: int) -> int | None:
+    """Core for the process of this number, from 0, of those that work for this one; see `pin`.
+
+    They get the cores that this process does not use, as far as there are any.
+    """
+    cores = sorted(shared_cores())
+    if not cores:
+        return None
+    others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
+    return others[number % len(others)]
+
+
+@contextmanager
+def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
+    """Processes to compute in, one a core; those of the block's tasks that wait end with it.
+
+    Parameters
+    ----------
+    most
+        No more processes than this.
+    preload
+        Modules that all of them need: they are imported once.
+
+    Raises
+    ------
+    AdaptuneError
+        If a process ends before its time.
+    """
+    # A process forked from one with threads may deadlock.
+    context = get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    n = max(1, min(most, available()))
+    pool = ProcessPoolExecutor(n, context, _ignore_interrupts)
+    try:
+        yield pool
+    except BrokenProcessPool as error:
+        raise AdaptuneError("a process was ended from outside; was the memory full?") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    # Ctrl-C reaches all processes; the first of them decides what happens.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,476 @@
+"""Recordings in ROS 1 and ROS 2 bags."""
+
+import struct
+import weakref
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import Chunk, ChunkInfo, IndexData, decompressors
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from adaptune.errors import nearest
+from adaptune.recording import clouds
+from adaptune.recording.clouds import (
+    PATH,
+    POSES,
+    TRANSFORMS,
+    PointCloudError,
+    header_stamp,
+    message_stamp,
+    of_frame,
+    usable,
+)
+from adaptune.recording.recording import Frame, Repairs
+from adaptune.recording.scan import AUTO, Imu, Scan, SequenceError, Timing
+from adaptune.trajectory import Trajectory
+
+# Which bags a path, a folder or a pattern names.
+
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+
+
+def bag_paths(given: Sequence[str]) -> list[Path]:
+    """Bags to open for the paths, folders and patterns that a user gives.
+
+    A SequenceError names what does not exist or holds no bag.
+    """
+    paths: list[Path] = []
+    for text in given:
+        path = Path(text)
+        if path.is_dir():
+            paths += _in_folder(path)
+        elif path.exists():
+            if path.suffix not in SUFFIXES:
+                bags = "bags are .bag, .mcap and .db3 files and ROS 2 folders"
+                raise SequenceError(f"{path}: not a bag; {bags}")
+            paths.append(path)
+        elif found := sorted(path.parent.glob(path.name)):
+            paths += bag_paths([str(match) for match in found])
+        else:
+            raise SequenceError(f"{path}: there is no such bag")
+    if len({path.suffix == ".bag" for path in paths}) > 1:
+        raise SequenceError(f"{paths[0]} and {paths[-1]} are of ROS 1 and ROS 2: they do not mix")
+    return paths
+
+
+def files_of(paths: Sequence[Path]) -> list[Path]:
+    """The files of bags, of which some may be folders."""
+    found = [sorted(path.iterdir()) if path.is_dir() else [path] for path in paths]
+    return [file for files in found for file in files if file.is_file()]
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    if (folder / "metadata.yaml").exists():
+        return [folder]
+    # A recorder that was killed leaves its files without the metadata.
+    for suffix in (".mcap", ".db3", ".bag"):
+        if found := sorted(folder.glob(f"*{suffix}")):
+            return found
+    raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
+
+
+# ROS 1 bags that are opened by the index at their end alone.
+
+
+_WORD = struct.Struct("<I").unpack_from
+_NOTHING = Chunk(0, 0, bytes)
+_KINDS = {b"op": "B", b"ver": "I", b"chunk_pos": "Q", b"count": "I"}
+_TIMES = (b"start_time", b"end_time")
+
+Layout = tuple[struct.Struct, list[int]]
+"""How to unpack the header of a record, and which of the values is which."""
+
+
+class IndexReader(Reader):
+    """Looks a chunk up only when messages of its time are asked for.
+
+    rosbags visits every chunk when it opens a bag, which takes seconds for 100,000 of them. What
+    they hold is also listed at the end of the file.
+    """
+
+    def open(self) -> None:
+        """Read the list of chunks."""
+        self._layout: Layout | None = None
+        super().open()
+        counts: Counter[int] = Counter()
+        for info in self.chunk_infos:
+            for connection, count in info.connection_counts.items():
+                counts[connection] += count
+        self.connections = [c._replace(msgcount=counts[c.id]) for c in self.connections]
+
+    def read_chunk(self) -> Chunk:
+        """Nothing, while the bag is opened."""
+        return _NOTHING
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        """Nothing, while the bag is opened."""
+
+    def read_chunk_info(self) -> ChunkInfo:
+        """Read a record in a sixth of the time, if it is laid out as the one before."""
+        assert self.bio is not None
+        word = self.bio.read(4)
+        header = self.bio.read(*_WORD(word)) if len(word) == 4 else b""
+        if self._layout is None or len(header) != self._layout[0].size:
+            self._layout = _layout(header)
+            self.bio.seek(-len(header) - len(word), 1)
+            return super().read_chunk_info()
+        values = self._layout[0].unpack(header)
+        op, ver, pos, count, start, start_ns, end, end_ns = [values[i] for i in self._layout[1]]
+        counts = self.bio.read(4 + 8 * count)
+        if (op, ver, len(counts)) != (6, 1, 4 + 8 * count) or not count:
+            self.bio.seek(-len(counts) - len(header) - len(word), 1)
+            return super().read_chunk_info()
+        numbers = struct.unpack_from(f"<{2 * count}I", counts, 4)
+        by_connection = dict(zip(numbers[::2], numbers[1::2], strict=True))
+        return ChunkInfo(pos, start * 10**9 + start_ns, end * 10**9 + end_ns + 1, by_connection)
+
+    def is_slow(self) -> bool:
+        """Whether its first chunk is packed by BZ2, which unpacks a few megabytes a second."""
+        if not self.chunk_infos:
+            return False
+        assert self.bio is not None
+        self.bio.seek(self.chunk_infos[0].pos)
+        return super().read_chunk().decompressor is decompressors["bz2"]
+
+    def messages(
+        self,
+        connections: Collection[Connection] = (),
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Messages of some time, as rosbags gives them."""
+        assert self.bio is not None
+        indexes: dict[int, list[IndexData]] = defaultdict(list)
+        for info in self.chunk_infos:
+            if (start is None or info.end_time > start) and (
+                stop is None or info.start_time < stop
+            ):
+                self.bio.seek(info.pos)
+                self.chunks[info.pos] = super().read_chunk()
+                for _ in info.connection_counts:
+                    super().read_index_data(info.pos, indexes)
+        self.indexes = {c.id: sorted(indexes[c.id]) for c in self.connections}
+        yield from super().messages(connections, start, stop)
+
+
+def _layout(header: bytes) -> Layout | None:
+    """Layout of the records of chunks; none if this header is not one."""
+    text, at, names = "<", 0, list[bytes]()
+    while at + 4 <= len(header):
+        (size,) = _WORD(header, at)
+        name, _, value = header[at + 4 : at + 4 + size].partition(b"=")
+        kind = "II" if name in _TIMES else _KINDS.get(name, f"{len(value)}x")
+        if struct.calcsize("<" + kind) != len(value):
+            return None
+        text += f"{4 + len(name) + 1}x{kind}"
+        names += [name, name + b"_ns"] if name in _TIMES else [name] if name in _KINDS else []
+        at += 4 + size
+    wanted = [*_KINDS, *(each for name in _TIMES for each in (name, name + b"_ns"))]
+    made = struct.Struct(text)
+    if made.size != len(header) or sorted(names) != sorted(wanted):
+        return None
+    return made, [names.index(name) for name in wanted]
+
+
+POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES, *clouds.VELODYNE_TYPES)
+IMU_TYPES = ("sensor_msgs/msg/Imu",)
+
+
+@cache
+def _typestore() -> Any:
+    """Message definitions for ROS 2 bags that contain none."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in clouds.DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+class BagSource:
+    """Scans, IMU and poses of one or more bags that follow each other.
+
+    All methods raise a SequenceError where the bags cannot be opened or read, lack a topic, or hold
+    no usable message on it. It names the bags and the message, or the topics that there are.
+
+    Parameters
+    ----------
+    paths
+        ROS 1 ``.bag`` files, or ROS 2 folders and files, as `bag_paths` gives them.
+    points
+        Topic of the point clouds; may be left out where there is only one.
+    timing
+        Meaning of the stamps.
+    about
+        Result of `about` when they were opened before; the bags are then not opened now.
+    """
+
+    random_access: ClassVar[bool] = False
+    pose_files: Sequence[Path] = ()
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        points: str | None = None,
+        timing: Timing = AUTO,
+        about: dict[str, Any] | None = None,
+    ):
+        self.paths, self.timing = tuple(paths), timing
+        self._ready: AnyReader | None = None
+        if about is not None:
+            self.topics: dict[str, str] = dict(about["topics"])
+            self.points: str = about["points"]
+            self.n_messages: int = about["n_messages"]
+            self._duration: int = about["duration"]
+            self._begins: dict[str, int] = dict(about["begins"])
+            return
+        reader = self._opened()
+        weakref.finalize(self, _close, reader)
+        self.topics = {c.topic: c.msgtype for c in reader.connections}
+        self.points = self.topic(points, POINTS_TYPES, "point clouds")
+        self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
+        self._duration = max(reader.end_time - reader.start_time, 0)
+        known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
+        begins = {topic: self._begin(reader, topic) for topic in known}
+        self._begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
+        # Opening reads the whole index: once for this and the first pass.
+        self._ready = reader
+
+    def about(self) -> dict[str, Any]:
+        """Everything that opening the bags has shown, as plain data."""
+        return {
+            "name": self.name,
+            "topics": self.topics,
+            "points": self.points,
+            "n_messages": self.n_messages,
+            "duration": self._duration,
+            "begins": self._begins,
+        }
+
+    @property
+    def name(self) -> str:
+        """The bag's file; the first one's, and how many more there are."""
+        more = f" (and {len(self.paths) - 1} more)" if len(self.paths) > 1 else ""
+        return f"{self.paths[0]}{more}"
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of all bags."""
+        return files_of(self.paths)
+
+    def frames(self) -> Iterator[Frame]:
+        """All scans in the order of their recording."""
+        with self.open() as reader:
+            load = self.loader(reader)
+            messages = enumerate(self.read(reader, self.points), start=1)
+            for number, (_, recorded, data) in messages:
+                what = f"{self.name}: message {number} on {self.points}"
+                stamp = header_stamp(data, reader.is2)
+                if stamp is None:
+                    raise SequenceError(f"{what} is cut short")
+                yield Frame(stamp, recorded, partial(load, data, what))
+
+    def _begin(self, reader: AnyReader, topic: str) -> int | None:
+        """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
+        try:
+            connection, _, data = next(self.read(reader, topic))
+            if topic == self.points:
+                return header_stamp(data, reader.is2)
+            message = reader.deserialize(data, connection.msgtype)
+            return POSES[connection.msgtype](message)[0][0]
+        except Exception:
+            return None
+
+    def span(self) -> tuple[int, int] | None:
+        """First stamp, and the last one if the recorder's clock went as the sensor's."""
+        first = self._begins.get(self.points)
+        return None if first is None else (first, first + self._duration)
+
+    def first_pose(self, name: str) -> int | None:
+        """Stamp of the first pose on a topic."""
+        return self._begins.get(self.topic(name, POSES, "poses"))
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
+
+        Poses that are not finite or whose quaternion has no length are left out and counted.
+        """
+        if name is None:
+            return None
+        name = self.topic(name, POSES, "poses")
+        messages = self.messages(name, last=self.topics[name] == PATH)
+        found = [pose for message in messages for pose in POSES[message.__msgtype__](message)]
+        if self.topics[name] in TRANSFORMS:
+            found = of_frame(f"{self.name}: {name}", found, child_frame)
+        if not found:
+            raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
+        trajectory, unusable = usable(found)
+        unfit = f"poses on {name} that are not finite or have no rotation"
+        if trajectory is None:
+            raise SequenceError(f"{self.name}: holds only {unfit}")
+        repairs = Repairs()
+        repairs.add(unfit, unusable)
+        repairs.report(self.name)
+        return trajectory
+
+    def imu(self, name: str | None) -> Imu | None:
+        """Measurements on a topic, as they were recorded."""
+        name = self.topic(name, IMU_TYPES, "an IMU's measurements")
+        stamps, values = [], []
+        for message in self.messages(name):
+            w, a = message.angular_velocity, message.linear_acceleration
+            stamps.append(message_stamp(message))
+            values.append((w.x, w.y, w.z, a.x, a.y, a.z))
+        if not stamps:
+            raise SequenceError(f"{self.name}: no measurement on {name}; name another topic")
+        unique, index = np.unique(np.array(stamps, np.int64), return_index=True)
+        measured = np.array(values)[index]
+        if not np.isfinite(measured).all():
+            raise SequenceError(f"{self.name}: a measurement on {name} is not finite")
+        return Imu(unique, measured[:, :3], measured[:, 3:])
+
+    def topic(self, name: str | None, types: Iterable[str], what: str) -> str:
+        """The topic of this name, or the only one of these types."""
+        types = tuple(types)
+        fitting = sorted(t for t, kind in self.topics.items() if kind in types)
+        if name is None:
+            # Packets are often recorded together with the points that were made of them.
+            fitting = [t for t in fitting if self.topics[t] not in clouds.VELODYNE_TYPES] or fitting
+            if len(fitting) != 1:
+                help_ = f", name one of them: {', '.join(fitting)}" if fitting else self._list()
+                raise SequenceError(f"{self.name}: {len(fitting)} topics with {what}{help_}")
+            return fitting[0]
+        if name in fitting:
+            return name
+        if name in self.topics:
+            raise SequenceError(f"{self.name}: {name} is {self.topics[name]}, not {what}")
+        help_ = nearest(name, self.topics) + self._list()
+        raise SequenceError(f"{self.name}: no topic {name}; {help_}")
+
+    def check(self, reference: str | None, imu: str | None) -> None:
+        """Make sure that the named topics are there, and that the points can be decoded."""
+        if (
+            self.topics[self.points] in clouds.VELODYNE_TYPES
+            and find_spec("velodyne_decoder") is None
+        ):
+            help_ = "install adaptune[velodyne] to decode them"
+            raise SequenceError(f"{self.name}: {self.points} holds a Velodyne's packets; {help_}")
+        if reference is not None:
+            self.topic(reference, POSES, "poses")
+        if imu is not None:
+            self.topic(imu, IMU_TYPES, "an IMU's measurements")
+
+    def _list(self) -> str:
+        topics = sorted(f"{topic} ({kind})" for topic, kind in self.topics.items())
+        return f"; it holds {', '.join(topics) or 'nothing'}"
+
+    def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
+        """Deserialised messages of a topic, or its last one only."""
+        with self.open() as reader:
+            messages: Iterable[Any] = enumerate(self.read(reader, topic), start=1)
+            if last:
+                messages = deque(messages, maxlen=1)
+            for number, (connection, _, data) in messages:
+                try:
+                    yield reader.deserialize(data, connection.msgtype)
+                except Exception as error:
+                    what = f"message {number} on {topic} is damaged ({error})"
+                    raise SequenceError(f"{self.name}: {what}") from error
+
+    @contextmanager
+    def open(self, by_index: bool = False) -> Iterator[AnyReader]:
+        """Open the bags for reading; `by_index`, without a look at their chunks."""
+        reader, self._ready = self._ready or self._opened(by_index), None
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+    def _opened(self, by_index: bool = False) -> AnyReader:
+        try:
+            reader = AnyReader(self.paths, default_typestore=_typestore())
+            if by_index and not reader.is2:
+                reader.readers = [IndexReader(path) for path in self.paths]
+            reader.open()
+        except Exception as error:
+            # The readers raise what their formats and decompressors raise.
+            raise SequenceError(
+                f"{self.name}: cannot be opened as a bag ({_say(error)}); if the recording was cut "
+                f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
+            ) from error
+        return reader
+
+    def read(
+        self,
+        reader: AnyReader,
+        topic: str | None = None,
+        span: tuple[int | None, int | None] = (None, None),
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Serialised messages of a topic, or of all topics; `span`, those recorded then."""
+        chosen = [c for c in reader.connections if topic in (None, c.topic)]
+        messages = reader.messages(chosen, *span)
+        while True:
+            try:
+                message = next(messages)
+            except StopIteration:
+                return
+            except Exception as error:
+                help_ = "the bag is damaged, `stop` before the damage or repair it"
+                raise SequenceError(
+                    f"{self.name}: the rest cannot be read ({_say(error)}); {help_}"
+                ) from error
+            yield message
+
+    def loader(self, reader: AnyReader) -> Callable[[bytes, str], Scan]:
+        """What decodes a message of the point clouds; its name goes into the SequenceError."""
+        return partial(_load, self._decoder(reader))
+
+    def _decoder(self, reader: AnyReader) -> Callable[[bytes], Scan]:
+        kind, definitions = self.topics[self.points], reader.typestore.fielddefs
+        if kind in clouds.VELODYNE_TYPES:
+            return clouds.decoder(reader.is2)
+        if kind not in clouds.LIVOX_TYPES:
+            self._check_standard(definitions, reader.is2)
+            return partial(clouds.decode_cloud, cdr=reader.is2, timing=self.timing)
+        fields = tuple(definitions[kind][1])
+        point = tuple(definitions[kind.replace("CustomMsg", "CustomPoint")][1])
+        return partial(
+            clouds.decode_livox, message=fields, point=point, cdr=reader.is2, timing=self.timing
+        )
+
+    def _check_standard(self, definitions: Any, cdr: bool) -> None:
+        """Make sure that point clouds are laid out as they are decoded."""
+        standard = _typestore().fielddefs
+        for name in ("std_msgs/msg/Header", "sensor_msgs/msg/PointField", POINTS_TYPES[0]):
+            _, found = definitions.get(name, ((), ()))
+            fields = [field for field in found if cdr or field[0] != "seq"]
+            if fields != standard[name][1]:
+                names = ", ".join(field for field, _ in fields)
+                raise SequenceError(f"{self.name}: its {name} is not as ROS defines it ({names})")
+
+
+def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:
+    try:
+        return decode(data)
+    except PointCloudError as error:
+        raise SequenceError(f"{what}: {error}") from error
+    except Exception as error:
+        raise SequenceError(f"{what}: damaged ({_say(error)})") from error
+
+
+def _close(reader: AnyReader) -> None:
+    if reader.stack is not None:
+        reader.close()
+
+
+def _say(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text[:200] or type(error).__name__

@@ -1,0 +1,572 @@
+"""sensor_msgs/PointCloud2 to scans."""
+
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+
+from adaptune import geometry
+from adaptune.errors import AdaptuneError, nearest
+from adaptune.recording.scan import AUTO, TIME_FIELDS, Scan, SequenceError, Timing, TimingError
+from adaptune.trajectory import Trajectory
+
+# Numbers and texts of serialised ROS messages, where a whole message would take too long.
+
+
+_WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}
+
+
+class Serialized:
+    """Reads a message, as it lies in the bag, from its beginning.
+
+    `cdr` says whether it is serialised as in ROS 2: in either byte order, and with aligned numbers.
+    All methods raise ValueError, IndexError or struct.error where the message is not long enough.
+    """
+
+    def __init__(self, data: bytes | memoryview, cdr: bool):
+        if cdr and bytes(data[:2]) not in (b"\0\0", b"\0\1"):
+            raise ValueError("not in CDR")
+        self.order = "<" if not cdr or data[1] else ">"  # of bytes, as numpy and struct write it
+        self.data = memoryview(data)[4 if cdr else 0 :]
+        self.at = 0  # where to read on
+        self._cdr = cdr
+        self._unpack = _WORD[self.order]
+
+    def align(self, size: int) -> None:
+        """Pass over the padding before a number of this size."""
+        if self._cdr:
+            self.at = -(-self.at // size) * size
+
+    def uint32(self) -> int:
+        """Read a number of four bytes."""
+        self.align(4)
+        (number,) = self._unpack(self.data, self.at)
+        self.at += 4
+        return int(number)
+
+    def uint8(self) -> int:
+        """Read a number of one byte."""
+        number = self.data[self.at]
+        self.at += 1
+        return number
+
+    def block(self, size: int) -> memoryview:
+        """Read so many bytes."""
+        begin, self.at = self.at, self.at + size
+        if self.at > len(self.data):
+            raise ValueError(f"{size} bytes are declared, there are {len(self.data) - begin}")
+        return self.data[begin : self.at]
+
+    def text(self) -> str:
+        """Read a text; in ROS 2 it ends with a zero."""
+        return bytes(self.block(self.uint32())).rstrip(b"\0").decode()
+
+    def header(self) -> int:
+        """Read a std_msgs/Header, and give its stamp in nanoseconds."""
+        if not self._cdr:
+            self.uint32()  # its sequence number
+        stamp = self.uint32() * 10**9 + self.uint32()
+        self.text()
+        return stamp
+
+    def end(self) -> None:
+        """Make sure that nothing is left but padding."""
+        left = len(self.data) - self.at
+        if left > (3 if self._cdr else 0):
+            raise ValueError(f"{left} bytes are left over")
+
+
+def header_stamp(data: bytes | memoryview, cdr: bool) -> int | None:
+    """Stamp of a message that begins with a header; none if it is damaged there."""
+    try:
+        return Serialized(data, cdr).header()
+    except (ValueError, IndexError, struct.error):
+        return None
+
+
+# The numbers of sensor_msgs/PointField's datatypes.
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LARGEST_POINT = 1 << 20
+RING_FIELDS = ("ring", "line", "channel", "laser_id")
+INTENSITY_FIELDS = ("intensity", "reflectivity")
+
+
+class PointCloudError(AdaptuneError):
+    """A message that does not describe a point cloud."""
+
+
+Field = tuple[str, int, int, int]
+"""Name, offset, datatype and count, in the order of sensor_msgs/PointField."""
+
+
+class PointCloud2(NamedTuple):
+    """Layout of the points of a message, and their bytes."""
+
+    stamp: int
+    height: int
+    width: int
+    fields: tuple[Field, ...]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: memoryview
+
+
+def parse(data: bytes | memoryview, cdr: bool) -> PointCloud2:
+    """Read a message, serialised as in ROS 2 if `cdr`, without a copy of its points.
+
+    A PointCloudError reports a message that is cut short, or longer than it declares.
+    """
+    try:
+        body = Serialized(data, cdr)
+        cloud = PointCloud2(
+            stamp=body.header(),
+            height=body.uint32(),
+            width=body.uint32(),
+            fields=tuple(
+                (body.text(), body.uint32(), body.uint8(), body.uint32())
+                for _ in range(body.uint32())
+            ),
+            is_bigendian=bool(body.uint8()),
+            point_step=body.uint32(),
+            row_step=body.uint32(),
+            data=body.block(body.uint32()),
+        )
+        body.uint8()  # is_dense, which drivers set as they like
+        body.end()
+    except (struct.error, ValueError, IndexError) as error:
+        raise PointCloudError(f"not a whole PointCloud2 ({error})") from error
+    return cloud
+
+
+@lru_cache(maxsize=64)
+def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) -> np.dtype[Any]:
+    """Structured type of one point; a PointCloudError where its fields cannot be."""
+    if point_step > _LARGEST_POINT:
+        raise PointCloudError(f"a point of {point_step} bytes is none")
+    names, formats, offsets = [], [], []
+    for name, offset, datatype, count in fields:
+        if datatype not in DATATYPES:
+            raise PointCloudError(f"field {name!r} has unknown datatype {datatype}")
+        if name in names:
+            raise PointCloudError(f"field {name!r} appears twice")
+        single = np.dtype((">" if is_bigendian else "<") + DATATYPES[datatype])
+        # Some drivers leave the count at zero.
+        if offset + single.itemsize * max(count, 1) > point_step:
+            raise PointCloudError(f"field {name!r} ends beyond the point's {point_step} bytes")
+        if name:
+            names.append(name)
+            formats.append(single if count <= 1 else (single, (count,)))
+            offsets.append(offset)
+    if missing := [axis for axis in "xyz" if axis not in names]:
+        there = ", ".join(names) or "none at all"
+        raise PointCloudError(f"no field {', '.join(missing)}; there is {there}")
+    return np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step}
+    )
+
+
+def read_points(cloud: PointCloud2) -> NDArray[Any]:
+    """All points of a message as a structured array of shape (height * width,), without a copy.
+
+    A PointCloudError reports a message without x, y or z, or with too few bytes.
+    """
+    height, width, size = cloud.height, cloud.width, len(cloud.data)
+    dtype = point_dtype(cloud.fields, cloud.is_bigendian, cloud.point_step)
+    if not height * width:
+        return np.empty(0, dtype)
+    row_step = max(cloud.row_step, width * dtype.itemsize)
+    needed = (height - 1) * row_step + width * dtype.itemsize
+    if size < needed:
+        what = f"{height} x {width} points of {dtype.itemsize} bytes"
+        raise PointCloudError(f"{what} need {needed} bytes, there are {size}")
+    rows = np.ndarray((height, width), dtype, cloud.data, strides=(row_step, dtype.itemsize))
+    return rows.reshape(-1)
+
+
+def decode_cloud(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
+    """Decode a serialised sensor_msgs/PointCloud2.
+
+    Points that are not finite are dropped, and so are those at the very origin, by which drivers
+    mark rays that did not come back. See `parse` and `from_fields`.
+    """
+    cloud = parse(data, cdr)
+    return from_fields(read_points(cloud), cloud.stamp, timing)
+
+
+def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timing: Timing) -> Scan:
+    """Make a scan of points given field by field.
+
+    Parameters
+    ----------
+    raw
+        A structured array of shape (n,), or arrays of shape (n,) by name, with x, y and z.
+    stamp
+        The header's, in nanoseconds.
+    timing
+        Meaning of the stamps.
+
+    Raises
+    ------
+    PointCloudError
+        If x, y or z are not single numbers, or the times cannot be.
+    """
+    names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
+    time = next((name for name in TIME_FIELDS if name in names), None)
+    ring = next((name for name in RING_FIELDS if name in names), None)
+    # An odd intensity field is ignored: nothing needs it.
+    numbers = (n for n in INTENSITY_FIELDS if n in names and raw[n].ndim == 1)
+    intensity = next((name for name in numbers if raw[name].dtype.kind in "iuf"), None)
+    columns = {name: raw[name] for name in (*"xyz", time, ring, intensity) if name}
+    for name, column in columns.items():
+        if column.ndim != 1 or column.dtype.kind not in "iuf":
+            raise PointCloudError(f"field {name!r} is not one number for each point")
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y, z = (np.asarray(columns[axis], np.float32) for axis in "xyz")
+        given = (
+            _NO_TIMES if time is None else _native(columns[time]),
+            _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16),
+            _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32),
+        )
+    n = len(x)
+    made = (np.empty((n, 3), np.float32), *(np.empty(len(v), v.dtype) for v in given))
+    gather, compact = _kernels(given[0].dtype.str)
+    valid, low, high = gather(x, y, z, given, made)
+    if valid < n:
+        _, low, high = compact(*made)
+        # A copy, so that the other points are not kept in memory with them.
+        made = tuple(values[:valid].copy() for values in made)
+    points, times, rings, intensities = made
+    try:
+        start, seconds = timing.resolve(stamp, None if time is None else times, (low, high))
+    except TimingError as error:
+        raise PointCloudError(str(error)) from error
+    given_rings, lights = rings if ring else None, intensities if intensity else None
+    return Scan(start, points, seconds, given_rings, intensities=lights)
+
+
+_NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
+_NO_INTENSITIES = np.empty(0, np.float32)
+
+
+def _native(values: NDArray[Any]) -> NDArray[Any]:
+    """Values in the machine's byte order."""
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+# Single precision keeps the loops fast.
+_ZERO, _INFINITE = np.float32(0.0), np.float32(np.inf)
+
+
+def _gather(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
+    given: tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
+    made: tuple[NDArray[np.float32], NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
+) -> tuple[int, Any, Any]:
+    """Put each field side by side; count the valid points, and find the extent of times."""
+    given_times, given_rings, given_intensities = given
+    points, times, rings, intensities = made
+    timed, ringed, lit = len(given_times) > 0, len(given_rings) > 0, len(given_intensities) > 0
+    low = high = given_times[0] if timed else times.dtype.type(0)
+    valid = 0
+    for i in range(len(x)):
+        a, b, c = x[i], y[i], z[i]
+        points[i, 0] = a
+        points[i, 1] = b
+        points[i, 2] = c
+        # Not a number or infinite if any coordinate is, zero if all of them are.
+        square = a * a + b * b + c * c
+        good = (square > _ZERO) & (square < _INFINITE)
+        if timed:
+            t = given_times[i]
+            times[i] = t
+            low, high = min(low, t), max(high, t)
+            good &= t - t == 0
+        if ringed:
+            rings[i] = given_rings[i]
+        if lit:
+            light = given_intensities[i]
+            intensities[i] = light if light - light == _ZERO else _ZERO
+        valid += good
+    return valid, low, high
+
+
+def _compact(
+    points: NDArray[np.float32],
+    times: NDArray[Any],
+    rings: NDArray[np.uint16],
+    intensities: NDArray[np.float32],
+) -> tuple[int, Any, Any]:
+    """Move the valid points to the front; count them, and find the extent of their times."""
+    timed, ringed, lit = len(times) > 0, len(rings) > 0, len(intensities) > 0
+    low = high = times.dtype.type(0)
+    count = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        square = x * x + y * y + z * z
+        good = (square > _ZERO) & (square < _INFINITE)
+        if timed:
+            t = times[i]
+            good &= t - t == 0
+        if not good:
+            continue
+        points[count, 0] = x
+        points[count, 1] = y
+        points[count, 2] = z
+        if timed:
+            times[count] = t
+            low, high = (min(low, t), max(high, t)) if count else (t, t)
+        if ringed:
+            rings[count] = rings[i]
+        if lit:
+            intensities[count] = intensities[i]
+        count += 1
+    return count, low, high
+
+
+@cache
+def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Gather and compact clouds whose times are of this type."""
+    # Importing numba takes time, and a bag may never be read.
+    import numba
+
+    # Fields lie at any offset. Unaligned types accept aligned arrays, too.
+    def column(scalar: Any) -> Any:
+        return types.Array(scalar, 1, "A", readonly=True, aligned=False)
+
+    types: Any = numba.types
+    real, whole, time = numba.float32, numba.uint16, numba.from_dtype(np.dtype(kind))
+    kinds = ((real, 2), (time, 1), (whole, 1), (real, 1))
+    scan = tuple(types.Array(scalar, axes, "C") for scalar, axes in kinds)
+    result = types.Tuple((numba.int64, time, time))
+    compiled = partial(numba.njit, nogil=True, cache=True)
+    given = types.Tuple((column(time), column(whole), column(real)))
+    gather = result(*3 * (column(real),), given, types.Tuple(scan))
+    return compiled(gather)(_gather), compiled(result(*scan))(_compact)
+
+
+# livox_ros_driver/CustomMsg to scans.
+
+
+LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+
+_POINT = """uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z
+uint8 reflectivity\nuint8 tag\nuint8 line\n"""
+_MESSAGE = """std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id
+uint8[3] rsvd\nCustomPoint[] points\n"""
+# For ROS 2 bags without definitions; all others bring their own.
+DEFINITIONS = {
+    f"{package}/msg/{name}": text
+    for package in ("livox_ros_driver", "livox_ros_driver2")
+    for name, text in (("CustomPoint", _POINT), ("CustomMsg", _MESSAGE))
+}
+
+_Fields = Sequence[tuple[str, Any]]
+
+
+def decode_livox(
+    data: bytes | memoryview, message: _Fields, point: _Fields, cdr: bool, timing: Timing
+) -> Scan:
+    """Decode a serialised message without an object for each of its points.
+
+    Parameters
+    ----------
+    data, cdr
+        The message as it lies in the bag, and whether it is serialised as in ROS 2.
+    message, point
+        Fields of the message and of one point, as rosbags gives them.
+    timing
+        Meaning of its stamps. The points' offsets count from the time base. The stamp marks the
+        same moment, unless it is set to mark the scan's end.
+
+    Raises
+    ------
+    PointCloudError
+        If the message does not match its definition.
+    """
+    try:
+        stamp, raw = _parse(Serialized(data, cdr), tuple(message), tuple(point), cdr)
+    except (struct.error, KeyError, ValueError, IndexError) as error:
+        raise PointCloudError(f"a Livox message unlike its definition ({error})") from error
+    return from_fields(raw, stamp, timing)
+
+
+def _parse(
+    body: Serialized, message: _Fields, point: _Fields, cdr: bool
+) -> tuple[int, NDArray[Any]]:
+    if message[0][0] != "header":
+        raise ValueError("it does not begin with a header")
+    stamp = body.header()
+    for name, description in message[1:]:
+        if name == "points":
+            break
+        size, number = _extent(description)
+        body.align(size)
+        body.block(size * number)
+    else:
+        raise KeyError("points")
+    count = body.uint32()
+    dtype, used = _point_dtype(point, cdr, body.order)
+    if not count:
+        return stamp, np.empty(0, dtype)
+    data = body.block((count - 1) * dtype.itemsize + used)
+    raw = np.ndarray((count - 1,), dtype, data)
+    last = np.zeros(1, dtype)
+    last.view(np.uint8)[:used] = np.frombuffer(data[-used:], np.uint8)
+    return stamp, np.concatenate([raw, last])
+
+
+@lru_cache(maxsize=8)
+def _point_dtype(point: _Fields, cdr: bool, order: str) -> tuple[np.dtype[Any], int]:
+    """Type of a point, padded to the next one, and where its last byte ends."""
+    names, formats, offsets, at, widest = [], [], [], 0, 1
+    for name, description in point:
+        size, number = _extent(description)
+        kind = description[1][0][:1]
+        if number != 1 or kind not in ("u", "i", "f"):
+            raise ValueError(f"a point's {name} is not a number")
+        at = _aligned(at, size if cdr else 1)
+        widest = max(widest, size)
+        names.append(name)
+        formats.append(f"{order}{kind}{size}")
+        offsets.append(at)
+        at += size
+    if missing := {"x", "y", "z", "offset_time"} - set(names):
+        raise KeyError(", ".join(sorted(missing)))
+    itemsize = _aligned(at, widest if cdr else 1)
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
+    # Behind the last point there is no padding.
+    return dtype, at
+
+
+def _extent(description: Any) -> tuple[int, int]:
+    """Bytes of an element and number of elements of a field of fixed size."""
+    if description[0] == Nodetype.ARRAY:
+        inner, number = description[1]
+        return _extent(inner)[0], number
+    if description[0] != Nodetype.BASE or description[1][0] == "string":
+        raise ValueError("a field before the points has no fixed size")
+    name = description[1][0]
+    return {"bool": 1, "byte": 1, "char": 1, "octet": 1}.get(name) or np.dtype(name).itemsize, 1
+
+
+def _aligned(at: int, to: int) -> int:
+    return -(-at // to) * to
+
+
+# velodyne_msgs/VelodyneScan, the raw packets of a turn, to scans.
+
+
+VELODYNE_TYPES = ("velodyne_msgs/msg/VelodyneScan",)
+_PACKET = 1206
+
+
+def decoder(cdr: bool) -> Callable[[bytes], Scan]:
+    """Make a decoder for the messages of one LiDAR, serialised as in ROS 2 if `cdr`.
+
+    The packets contain the LiDAR's model. A scan starts when its first packet was received,
+    whatever the header's stamp marks. The decoder raises a PointCloudError for a message that is
+    not whole, or of an unknown model. It needs the package velodyne_decoder.
+    """
+    import velodyne_decoder
+
+    config = velodyne_decoder.Config()
+    config.timestamp_first_packet = True
+    turn = velodyne_decoder.ScanDecoder(config)
+
+    def decode(data: bytes) -> Scan:
+        try:
+            body = Serialized(data, cdr)
+            body.header()
+            packets = []
+            for _ in range(body.uint32()):
+                stamp = body.uint32() * 10**9 + body.uint32()
+                packets.append((stamp, bytes(body.block(_PACKET))))
+            body.end()
+        except (struct.error, ValueError, IndexError) as error:
+            raise PointCloudError(f"not a whole VelodyneScan ({error})") from error
+        if not packets:  # velodyne_decoder would crash
+            raise PointCloudError("holds no packet")
+        raw = [velodyne_decoder.VelodynePacket(at * 1e-9, packet) for at, packet in packets]
+        try:
+            _, points = turn.decode(velodyne_decoder.PacketVector(raw), True)
+        except RuntimeError as error:
+            raise PointCloudError(str(error)) from error
+        return from_fields(points, packets[0][0], Timing("start"))
+
+    return decode
+
+
+# Poses in ROS messages.
+
+
+Pose = tuple[int, str, Any, Any]
+"""Stamp, frame, translation, quaternion."""
+
+
+def message_stamp(message: Any) -> int:
+    """Nanoseconds of a message's header."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def _header_pose(message: Any, pose: Any) -> list[Pose]:
+    return [(message_stamp(message), message.header.frame_id, pose.position, pose.orientation)]
+
+
+def _transforms(transforms: Iterable[Any]) -> list[Pose]:
+    return [
+        (message_stamp(t), t.child_frame_id, t.transform.translation, t.transform.rotation)
+        for t in transforms
+    ]
+
+
+POSES: dict[str, Callable[[Any], list[Pose]]] = {
+    "geometry_msgs/msg/PoseStamped": lambda m: _header_pose(m, m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _header_pose(m, m.pose.pose),
+    "nav_msgs/msg/Odometry": lambda m: _header_pose(m, m.pose.pose),
+    "nav_msgs/msg/Path": lambda m: [pose for p in m.poses for pose in _header_pose(p, p.pose)],
+    "geometry_msgs/msg/TransformStamped": lambda m: _transforms([m]),
+    "tf2_msgs/msg/TFMessage": lambda m: _transforms(m.transforms),
+    "tf/msg/tfMessage": lambda m: _transforms(m.transforms),
+}
+"""Poses in a message, by its type."""
+# Each message of this type repeats all poses of the one before.
+PATH = "nav_msgs/msg/Path"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]:
+    """Poses of one child frame; of the only one if `frame` is None, else a SequenceError."""
+    frames = sorted({name for _, name, *_ in poses})
+    if frame is None and len(frames) > 1:
+        help_ = f"name one of them as `child_frame`: {', '.join(frames)}"
+        raise SequenceError(f"{topic} has the transforms of several frames, {help_}")
+    if frame is not None and frame not in frames:
+        raise SequenceError(f"{topic}: no frame {frame}; {nearest(frame, frames)}")
+    return [pose for pose in poses if frame in (None, pose[1])]
+
+
+def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
+    """Trajectory of the usable poses, each stamp once, and the number of the others.
+
+    Poses are usable if they are finite and have a rotation. The trajectory is None if none is.
+    """
+    stamps = np.array([stamp for stamp, *_ in poses], np.int64)
+    values: NDArray[np.float64] = np.array(
+        [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for _, _, p, q in poses]
+    )
+    with np.errstate(invalid="ignore", over="ignore"):
+        norms = np.linalg.norm(values[:, 3:], axis=1)
+    good = np.isfinite(values).all(axis=1) & np.isfinite(norms) & (norms > 0.1)
+    if not good.any():
+        return None, len(poses)
+    unique, index = np.unique(stamps[good], return_index=True)
+    values = values[good][index]
+    T = geometry.from_quaternions(values[:, :3], values[:, 3:])
+    return Trajectory(unique, T), int(np.count_nonzero(~good))

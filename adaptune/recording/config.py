@@ -1,0 +1,270 @@
+"""Configuration of a sequence in a study."""
+
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationInfo,
+    model_validator,
+)
+
+from adaptune import geometry
+from adaptune.errors import AdaptuneError, StrictModel
+from adaptune.files import expand_user
+from adaptune.geometry import Poses
+from adaptune.recording.bag import bag_paths
+from adaptune.recording.scan import USUAL, Part, Unit
+
+MOST_VIEWS = 16
+"""Views of one sequence, and views to train on; each costs time with every scan."""
+REFERENCE_FILES = (".tum", ".txt", ".csv")
+ESTIMATED, NO_REFERENCE = "estimated", "none"
+"""In place of a `reference`: it is estimated from the scans, or there is none."""
+_SOURCES = ("bag", "kitti", "folder", "evalio")
+
+
+_POSE = "give numbers: x y z qx qy qz qw, or the four rows of a 4x4 matrix"
+_FARTHEST = 1e6
+"""Metres between two frames of one platform."""
+
+
+def expand(text: str) -> str:
+    """Replace ``${VARIABLE}`` by its value; a ValueError names the variable that is not set."""
+    if unset := [v for v in re.findall(r"\$\{(\w+)\}", text) if v not in os.environ]:
+        raise ValueError(f"the environment variable {unset[0]} is not set")
+    return os.path.expandvars(text)
+
+
+def resolve(path: str, info: ValidationInfo) -> str:
+    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
+    folder = (info.context or {}).get("folder", Path())
+    if not path.strip():
+        raise ValueError("give a path, not an empty text")
+    try:
+        whole = (Path(folder) / expand_user(expand(path))).resolve()
+        whole.exists()
+    except AdaptuneError as error:
+        raise ValueError(str(error)) from error
+    except RuntimeError as error:
+        raise ValueError(f"{path}: links lead in a circle; remove them") from error
+    except OSError as error:
+        raise ValueError(f"cannot be reached ({error.strerror}); give another path") from error
+    return str(whole)
+
+
+def _resolve_bags(given: Any, info: ValidationInfo) -> Any:
+    if isinstance(given, str):
+        return resolve(given, info)
+    if given is None:
+        return None
+    if not isinstance(given, list | tuple) or not given or {type(path) for path in given} != {str}:
+        raise ValueError("give the path of a bag, or a list of paths")
+    return tuple(resolve(path, info) for path in given)
+
+
+def _resolve_file(reference: str, info: ValidationInfo) -> str:
+    return resolve(reference, info) if reference.endswith(REFERENCE_FILES) else reference
+
+
+_Numbers = tuple[float, ...]
+
+
+def _check_transform(given: Any) -> Any:
+    rows: Any = given if isinstance(given, list | tuple) else ()
+    nested = any(isinstance(row, list | tuple) for row in rows)
+    for row in rows if nested else (rows,):
+        for number in row if isinstance(row, list | tuple) else (row,):
+            real = isinstance(number, int | float) and not isinstance(number, bool)
+            if not (real and abs(number) <= _FARTHEST):
+                raise ValueError(f"holds {number!r:.20}; {_POSE}")
+    to_pose(rows)
+    return given
+
+
+def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
+    """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
+    values = np.array(given, np.float64) if len({np.shape(row) for row in given}) == 1 else None
+    if values is not None and values.shape == (7,):
+        if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
+            raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
+        pose: Poses = geometry.from_quaternions(values[None, :3], values[None, 3:])[0]
+        return pose
+    if values is None or values.shape not in ((4, 4), (3, 4)):
+        raise ValueError(_POSE)
+    R = values[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise ValueError("its first three columns and rows are not a rotation")
+    if values.shape == (4, 4) and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError("its last row is not 0 0 0 1; is it transposed?")
+    from scipy.spatial.transform import Rotation
+
+    T = np.eye(4)
+    # Written with a few digits, it is a rotation only nearly.
+    T[:3, :3] = Rotation.from_matrix(R).as_matrix()
+    T[:3, 3] = values[:3, 3]
+    return T
+
+
+Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_check_transform)]
+"""A pose as seven numbers, or as the rows of a matrix."""
+
+
+class _Part(StrictModel):
+    """Seconds since the first scan."""
+
+    start: float = Field(0.0, ge=0, le=1e9)
+    stop: float | None = Field(None, gt=0, le=1e9)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.stop is not None and self.stop <= self.start:
+            raise ValueError(f"start ({self.start:g}) must be less than stop ({self.stop:g})")
+        return self
+
+
+_Seconds = Annotated[float, Field(ge=0, le=1e9)]
+
+
+class DropConfig(_Part):
+    """The share of the scans from `start` to `stop` that is lost."""
+
+    share: float = Field(gt=0, lt=1)
+    seed: int = Field(0, ge=0, lt=2**32)
+
+
+class SpeedConfig(_Part):
+    """How many times faster the scans from `start` to `stop` arrive."""
+
+    factor: float = Field(ge=1e-3, le=1e3)
+
+
+class NoiseConfig(StrictModel):
+    """Metres by which points are moved along their rays."""
+
+    sigma: float = Field(gt=0, le=1e3)
+    seed: int = Field(0, ge=0, lt=2**32)
+
+
+class ViewConfig(StrictModel):
+    """One view, by its name; views apply in the order of the list."""
+
+    # Only these parts, in seconds since the first scan.
+    cut: tuple[tuple[_Seconds, _Seconds], ...] | None = Field(None, min_length=1, max_length=1000)
+    drop: DropConfig | None = None
+    speed: SpeedConfig | None = None
+    reverse: Literal[True] | None = None
+    rings: int | None = Field(None, ge=2, le=256)  # keep one ring in so many
+    noise: NoiseConfig | None = None
+    transform: Transform | None = None  # pose of the LiDAR in the frame from which to see it
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self._given()) != 1:
+            names = ", ".join(type(self).model_fields)
+            raise ValueError(f"each view is an entry of its own, `- name: ...` with one of {names}")
+        if self.cut and (bad := [part for part in self.cut if not 0 <= part[0] < part[1]]):
+            raise ValueError(f"a part goes from a start to a later stop, not {list(bad[0])}")
+        return self
+
+    @property
+    def name(self) -> str:
+        """Which view it is."""
+        return self._given()[0]
+
+    def _given(self) -> list[str]:
+        return [name for name in type(self).model_fields if getattr(self, name) is not None]
+
+
+_Noise = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class NoiseDensities(StrictModel):
+    """See `ImuNoise`."""
+
+    gyroscope: _Noise = USUAL.gyroscope
+    accelerometer: _Noise = USUAL.accelerometer
+    gyroscope_walk: _Noise = USUAL.gyroscope_walk
+    accelerometer_walk: _Noise = USUAL.accelerometer_walk
+
+
+class ImuConfig(StrictModel):
+    """An IMU."""
+
+    topic: str | None = None  # may be left out where there is only one
+    extrinsic: Transform | None = None  # its pose in the LiDAR's frame
+    unit: Literal["m/s2", "g"] = "m/s2"  # of its accelerometer
+    noise: NoiseDensities = NoiseDensities()  # for odometries that weigh it against the LiDAR
+
+
+class SequenceConfig(_Part):
+    """A recording, from one of `bag`, `kitti`, `folder` and `evalio`, and what of it to use."""
+
+    # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
+    bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
+    # Folder of a KITTI odometry sequence, or of a drive of KITTI raw or KITTI-360.
+    kitti: Annotated[str, AfterValidator(resolve)] | None = None
+    # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
+    folder: Annotated[str, AfterValidator(resolve)] | None = None
+    evalio: str | None = None  # one of evalio's sequences, as ``newer_college_2020/short``
+    points: str | None = None  # topic of the point clouds
+    stamp: Literal["auto", "start", "end"] = "auto"  # what a stamp marks of its scan
+    time_unit: Unit | None = None  # of the points' times
+    # Seconds a scan takes; used if neither points nor files have times.
+    period: float = Field(0.1, gt=0, le=60)
+    stride: int = Field(1, ge=1, le=10_000)  # use every stride-th scan
+    part: Part | None = None  # of the time from `start` to `stop`
+    # Topic of the reference poses, or a file: TUM, KITTI (``.txt``, ``.tum``), EuRoC (``.csv``).
+    # `estimated` from the scans, also where there are poses; `none`. Left out, the recording's own
+    # poses, and where it has none, estimated.
+    reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
+    # Poses like those of a `reference`, right over long distances only, that an estimate joins.
+    position_prior: Annotated[str, AfterValidator(_resolve_file)] | None = None
+    child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
+    extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
+    # Seconds to add to the reference's stamps, as far as those of other clocks lie.
+    clock_offset: float = Field(0.0, ge=-3e9, le=3e9)
+    # Seconds. The reference is unknown between poses further apart.
+    max_gap: float = Field(1.0, gt=0, le=1e9)
+    imu: ImuConfig | None = None
+    # Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
+    # benchmark and the raw drives when left out.
+    elevation: float | None = Field(None, ge=-5, le=5)
+    # Undo the motion since the scan before, or the rotation that the IMU measured.
+    compensate: Literal["constant_velocity", "gyro"] | None = None
+    views: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
+    cache: bool = True  # whether to keep decoded bags in the cache
+
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
+        given = [name for name in _SOURCES if getattr(self, name) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"give one of {', '.join(_SOURCES)}, not {found}")
+        if self.points is not None and given[0] != "bag":
+            raise ValueError(f"`points` names a topic of a bag; {given[0]} has none")
+        if self.elevation is not None and given[0] != "kitti":
+            raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
+        if self.compensate == "gyro" and self.imu is None:
+            raise ValueError("`compensate: gyro` needs `imu`")
+        if self.position_prior in (ESTIMATED, NO_REFERENCE):
+            raise ValueError("`position_prior` names a topic or a file of poses")
+        if self.position_prior is not None and self.reference not in (None, ESTIMATED):
+            raise ValueError(
+                f"`position_prior` joins an estimated reference: write `reference: {ESTIMATED}`, "
+                f"or leave `position_prior` out"
+            )
+        return self
+
+    def paths(self) -> list[Path]:
+        """Files and folders that it is read from; a SequenceError if there is no such bag."""
+        paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
+        paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
+        of_poses = (self.reference, self.position_prior)
+        paths += [Path(file) for file in of_poses if file and file.endswith(REFERENCE_FILES)]
+        return paths

@@ -1,0 +1,213 @@
+"""Sequences as bags and folders, for programs that read nothing else."""
+
+import heapq
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from adaptune import geometry
+from adaptune.files import write_text
+from adaptune.geometry import Poses
+from adaptune.recording.scan import Imu, Scan
+from adaptune.trajectory import write_kitti
+
+Message = tuple[str, int, Any]
+"""Topic, nanoseconds at which it is sent, content."""
+
+Layout = Literal["bag", "ros2", "kitti"]
+"""ROS 1 bag, ROS 2 folder with sqlite3, KITTI odometry folder."""
+
+POINTS, IMU = "/points", "/imu"
+"""Topics of the bags."""
+
+T_CAMERA_LIDAR = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""A camera in the LiDAR's place which looks ahead, z forward, as KITTI's do."""
+
+_KINDS = {"<f4": 7, "<u2": 4}
+
+
+class Messages:
+    """Makes messages of a version of ROS."""
+
+    def __init__(self, version: Literal[1, 2]) -> None:
+        self.version = version
+        self.typestore = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+        self.types = self.typestore.types
+        # Only a ROS 1 header counts its messages.
+        self._counts: Counter[str] = Counter()
+
+    def header(self, topic: str, stamp: int, frame: str) -> Any:
+        """A header with nanoseconds and frame, counted by topic in ROS 1."""
+        time = self.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+        header = self.types["std_msgs/msg/Header"]
+        if self.version == 2:
+            return header(stamp=time, frame_id=frame)
+        number = self._counts[topic]
+        self._counts[topic] += 1
+        return header(seq=number, stamp=time, frame_id=frame)
+
+    def cloud(self, header: Any, cloud: NDArray[Any]) -> Any:
+        """A cloud of points in a structured array of shape (n,) of float32 and uint16."""
+        field = self.types["sensor_msgs/msg/PointField"]
+        layout: Any = cloud.dtype.fields
+        fields = [
+            field(name=name, offset=layout[name][1], datatype=_KINDS[layout[name][0].str], count=1)
+            for name in cloud.dtype.names or ()
+        ]
+        return self.types["sensor_msgs/msg/PointCloud2"](
+            header=header,
+            height=1,
+            width=len(cloud),
+            fields=fields,
+            is_bigendian=False,
+            point_step=cloud.dtype.itemsize,
+            row_step=cloud.nbytes,
+            data=cloud.view(np.uint8),
+            is_dense=True,
+        )
+
+    def imu(self, header: Any, gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> Any:
+        """A measurement without an orientation."""
+        vector, unknown = self.types["geometry_msgs/msg/Vector3"], np.zeros(9)
+        return self.types["sensor_msgs/msg/Imu"](
+            header=header,
+            orientation=self.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            # As the message's definition has it: no orientation is estimated.
+            orientation_covariance=np.array([-1.0, *np.zeros(8)]),
+            angular_velocity=vector(*gyro.tolist()),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=vector(*accel.tolist()),
+            linear_acceleration_covariance=unknown,
+        )
+
+    def write(
+        self,
+        path: Path,
+        types: Mapping[str, str],
+        messages: Iterable[Message],
+        storage: StoragePlugin = StoragePlugin.SQLITE3,
+    ) -> None:
+        """Write a bag where nothing is yet: a file of ROS 1, or a folder of ROS 2.
+
+        Parameters
+        ----------
+        path
+            The file or the folder.
+        types
+            Of the messages on each topic.
+        messages
+            In the order in which they are sent.
+        storage
+            Format of a ROS 2 bag's files.
+        """
+        store, writer = self.typestore, Writer1(path) if self.version == 1 else None
+        serialize = store.serialize_cdr if writer is None else store.serialize_ros1
+        with writer or Writer2(path, version=9, storage_plugin=storage) as bag:
+            topics: dict[str, Any] = {
+                topic: bag.add_connection(topic, kind, typestore=store)
+                for topic, kind in types.items()
+            }
+            for topic, stamp, message in messages:
+                bag.write(topics[topic], stamp, serialize(message, types[topic]))
+
+
+def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -> None:
+    """Write scans, and an IMU's measurements where there are any, for another program.
+
+    Bags hold `POINTS` (x, y, z, intensity, which is 0 where the scans have none, and ring and time
+    where they have them) and `IMU`. A KITTI folder holds sequence 00, its camera in the LiDAR's
+    frame. Scans are in order of time, the IMU is on their clock, and nothing is at `path` yet.
+    """
+    if layout == "kitti":
+        write_kitti_sequence(scans, path)
+        return
+    messages = Messages(1 if layout == "bag" else 2)
+    types = {POINTS: "sensor_msgs/msg/PointCloud2"}
+    streams = [_clouds(messages, scans)]
+    if imu is not None:
+        types[IMU] = "sensor_msgs/msg/Imu"
+        streams.append(_measurements(messages, imu))
+    messages.write(path, types, heapq.merge(*streams, key=lambda message: message[1]))
+
+
+def _clouds(messages: Messages, scans: Iterable[Scan]) -> Iterator[Message]:
+    """Each cloud when its scan is over."""
+    for scan in scans:
+        header = messages.header(POINTS, scan.stamp, "lidar")
+        yield POINTS, scan.stamp + max(scan.span, 0), messages.cloud(header, structured(scan))
+
+
+def structured(scan: Scan) -> NDArray[Any]:
+    """Points as Velodyne's driver writes them, with rings and times where the scan has them."""
+    x, y, z = scan.points.T
+    light = np.zeros(len(scan)) if scan.intensities is None else scan.intensities
+    columns = {"x": x, "y": y, "z": z, "intensity": light, "ring": scan.rings, "time": scan.times}
+    given = {name: values for name, values in columns.items() if values is not None}
+    cloud = np.empty(len(scan), [(name, "<u2" if name == "ring" else "<f4") for name in given])
+    for name, values in given.items():
+        cloud[name] = values
+    return cloud
+
+
+def _measurements(messages: Messages, imu: Imu) -> Iterator[Message]:
+    measured = zip(imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True)
+    for stamp, gyro, accel in measured:
+        yield IMU, stamp, messages.imu(messages.header(IMU, stamp, "imu"), gyro, accel)
+
+
+def write_kitti_sequence(
+    scans: Iterable[Scan], root: Path, name: str = "00", T_camera_lidar: Poses | None = None
+) -> None:
+    """Write a sequence of the KITTI odometry benchmark, without its poses.
+
+    Parameters
+    ----------
+    scans
+        In order of time. Intensities are 0 where they have none.
+    root
+        Folder of the benchmark; it receives ``sequences/<name>``.
+    name
+        Of the sequence, which is not there yet.
+    T_camera_lidar
+        Pose of shape (4, 4) for ``calib.txt``: KITTI's poses are those of the camera. The camera
+        is in the LiDAR's frame when left out.
+    """
+    sequence = root / "sequences" / name
+    (sequence / "velodyne").mkdir(parents=True)
+    stamps = []
+    for number, scan in enumerate(scans):
+        stamps.append(scan.stamp)
+        cloud = np.zeros((len(scan), 4), "<f4")
+        cloud[:, :3] = scan.points
+        if scan.intensities is not None:
+            cloud[:, 3] = scan.intensities
+        (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.tobytes())
+    seconds = (np.array(stamps) - stamps[0]) * 1e-9
+    write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
+    T = np.eye(4) if T_camera_lidar is None else T_camera_lidar
+    rows = " ".join(f"{v:.12e}" for v in T[:3].ravel())
+    camera = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
+    lines = [*(f"P{i}: {camera}\n" for i in range(4)), f"Tr: {rows}\n"]
+    write_text(sequence / "calib.txt", "".join(lines))
+
+
+def write_kitti_poses(
+    T_world_lidar: Poses, root: Path, name: str = "00", T_camera_lidar: Poses | None = None
+) -> None:
+    """Write ``poses/<name>.txt`` of the KITTI odometry benchmark: the camera's, the first at 0.
+
+    `T_world_lidar` are of shape (n, 4, 4), one a scan. For the rest see `write_kitti_sequence`.
+    """
+    T = np.eye(4) if T_camera_lidar is None else T_camera_lidar
+    of_lidar = geometry.invert(T_world_lidar[0]) @ T_world_lidar
+    write_kitti(root / "poses" / f"{name}.txt", T @ of_lidar @ geometry.invert(T))

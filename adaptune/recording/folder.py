@@ -1,0 +1,390 @@
+"""Recordings with one file for each scan.
+
+All functions raise a SequenceError that names the file or folder that is missing or unfit.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import files as open3d
+from adaptune import geometry
+from adaptune.geometry import Poses
+from adaptune.recording.clouds import PointCloudError, from_fields
+from adaptune.recording.recording import Frame
+from adaptune.recording.scan import AUTO, Imu, Scan, SequenceError, Timing
+from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
+
+SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+ELEVATION = 0.205
+"""Degrees by which KITTI's LiDAR reports its rays too low."""
+
+
+@dataclass(frozen=True, eq=False)
+class FileSource:
+    """Scans in files of their own."""
+
+    name: str  # the folder
+    scans: Sequence[Path]
+    stamps: NDArray[np.int64]  # nanoseconds of each file, of shape (n,)
+    timing: Timing = AUTO  # what the stamps mean
+    # Reads the LiDAR's poses stored with the files.
+    own_poses: Callable[[], Trajectory] | None = None
+    elevation: float = 0.0  # degrees by which every ray is to be turned up
+    stamp_files: Sequence[Path] = ()  # hold the stamps, where the files' names do not
+    pose_files: Sequence[Path] = ()  # hold the poses
+
+    random_access: ClassVar[bool] = True
+
+    def about(self) -> dict[str, Any]:
+        """Its name."""
+        return {"name": self.name}
+
+    @property
+    def n_messages(self) -> int:
+        """Number of files."""
+        return len(self.scans)
+
+    @property
+    def files(self) -> list[Path]:
+        """Scans and stamps."""
+        return [*self.scans, *self.stamp_files]
+
+    def frames(self) -> Iterator[Frame]:
+        """All scans in the order of the files' names."""
+        for path, stamp in zip(self.scans, self.stamps.tolist(), strict=True):
+            yield Frame(stamp, stamp, partial(self._load, path, stamp))
+
+    def _load(self, path: Path, stamp: int) -> Scan:
+        scan = read_scan(path, stamp, self.timing)
+        if not self.elevation:
+            return scan
+        return replace(scan, points=turn_up(scan.points, self.elevation))
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last stamp."""
+        return (int(self.stamps[0]), int(self.stamps[-1])) if len(self.stamps) else None
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """The LiDAR's poses stored with the files; a TrajectoryError if they cannot be read."""
+        if name is not None or child_frame is not None:
+            help_ = "`reference` must be a file of poses, or be left out"
+            raise SequenceError(f"{self.name}: has no topics; {help_}")
+        return None if self.own_poses is None else self.own_poses()
+
+    def first_pose(self, name: str) -> int | None:
+        """Folders have no topics."""
+        self.poses(name, None)
+        return None
+
+    def imu(self, name: str | None) -> Imu | None:
+        """Folders hold none."""
+        if name is not None:
+            raise SequenceError(f"{self.name}: has no topics; leave `imu` out")
+        return None
+
+
+def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
+    """Read one file: ``.bin`` as KITTI writes them, ``.npy``, ``.pcd`` or ``.ply``."""
+    try:
+        return from_fields(_fields(path), stamp, timing)
+    except FileNotFoundError as error:
+        raise SequenceError(f"{path}: there is no such file") from error
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, PointCloudError) as error:
+        raise SequenceError(f"{path}: cannot be read as a scan ({error})") from error
+
+
+def turn_up(points: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
+    """Turn every ray up by `degrees`, in the vertical plane in which it lies.
+
+    The rays of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018; KISS-ICP corrects
+    it likewise). `points` are of shape (n, 3).
+    """
+    sine, cosine = np.sin(np.deg2rad(degrees)), np.cos(np.deg2rad(degrees))
+    distance = np.hypot(points[:, 0], points[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = cosine - sine * points[:, 2] / distance
+    turned = np.empty_like(points)
+    # Straight up there is no plane to turn in.
+    turned[:, :2] = points[:, :2] * np.where(distance > 0, scale, 1.0)[:, None]
+    turned[:, 2] = np.where(distance > 0, sine * distance + cosine * points[:, 2], points[:, 2])
+    return turned
+
+
+def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    if path.suffix == ".bin":
+        size = path.stat().st_size
+        if size % 16:
+            raise ValueError(f"{size} bytes are not a whole number of points of four float32")
+        array: NDArray[Any] = np.fromfile(path, "<f4").reshape(-1, 4)
+    elif path.suffix == ".npy":
+        array = np.load(path, allow_pickle=False)
+        if array.dtype.names is not None:
+            _require_xyz(array.dtype.names)
+            return array.reshape(-1)
+    else:
+        return _open3d_fields(path)
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise ValueError(f"an array of shape {array.shape} is not one of points")
+    columns = {axis: array[:, i] for i, axis in enumerate("xyz")}
+    return columns | {"intensity": array[:, 3]} if path.suffix == ".bin" else columns
+
+
+def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
+    cloud = open3d.load().t.io.read_point_cloud(str(path))
+    # Open3D returns an empty cloud for files that it cannot read.
+    if "positions" not in cloud.point or not len(cloud.point.positions):
+        raise ValueError("it is damaged or holds no point")
+    fields = {name: tensor.numpy() for name, tensor in cloud.point.items()}
+    columns = {name: v[:, 0] for name, v in fields.items() if v.ndim == 2 and v.shape[1] == 1}
+    return columns | {axis: fields["positions"][:, i] for i, axis in enumerate("xyz")}
+
+
+def _require_xyz(names: Sequence[str]) -> None:
+    if missing := [axis for axis in "xyz" if axis not in names]:
+        raise KeyError(f"no field {', '.join(missing)}; there is {', '.join(names)}")
+
+
+def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
+    """Scans of a folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
+
+    Stamps are the lines of ``times.txt`` (seconds) where there is one; else the files' names
+    where these are seconds with a fraction or nanoseconds since 1970; else one `period` a file.
+    """
+    if not folder.is_dir():
+        raise SequenceError(f"{folder}: there is no such folder")
+    for suffix in SUFFIXES:
+        if files := sorted(folder.glob(f"*{suffix}"), key=_natural):
+            break
+    else:
+        raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)})")
+    stamp_files: list[Path] = []
+    if (times := folder / "times.txt").exists():
+        stamp_files.append(times)
+        stamps = _seconds(times)
+        if len(stamps) != len(files):
+            raise SequenceError(
+                f"{times}: {len(stamps)} times for {len(files)} scans; give one a scan"
+            )
+    else:
+        named = _named_stamps(files)
+        evenly = np.arange(len(files)) * round(timing.period * 1e9)
+        stamps = evenly if named is None else named
+    return FileSource(str(folder), files, stamps, timing, stamp_files=stamp_files)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Key by which scan_10 comes after scan_9."""
+    return [(int(n or 0), text) for text, n in re.findall(r"(\D*)(\d*)", path.stem)]
+
+
+def _named_stamps(files: Sequence[Path]) -> NDArray[np.int64] | None:
+    stems = [path.stem for path in files]
+    if all(re.fullmatch(r"\d{17,19}", stem) for stem in stems):
+        return np.array([int(stem) for stem in stems], np.int64)
+    if all(re.fullmatch(r"\d{1,10}\.\d+", stem) for stem in stems):
+        return np.array([int(Decimal(stem).scaleb(9)) for stem in stems], np.int64)
+    return None
+
+
+def kitti(folder: Path, elevation: float | None = None) -> FileSource:
+    """Scans of a KITTI odometry sequence, a KITTI raw drive or a KITTI-360 drive.
+
+    The content of the folder shows the kind: ``velodyne/`` with ``times.txt`` and ``calib.txt``
+    (poses in ``poses.txt``, or ``poses/`` two folders up), or ``velodyne_points/data/`` (poses
+    from ``oxts/``, or from ``data_poses/`` two folders up). Every ray is turned up by `elevation`
+    degrees: 0.205 when left out, and 0 for KITTI-360.
+    """
+    if (folder / "velodyne").is_dir():
+        return _kitti_odometry(folder, ELEVATION if elevation is None else elevation)
+    if (folder / "velodyne_points" / "data").is_dir():
+        return _kitti_drive(folder, elevation)
+    if not folder.is_dir():
+        raise SequenceError(f"{folder}: there is no such folder")
+    what = "not a KITTI sequence; it has neither velodyne/ nor velodyne_points/data/"
+    raise SequenceError(f"{folder}: {what}")
+
+
+def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
+    files = _scans(folder / "velodyne")
+    stamps = _seconds(folder / "times.txt")
+    if len(files) > len(stamps):
+        raise SequenceError(f"{folder}: {len(stamps)} lines in times.txt for {len(files)} scans")
+    candidates = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt")
+    found = next((path for path in candidates if path.exists()), None)
+
+    def poses() -> Trajectory:
+        assert found is not None
+        T_world_camera = read_kitti(found)
+        if len(T_world_camera) != len(stamps):
+            raise SequenceError(f"{found}: {len(T_world_camera)} poses for {len(stamps)} stamps")
+        T_camera_sensor = calibration(folder / "calib.txt", "Tr")
+        T = geometry.invert(T_camera_sensor) @ T_world_camera @ T_camera_sensor
+        return Trajectory(stamps, T)
+
+    # Files may be missing from the front or the middle: their numbers give the stamps.
+    return FileSource(
+        str(folder),
+        files,
+        _by_number(files, stamps),
+        own_poses=poses if found else None,
+        elevation=elevation,
+        stamp_files=[folder / "times.txt"],
+        pose_files=[found, folder / "calib.txt"] if found else [],
+    )
+
+
+def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
+    points = folder / "velodyne_points"
+    files = _scans(points / "data")
+    started = points / "timestamps_start.txt"
+    path = started if started.exists() else points / "timestamps.txt"
+    stamps = _by_number(files, _dates(path))
+    poses: Callable[[], Trajectory] | None = None
+    pose_files: list[Path] = []
+    if (folder / "oxts" / "data").is_dir():
+        poses = partial(_oxts_poses, folder)
+        pose_files = [*_oxts_files(folder), folder / "oxts" / "timestamps.txt"]
+        pose_files.append(folder.parent / "calib_imu_to_velo.txt")
+    elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
+        poses = partial(_kitti_360_poses, record, _dates(path))
+        calibrations = record.parent.parent / "calibration"
+        pose_files = [record / "poses.txt", *sorted(calibrations.glob("*.txt"))]
+    if elevation is None:
+        # Only the raw drives record the start of each turn; KITTI-360 has another LiDAR.
+        elevation = ELEVATION if started.exists() else 0.0
+    return FileSource(
+        str(folder),
+        files,
+        stamps,
+        own_poses=poses,
+        elevation=elevation,
+        stamp_files=[path],
+        pose_files=[file for file in pose_files if file.is_file()],
+    )
+
+
+def _oxts_files(folder: Path) -> list[Path]:
+    return sorted((folder / "oxts" / "data").glob("*.txt"))
+
+
+def _oxts_poses(folder: Path) -> Trajectory:
+    files = _oxts_files(folder)
+    stamps = _by_number(files, _dates(folder / "oxts" / "timestamps.txt"))
+    T_sensor_imu = _calibration_rt(folder.parent / "calib_imu_to_velo.txt")
+    T_world_imu = read_oxts(files)
+    _, first = np.unique(stamps, return_index=True)
+    T = T_sensor_imu @ geometry.invert(T_world_imu[0]) @ T_world_imu @ geometry.invert(T_sensor_imu)
+    return Trajectory(stamps[first], T[first])
+
+
+def _kitti_360_poses(record: Path, stamps: NDArray[np.int64]) -> Trajectory:
+    path = record / "poses.txt"
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise TrajectoryError(f"{path}: cannot be read ({error})") from error
+    if rows.shape[1] != 13 or not len(rows) or not np.isfinite(rows).all():
+        raise TrajectoryError(f"{path}: lines must hold a frame and the 12 numbers of a pose")
+    frames = rows[:, 0].astype(np.int64)
+    if np.any(np.diff(frames) <= 0) or frames[0] < 0 or frames[-1] >= len(stamps):
+        raise TrajectoryError(f"{path}: its frames are not in order, or not those of the drive")
+    folder = record.parent.parent / "calibration"
+    T_body_camera = calibration(folder / "calib_cam_to_pose.txt", "image_00")
+    T_sensor_camera = _matrix(folder / "calib_cam_to_velo.txt")
+    T_world_body = _pose(rows[:, 1:].reshape(-1, 3, 4))
+    T_world_sensor = T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
+    return Trajectory(stamps[frames], T_world_sensor)
+
+
+def calibration(path: Path, key: str) -> Poses:
+    """A 3x4 matrix of KITTI's ``key: 12 numbers`` files, as a pose of shape (4, 4)."""
+    numbers = _entries(path).get(key, [])
+    if len(numbers) != 12:
+        raise SequenceError(f"{path}: no line `{key}:` with 12 numbers")
+    return _pose(np.array(numbers).reshape(3, 4))
+
+
+def _calibration_rt(path: Path) -> Poses:
+    entries = _entries(path)
+    if len(entries.get("R", [])) != 9 or len(entries.get("T", [])) != 3:
+        raise SequenceError(f"{path}: no lines `R:` and `T:` with 9 and 3 numbers")
+    rotation = np.array(entries["R"]).reshape(3, 3)
+    return _pose(np.column_stack([rotation, entries["T"]]))
+
+
+def _matrix(path: Path) -> Poses:
+    try:
+        numbers = [float(field) for field in _text(path).split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 12:
+        raise SequenceError(f"{path}: must hold the 12 numbers of a 3x4 matrix")
+    return _pose(np.array(numbers).reshape(3, 4))
+
+
+def _pose(rows: NDArray[np.float64]) -> Poses:
+    """Complete matrices of shape (..., 3, 4)."""
+    T = np.zeros((*rows.shape[:-2], 4, 4))
+    T[..., :3, :], T[..., 3, 3] = rows, 1.0
+    return T
+
+
+def _entries(path: Path) -> dict[str, list[float]]:
+    entries = {}
+    for line in _text(path).splitlines():
+        key, colon, numbers = line.partition(":")
+        try:
+            entries[key.strip()] = [float(field) for field in numbers.split()] if colon else []
+        except ValueError:  # a date, for example
+            continue
+    return entries
+
+
+def _scans(folder: Path) -> list[Path]:
+    if files := sorted(folder.glob("*.bin")):
+        return files
+    raise SequenceError(f"{folder}: holds no .bin files")
+
+
+def _by_number(files: Sequence[Path], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Stamp of each file by the number that its name is."""
+    try:
+        return np.asarray(stamps[[int(path.stem) for path in files]])
+    except (ValueError, IndexError) as error:
+        what = f"the files' numbers do not go with {len(stamps)} stamps"
+        raise SequenceError(f"{files[0].parent}: {what}") from error
+
+
+def _seconds(path: Path) -> NDArray[np.int64]:
+    try:
+        seconds = [Decimal(line) for line in _text(path).split()]
+        return np.array([int(s.scaleb(9).to_integral_value()) for s in seconds], np.int64)
+    except (InvalidOperation, ValueError, OverflowError) as error:
+        raise SequenceError(f"{path}: a line is not a time in seconds") from error
+
+
+def _dates(path: Path) -> NDArray[np.int64]:
+    lines = [line.strip() for line in _text(path).splitlines()]
+    try:
+        # An empty line stands for a scan that was lost; it has no file.
+        dates = np.array([line or "NaT" for line in lines], "datetime64[ns]")
+    except ValueError as error:
+        raise SequenceError(f"{path}: a line is not a date and time ({error})") from error
+    return np.asarray(dates.astype(np.int64))
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise SequenceError(f"{path}: there is no such file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise SequenceError(f"{path}: cannot be read as text ({error})") from error

@@ -1,0 +1,172 @@
+"""A figure as data: what is drawn, and not how.
+
+`adaptune.report.paper` draws a chart as PNG and SVG, `adaptune.report.interactive` for a browser.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.space import Categorical, Float, Integer, label
+
+Values = NDArray[Any] | Sequence[Any]
+"""Numbers, or names where an axis has names."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis; its label names the unit."""
+
+    label: str
+    log: bool = False
+    names: tuple[str, ...] | None = None  # of the values 0, 1, 2, ..., where it has names
+    limits: tuple[float, float] | None = None  # where they do not follow from the data
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line through points, or steps that last until the next point."""
+
+    x: Values
+    y: Values  # NaN interrupts it
+    name: str  # in the legend; of a mode, the mode's, whose colour and width it then has
+    steps: bool = False
+    dashed: bool = False
+    faint: bool = False  # lies in the background
+
+
+@dataclass(frozen=True)
+class Points:
+    """Markers."""
+
+    x: Values
+    y: Values
+    name: str  # in the legend; of a mode, the mode's, whose colour and marker they then have
+    colour: Values | None = None  # a number for every point, shown on a colour bar
+    colour_label: str = ""
+    log_colour: bool = False
+    texts: Sequence[str] | None = None  # what is told of each point in a browser
+    faint: bool = False
+    marker: str | None = None  # as matplotlib names it: "o", "s", "^", "v", "D", "x", "P", "*"
+
+
+@dataclass(frozen=True)
+class Band:
+    """The space between two lines, as of an interval."""
+
+    x: Values
+    low: Values
+    high: Values
+    name: str
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Bars from zero, or from `base`; on a logarithmic axis zero is the axis's low end."""
+
+    x: Values
+    heights: Values  # the values that they reach
+    name: str
+    low: Values | None = None  # ends of an interval of each
+    high: Values | None = None
+    width: float = 0.8  # in units of x
+    base: float = 0.0
+    flat: bool = False  # along x, with `x` on the y axis
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of a whole over time, stacked, each lasting until the next point."""
+
+    x: Values  # of shape (n,), the last being the end
+    shares: NDArray[np.float64]  # of shape (k, n)
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Stretches along x that are shaded and named, such as the scenes of a course."""
+
+    edges: Values  # of shape (n + 1,)
+    names: tuple[str, ...]  # of shape (n,); an empty name is not shaded
+    name: str = ""  # in the legend, if any
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A line at a value of x or y, with a few words on it."""
+
+    at: float
+    words: str = ""
+    axis: Literal["x", "y"] = "y"
+
+
+Drawn = Line | Points | Band | Bars | Shares | Spans | Mark
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes."""
+
+    x: Axis
+    y: Axis
+    drawn: tuple[Drawn, ...]
+    title: str = ""
+    equal: bool = False  # one metre is as long along x as along y
+    height: float = 1.0  # relative to the other rows
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure of one panel or several."""
+
+    key: str  # of its files and its anchor
+    title: str
+    panels: tuple[Panel, ...]  # row by row
+    caption: str = ""  # what it shows, in a sentence or two
+    columns: int = 1
+    shared_x: bool = False  # panels below each other have the same x axis
+
+
+class Charts(NamedTuple):
+    """The charts of a part of a study, and what is not among them."""
+
+    charts: list[Chart]
+    notes: list[str]  # sentences: what is missing, and what to run for it
+
+
+def charts_of(found: Iterable[Chart | str | None]) -> Charts:
+    """Charts and notes, told apart; what is None is left out."""
+    every = list(found)
+    charts = [one for one in every if isinstance(one, Chart)]
+    return Charts(charts, [one for one in every if isinstance(one, str)])
+
+
+# Axes of parameters: their unit, their scale, and their categories.
+
+
+Parameter = Float | Integer | Categorical
+
+
+def parameter_axis(name: str, parameter: Parameter) -> Axis:
+    """The axis of a parameter: logarithmic as its range is, or with the names of its choices."""
+    if isinstance(parameter, Categorical):
+        return Axis(label(name, parameter), names=tuple(map(str, parameter.choices)))
+    return Axis(label(name, parameter), log=parameter.log)
+
+
+def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:
+    """Where values are on this axis, of shape (n,); NaN for None.
+
+    Parameters
+    ----------
+    values
+        Values of the parameter; None where a set has none.
+    parameter
+        The parameter.
+    """
+    at = parameter.index if isinstance(parameter, Categorical) else float
+    return np.array([np.nan if value is None else at(value) for value in values], np.float64)

@@ -1,0 +1,149 @@
+"""What carries messages between adaptune and a robot: ROS 1, or ROS 2."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from rosbags.typesys.store import Typestore
+
+from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.space import ParameterSet
+
+
+class LinkError(AdaptuneError):
+    """A robot that cannot be reached, or that refuses what is asked of it."""
+
+
+class RosLink(Protocol):
+    """A node of adaptune's in a robot's ROS.
+
+    Messages are those of `store`, by names such as ``sensor_msgs/msg/PointCloud2`` in ROS 1, too.
+    Every method may be called from any thread.
+
+    Attributes
+    ----------
+    store : Typestore
+        The types of all messages.
+    """
+
+    store: Typestore
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+        """Have every message of a topic taken, one after the other, in a thread of its own."""
+
+    def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
+        """Announce a topic; what is returned publishes a message on it."""
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Set parameters of another node; what it then holds, as far as it tells.
+
+        Raises
+        ------
+        LinkError
+            If the node is not there, does not answer, or refuses a value.
+        """
+
+    def topics(self) -> Mapping[str, str]:
+        """The topics that somebody publishes now, and their types."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether messages still pass."""
+
+    def close(self) -> None:
+        """Leave."""
+
+
+# Parameters of a node that somebody else wrote, set while it runs.
+
+
+Run = Callable[[list[str]], tuple[int, str]]
+"""Runs a command; its exit code, and what it wrote."""
+
+_log = logging.getLogger(__name__)
+
+
+class Steering:
+    """Sets parameters of a node.
+
+    Parameters
+    ----------
+    node
+        Its name.
+    set_parameters
+        Sets them through ROS, see `adaptune.ros.link.RosLink.set_parameters`.
+    command
+        A program that sets a parameter in place of ROS, and its arguments, with ``{node}``,
+        ``{name}`` and ``{value}``.
+    run
+        Runs it.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        set_parameters: Callable[[ParameterSet], Mapping[str, Any]],
+        command: Sequence[str] | None,
+        run: Run,
+    ):
+        self._node, self._set_parameters = node, set_parameters
+        self._command, self._run = command, run
+        self._told: set[str] = set()
+
+    def apply(self, parameters: ParameterSet) -> None:
+        """Set the parameters, and make sure that the node holds them where it tells.
+
+        Raises
+        ------
+        OdometryError
+            If it cannot be reached, or holds other values.
+        LinkError
+            If it refuses them.
+        """
+        if self._command is not None:
+            for name, value in parameters.items():
+                self._set(self._command, name, value)
+            return
+        held = self._set_parameters(parameters)
+        for name, value in parameters.items():
+            if name not in held:
+                self._warn(name)
+            elif not equal_values(value, held[name]):
+                raise OdometryError(f"{self._node} holds {name} = {held[name]}")
+
+    def _warn(self, name: str) -> None:
+        if name not in self._told:
+            self._told.add(name)
+            what = "%s: nobody says whether %s takes effect before the node starts again"
+            _log.warning(what, self._node, name)
+
+    def _set(self, command: Sequence[str], name: str, value: Any) -> None:
+        values = {"{node}": self._node, "{name}": name, "{value}": _text(value)}
+        arguments = []
+        for argument in command:
+            for key, text in values.items():
+                argument = argument.replace(key, text)  # noqa: PLW2901
+            arguments.append(argument)
+        code, written = self._run(arguments)
+        if code:
+            words = " | ".join(written.split("\n")[-4:]).strip(" |")
+            raise OdometryError(f"{' '.join(arguments)}: exit code {code}: {words}")
+
+
+def equal_values(wanted: Any, held: Any) -> bool:
+    """Whether a node holds what was set, but for the rounding of real numbers."""
+    if isinstance(wanted, bool) or isinstance(held, bool):
+        return bool(wanted is held)
+    if isinstance(wanted, float) and isinstance(held, int | float):
+        return bool(np.isclose(wanted, held, rtol=1e-5, atol=1e-9))
+    return bool(wanted == held)
+
+
+def _text(value: Any) -> str:
+    # `1e-05` is a text to some readers of YAML, and `True` to others.
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return np.format_float_positional(value, trim="0")
+    return str(value)

@@ -1,0 +1,519 @@
+"""Recordings of simulated courses: ROS bags and KITTI odometry folders."""
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin
+
+from adaptune import files, geometry
+from adaptune.files import replacing, replacing_folder
+from adaptune.geometry import Poses, invert
+from adaptune.recording.export import (
+    T_CAMERA_LIDAR,
+    Message,
+    Messages,
+    structured,
+    write_kitti_poses,
+    write_kitti_sequence,
+)
+from adaptune.recording.scan import Scan
+from adaptune.report.paper import as_png_and_svg, colour_map, picture, plain
+from adaptune.simulation import world as kernels
+from adaptune.simulation.course import (
+    IMU,
+    NOISE,
+    POINTS,
+    POSES,
+    T_IMU_LIDAR,
+    Course,
+    SimulationError,
+)
+from adaptune.simulation.mesh import REFLECTIVITY, Mesh
+from adaptune.simulation.scenes import SCENES, TILE
+from adaptune.simulation.sensors import MOTIONS, SENSORS, WEATHERS, directions
+from adaptune.simulation.world import RADIUS, Ride, Road, World, model, populate
+from adaptune.trajectory import Trajectory, write_tum
+
+# Drive through a world and scan it.
+
+
+EPOCH = 1_600_000_000_000_000_000
+"""Nanoseconds at which every recording starts."""
+
+_DETOUR = 1.2
+"""Metres of road in a metre of sight, where it winds."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulatedScan(Scan):
+    """A scan with intensities, rings and its true pose."""
+
+    intensities: NDArray[np.float32]  # from 0 to 255
+    rings: NDArray[np.uint16]
+    T_world_sensor: Poses  # at the scan's stamp, of shape (4, 4)
+
+
+class Drive:
+    """A course with its road and the sensor's ride along it."""
+
+    def __init__(self, course: Course) -> None:
+        self.course = course
+        self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
+        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
+
+    def __len__(self) -> int:
+        """Whole scans in the drive."""
+        return int(self.ride.duration * self.course.turns)
+
+    def stamps(self) -> NDArray[np.int64]:
+        """Borders of the scans in nanoseconds, one more than there are scans."""
+        borders = np.arange(len(self) + 1) * (1e9 / self.course.turns)
+        return np.asarray(EPOCH + np.rint(borders).astype(np.int64))
+
+    def seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Seconds since the start of stamps in nanoseconds."""
+        return np.asarray((stamps - EPOCH) * 1e-9, np.float64)
+
+    def scans(self) -> Iterator[SimulatedScan]:
+        """Scan the world from one end of the drive to the other."""
+        course, sensor = self.course, SENSORS[self.course.sensor]
+        air = WEATHERS[course.weather]
+        columns = course.columns or sensor.columns
+        rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
+        offsets = np.arange(columns) / (columns * course.turns)
+        times = np.repeat(offsets, sensor.rings).astype(np.float32)
+        receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
+        caster = _Caster(self, sensor.range[1])
+        for number, stamp in enumerate(self.stamps()[:-1].tolist()):
+            start = (stamp - EPOCH) * 1e-9
+            T_world_sensor = self.ride.poses(start + offsets)
+            looks = directions(course.sensor, columns, start, course.turns)
+            cast = caster.cast(looks, T_world_sensor, start + offsets)
+            rng = np.random.default_rng([course.seed, 6, number])
+            points, intensities, kept = kernels.receive(
+                looks.reshape(-1, 3),
+                cast,
+                receiver,
+                (air.extinction, air.backscatter, air.reach),
+                rng.random((2, len(cast.rays)), np.float32),
+                rng.standard_normal(len(cast.rays), np.float32),
+            )
+            yield SimulatedScan(
+                stamp=stamp,
+                points=points,
+                times=times[kept],
+                intensities=intensities,
+                rings=rings[kept],
+                T_world_sensor=T_world_sensor[0],
+            )
+
+
+class _Caster:
+    """Casts rays into the world nearby, which it builds again for every tile."""
+
+    def __init__(self, drive: Drive, sight: float) -> None:
+        self._road, self._sight = drive.road, sight
+        self._world = World(drive.road)
+        self._here: int | None = None
+        self._movers = populate(drive.road) if drive.course.moving_objects else []
+        kinds = {mover.kind for mover in self._movers}
+        self._models = {kind: _Target(model(kind), np.zeros(3)) for kind in kinds}
+
+    def cast(
+        self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
+    ) -> kernels.Cast:
+        """Cast rays from each column's pose."""
+        station = float(self._road.station(T_world_sensor[0, 0, 3]))
+        tile = int(station // TILE)
+        if tile != self._here:
+            mesh = self._world.around((tile + 0.5) * TILE, self._sight * _DETOUR + TILE / 2.0)
+            self._origin = T_world_sensor[0, :3, 3].copy()
+            self._target = _Target(mesh, self._origin)
+            self._here = tile
+        rays = kernels.aim(looks, T_world_sensor, self._origin)
+        hits, normals, reflectivity = self._target.cast(rays)
+        for mover in self._movers:
+            if abs(mover.middle - station) > mover.swing + self._sight:
+                continue
+            centres, yaw = mover.at(self._road, times)
+            picked, local = kernels.towards(
+                rays, looks.shape[1], centres - self._origin, yaw, RADIUS[mover.kind]
+            )
+            if not len(picked):
+                continue
+            nearer, turned, shine = self._models[mover.kind].cast(local)
+            hit = nearer < hits[picked]
+            picked, turned, heading = picked[hit], turned[hit], yaw[picked[hit] // looks.shape[1]]
+            hits[picked], reflectivity[picked] = nearer[hit], shine[hit]
+            cos, sin = np.cos(heading), np.sin(heading)
+            normals[picked, 0] = cos * turned[:, 0] - sin * turned[:, 1]
+            normals[picked, 1] = sin * turned[:, 0] + cos * turned[:, 1]
+            normals[picked, 2] = turned[:, 2]
+        return kernels.Cast(rays, hits, normals, reflectivity)
+
+
+class _Target:
+    """A mesh that rays can be cast at, relative to an origin."""
+
+    def __init__(self, mesh: Mesh, origin: NDArray[np.float64]) -> None:
+        o3d: Any = files.load()
+        self._tensor = o3d.core.Tensor.from_numpy
+        self._scene = o3d.t.geometry.RaycastingScene()
+        vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)
+        triangles = np.ascontiguousarray(mesh.triangles, np.uint32)
+        self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
+        # The last one is for rays that hit nothing.
+        self._reflectivity = np.append(REFLECTIVITY[mesh.materials], np.float32(0.0))
+
+    def cast(
+        self, rays: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Cast rays of shape (n, 6): metres to the hit, its normal and its reflectivity."""
+        answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))
+        triangles = np.minimum(answer["primitive_ids"].numpy(), len(self._reflectivity) - 1)
+        hits, normals = answer["t_hit"].numpy(), answer["primitive_normals"].numpy()
+        return hits, normals, self._reflectivity[triangles]
+
+
+def simulate(course: Course) -> Iterator[SimulatedScan]:
+    """Drive a course and scan it, one scan at a time; stamps always mark a scan's start."""
+    return Drive(course).scans()
+
+
+# Simulated measurements of an inertial measurement unit.
+
+
+GRAVITY = 9.80665
+"""m/s^2, downwards along the world's z axis."""
+
+
+class Inertial(NamedTuple):
+    """Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
+
+    The specific force points up at rest.
+    """
+
+    gyro: NDArray[np.float64]
+    accel: NDArray[np.float64]
+
+
+def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
+    """Measure without any error, at seconds since the recording's start, of shape (n,)."""
+    T_lidar_imu = invert(T_IMU_LIDAR)
+    R_lidar_imu, lever = T_lidar_imu[:3, :3], T_lidar_imu[:3, 3]
+    R_world_lidar = ride.poses(times)[:, :3, :3]
+    _, turn = ride.velocities(times)
+    acceleration, turn_rate = ride.accelerations(times)
+    # Rotation accelerates the IMU, which is not at the LiDAR's origin.
+    round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
+    force = acceleration + np.array([0.0, 0.0, GRAVITY])
+    force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_
+    return Inertial(turn @ R_lidar_imu, force @ R_lidar_imu)
+
+
+def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
+    """Measure with biases that wander, and white noise, at times that are `rate` a second.
+
+    `seed` is that of the errors; see `ideal`.
+    """
+    rng = np.random.default_rng([seed, 5])
+    truth = ideal(ride, times)
+
+    def error(start: float, walk: float, noise: float) -> NDArray[np.float64]:
+        shape = (len(times), 3)
+        bias = rng.normal(0.0, start, 3)
+        bias = bias + np.cumsum(rng.normal(0.0, walk / np.sqrt(rate), shape), axis=0)
+        return np.asarray(bias + rng.normal(0.0, noise * np.sqrt(rate), shape))
+
+    gyro = truth.gyro + error(2e-3, NOISE.gyroscope_walk, NOISE.gyroscope)
+    return Inertial(gyro, truth.accel + error(2e-2, NOISE.accelerometer_walk, NOISE.accelerometer))
+
+
+Layout = Literal["ros1", "ros2", "mcap", "kitti"]
+"""ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
+
+Progress = Callable[[int, int], None]
+
+_MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
+"""Marks of a recording's folder, which may be overwritten."""
+
+
+def record(
+    course: Course,
+    path: Path,
+    *,
+    layout: Layout | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Simulate a course and write its recording, its ground truth and a preview.
+
+    The truth, in the TUM format, and the preview, as PNG and SVG, are named after the recording.
+    All are written whole or not at all.
+
+    Parameters
+    ----------
+    course
+        The course to simulate.
+    path
+        Where to write the recording.
+    layout
+        Format. If not given, the name decides: ``.bag`` is ROS 1, ``.mcap`` a ROS 2 file,
+        anything else a ROS 2 folder.
+    overwrite
+        Whether to replace an existing recording; no other file or folder is replaced.
+    progress
+        Called after every scan with the numbers of finished and of all scans.
+    """
+    # matplotlib takes a second to import.
+
+    path = Path(path)
+    layout = _layout(path) if layout is None else layout
+    stem = path.name if layout in _MARKS else path.stem
+    truth = path.with_name(f"{stem}.tum")
+    previews = as_png_and_svg(path.with_name(f"{stem}.png"))
+    for file in (path, truth, *previews):
+        _check(file, overwrite, _MARKS.get(layout) if file is path else None)
+    drive = Drive(course)
+    if not len(drive):
+        raise SimulationError("the course is over before its first scan is: make it longer")
+    with ExitStack() as stack:
+        temporary_truth = stack.enter_context(replacing(truth))
+        temporary_previews = [stack.enter_context(replacing(preview)) for preview in previews]
+        scans = _watched(drive, picture := Preview(drive), progress)
+        new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
+        if layout == "kitti":
+            _write_kitti(drive, scans, new)
+        elif layout == "mcap":
+            _write_mcap(drive, scans, new)
+        else:
+            # The writer makes the file itself.
+            new.unlink(missing_ok=True)
+            _write_bag(drive, scans, new, 1 if layout == "ros1" else 2)
+        stamps = drive.stamps()
+        write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
+        picture.save(temporary_previews)
+
+
+def _layout(path: Path) -> Layout:
+    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix, "ros2")  # type: ignore[return-value]
+
+
+def _check(path: Path, overwrite: bool, mark: str | None) -> None:
+    """Refuse to replace a recording without `overwrite`, and anything else."""
+    if not path.exists():
+        return
+    if not overwrite:
+        raise SimulationError(f"{path} exists already; give --overwrite to replace it")
+    if path.is_dir() and (mark is None or not (path / mark).exists()):
+        raise SimulationError(f"{path} is a folder, but no recording of this kind: not replaced")
+    if mark is not None and not path.is_dir():
+        raise SimulationError(f"{path} is a file, the recording would be a folder: not replaced")
+
+
+def _watched(
+    drive: Drive, preview: "Preview", progress: Progress | None
+) -> Iterator[SimulatedScan]:
+    for number, scan in enumerate(drive.scans(), start=1):
+        preview.add(scan)
+        yield scan
+        if progress is not None:
+            progress(number, len(drive))
+
+
+class _Composer(Messages):
+    """Makes the ROS messages of a drive."""
+
+    def __init__(self, drive: Drive, version: Literal[1, 2]) -> None:
+        super().__init__(version)
+        self._drive = drive
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Type of each topic."""
+        topics = {POINTS: "sensor_msgs/msg/PointCloud2", POSES: "geometry_msgs/msg/PoseStamped"}
+        if self._drive.course.imu is not None:
+            topics[IMU] = "sensor_msgs/msg/Imu"
+        return topics
+
+    def messages(self, scans: Iterator[SimulatedScan]) -> Iterator[Message]:
+        """All messages in the order in which they are sent: a cloud when its scan is over."""
+        drive = self._drive
+        stamps = drive.stamps()
+        T_world_sensor = drive.ride.poses(drive.seconds(stamps))
+        quaternions = geometry.to_quaternions(T_world_sensor)
+        inertial, inertial_stamps = self._inertial(int(stamps[-1]))
+        sent = 0
+        yield POSES, int(stamps[0]), self._pose(int(stamps[0]), T_world_sensor[0], quaternions[0])
+        for i, scan in enumerate(scans):
+            end = int(stamps[i + 1])
+            while sent < len(inertial_stamps) and inertial_stamps[sent] <= end:
+                stamp = int(inertial_stamps[sent])
+                header = self.header(IMU, stamp, "imu")
+                yield IMU, stamp, self.imu(header, inertial.gyro[sent], inertial.accel[sent])
+                sent += 1
+            yield POSES, end, self._pose(end, T_world_sensor[i + 1], quaternions[i + 1])
+            yield POINTS, end, self._cloud(scan, end)
+
+    def _inertial(self, end: int) -> tuple[Inertial, NDArray[np.int64]]:
+        drive, rate = self._drive, self._drive.course.imu
+        if rate is None:
+            return Inertial(np.empty((0, 3)), np.empty((0, 3))), np.empty(0, np.int64)
+        start = int(drive.stamps()[0])
+        stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
+        return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
+
+    def _pose(self, stamp: int, T: geometry.Poses, quaternion: NDArray[np.float64]) -> Any:
+        t = self.types
+        pose = t["geometry_msgs/msg/Pose"](
+            position=t["geometry_msgs/msg/Point"](*T[:3, 3].tolist()),
+            orientation=t["geometry_msgs/msg/Quaternion"](*quaternion.tolist()),
+        )
+        header = self.header(POSES, stamp, "map")
+        return t["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
+
+    def _cloud(self, scan: SimulatedScan, end: int) -> Any:
+        at_end, cloud = self._drive.course.stamp == "end", structured(scan)
+        if at_end:
+            cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
+        header = self.header(POINTS, end if at_end else scan.stamp, "velodyne")
+        return self.cloud(header, cloud)
+
+
+def _write_bag(
+    drive: Drive,
+    scans: Iterator[SimulatedScan],
+    path: Path,
+    version: Literal[1, 2],
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
+) -> None:
+    composer = _Composer(drive, version)
+    composer.write(path, composer.topics, composer.messages(scans), storage)
+
+
+def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
+        folder = Path(name) / "bag"
+        _write_bag(drive, scans, folder, 2, StoragePlugin.MCAP)
+        (file,) = folder.glob("*.mcap")
+        file.replace(path)
+
+
+def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> None:
+    """Write sequence 00."""
+    T_world_lidar: list[geometry.Poses] = []
+
+    def seen() -> Iterator[Scan]:
+        for scan in scans:
+            T_world_lidar.append(scan.T_world_sensor)
+            yield standing(drive, scan)
+
+    write_kitti_sequence(seen(), folder, T_camera_lidar=T_CAMERA_LIDAR)
+    write_kitti_poses(np.array(T_world_lidar), folder, T_camera_lidar=T_CAMERA_LIDAR)
+
+
+def standing(drive: Drive, scan: SimulatedScan) -> Scan:
+    """A scan as KITTI has it: undistorted to the scan's start, intensities from 0 to 1."""
+    light = scan.intensities / np.float32(255.0)
+    return Scan(scan.stamp, undistort(drive, scan), intensities=light)
+
+
+def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:
+    """Points (n, 3) as if all had been measured at the scan's stamp, by the true motion."""
+    assert scan.times is not None
+    times, column = np.unique(scan.times, return_inverse=True)
+    T_world_column = drive.ride.poses((scan.stamp - drive.stamps()[0]) * 1e-9 + times.astype(float))
+    T = (geometry.invert(scan.T_world_sensor) @ T_world_column)[column]
+    points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
+    return np.asarray(points, np.float32)
+
+
+# A picture of a simulated recording.
+
+
+_MAP_SCANS, _MAP_POINTS = 150, 4000
+"""Number of scans in the map, and points of each."""
+
+
+class Preview:
+    """Collects the content of the picture of a drive scan by scan."""
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+        self._every = max(len(drive) // _MAP_SCANS, 1)
+        self._shown = len(drive) // 2
+        self._count = 0
+        self._map: list[NDArray[np.float64]] = []
+        self._scan: SimulatedScan | None = None
+
+    def add(self, scan: SimulatedScan) -> None:
+        """Add the next scan."""
+        if self._count % self._every == 0 and len(scan):
+            T = scan.T_world_sensor
+            points = scan.points[:: max(len(scan) // _MAP_POINTS, 1)]
+            near = points[np.linalg.norm(points[:, :2], axis=1) < 45.0]
+            # Height above the sensor, in its own upright frame.
+            self._map.append(np.column_stack([near @ T[:2, :3].T + T[:2, 3], near @ T[2, :3]]))
+        if self._count == self._shown:
+            self._scan = scan
+        self._count += 1
+
+    def save(self, files: Iterable[Path]) -> None:
+        """Draw the map with the path, and the middle scan from above and as a panorama.
+
+        Parameters
+        ----------
+        files
+            See `adaptune.report.paper.picture`.
+        """
+        course = self._drive.course
+        with picture(files, 16.0, 9.0) as figure:
+            upper: Any = ["map", "map", "scan"]
+            panels = figure.subplot_mosaic([upper, upper, ["panorama"] * 3])
+            figure.suptitle(
+                f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
+                f"seed {course.seed}: {len(self._drive)} scans, {self._drive.road.length:.0f} m"
+            )
+            self._draw_map(figure, panels["map"])
+            if self._scan is not None and len(self._scan):
+                _draw_scan(figure, panels["scan"], panels["panorama"], self._scan.points)
+
+    def _draw_map(self, figure: Any, axes: Any) -> None:
+        points = np.concatenate(self._map) if self._map else np.empty((0, 3))
+        x, y, z = points[np.argsort(points[:, 2], kind="stable")].T
+        dots = axes.scatter(x, y, c=z, s=0.5, vmin=-1.5, vmax=4.0, **_look())
+        T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
+        axes.plot(T[:, 0, 3], T[:, 1, 3], color="#d55e00", lw=2.0, label="path")
+        axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="the recording from above")
+        label = "height above the sensor [m]"
+        figure.colorbar(dots, ax=axes, label=label, pad=0.01, extend="both")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+
+
+def _look() -> dict[str, Any]:
+    """Dots of a cloud: a picture in an SVG, too, which thousands of shapes would make slow."""
+    return {"linewidths": 0, "cmap": colour_map(), "rasterized": True}
+
+
+def _draw_scan(figure: Any, above: Any, panorama: Any, points: NDArray[np.float32]) -> None:
+    away = np.linalg.norm(points, axis=1)
+    look = _look() | {"c": away, "norm": LogNorm(1.0, 80.0)}
+    above.scatter(points[:, 0], points[:, 1], s=0.6, **look)
+    span = np.percentile(np.abs(points[:, :2]).max(axis=1), 97)
+    above.set(aspect="equal", xlim=(-span, span), ylim=(-span, span))
+    above.set(title="one scan from above", xlabel="x [m]", ylabel="y [m]")
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    elevation = np.degrees(np.arcsin(points[:, 2] / away))
+    dots = panorama.scatter(azimuth, elevation, s=9.0, marker="s", **look)
+    panorama.set(xlim=(180, -180), xlabel="azimuth [deg]", ylabel="elevation [deg]")
+    panorama.set_title("the same scan as the sensor sees it")
+    ticks = {"ticks": [1, 2, 5, 10, 20, 50], "format": plain}
+    bar = figure.colorbar(dots, ax=[above, panorama], label="range [m]", pad=0.01, **ticks)
+    bar.ax.minorticks_off()

@@ -1,0 +1,587 @@
+"""What all samplers share: batches, and no set twice."""
+
+import json
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
+from operator import itemgetter
+from typing import Any, BinaryIO
+
+import numpy as np
+import optuna
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from adaptune import processes
+from adaptune.processes import Message, Readable
+from adaptune.space import (
+    ODOMETRY,
+    Categorical,
+    Float,
+    Integer,
+    ParameterSet,
+    ParameterSpace,
+    PooledSpace,
+)
+from offline.config import OfflineConfig
+from offline.objective import SamplerResult, exceeded, penalised
+from offline.samplers.annealing import AnnealingSampler
+from offline.samplers.settings import (
+    FORGETFUL,
+    SERVICE,
+    AnnealingSettings,
+    Grid,
+    GridSettings,
+    RandomSettings,
+    SamplerError,
+    make_grid,
+    optuna_class,
+    optuna_sampler,
+)
+from offline.storage import distribution
+
+_ENUMERABLE = 4096
+_DRAWS = 1000
+
+
+class Sampler(ABC):
+    """Proposes trials in batches.
+
+    Proposals depend on the seed and on the results of the batches before, and on nothing else: not
+    on the number of trials, nor on who runs them. Trial 0 is the baseline, and no set is proposed
+    twice. Samplers without constraints receive bad values for sets that break limits.
+    """
+
+    constrained = False
+    """Whether the sampler takes constraints."""
+    end = "there is nothing else to try"
+    """Why the search ends when the sampler proposes fewer sets than a batch."""
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        self.space = space
+        self.config = config
+
+    def propose(self, history: Sequence[tuple[Any, ...]]) -> list[ParameterSet]:
+        """Propose the parameter sets of the next batch.
+
+        Parameters
+        ----------
+        history
+            Results of all trials of the batches before, in their order: `SamplerResult`, or tuples
+            of its first values.
+
+        Returns
+        -------
+        list of dict
+            ``config.batch`` parameter sets; fewer where nothing is left to try, which ends the
+            search.
+        """
+        first = len(history)
+        if first % self.config.batch:
+            raise ValueError(f"batches have {self.config.batch} trials; {first} is not a multiple")
+        results = [SamplerResult(*result) for result in history]
+        if not self.constrained:
+            results = penalised(results)
+        return self._propose(range(first, first + self.config.batch), results)
+
+    @abstractmethod
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]: ...
+
+
+class Tried:
+    """Parameter sets that were proposed before."""
+
+    def __init__(self, sets: Iterable[ParameterSet] = ()):
+        self._keys = set(map(key, sets))
+
+    def add(self, parameters: ParameterSet) -> None:
+        """Add a set."""
+        self._keys.add(key(parameters))
+
+    def __contains__(self, parameters: ParameterSet) -> bool:
+        return key(parameters) in self._keys
+
+    def another(self, space: ParameterSpace, rng: np.random.Generator) -> ParameterSet | None:
+        """Draw a set that was not proposed before; None if none is left."""
+        everything = Grid.of(space)
+        if everything is not None and everything.size <= _ENUMERABLE:
+            left = [s for s in map(everything.__getitem__, range(everything.size)) if s not in self]
+            return left[rng.integers(len(left))] if left else None
+        for _ in range(_DRAWS):
+            (drawn,) = space.from_unit(rng.random((1, len(space))))
+            if drawn not in self:
+                return drawn
+        return None
+
+
+def key(parameters: ParameterSet) -> str:
+    """Text that identifies a set: True is not 1."""
+    return repr(sorted(parameters.items()))
+
+
+# Samplers that do not learn: they need only the number of a trial.
+
+
+_SHUFFLED = 1 << 20
+
+
+class PointSampler(Sampler):
+    """Proposes one set for every trial number, or another one if that set was tried before."""
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        tried = Tried(result.parameters for result in history)
+        sets: list[ParameterSet] = []
+        points = [self.space.baseline] if numbers.start == 0 else []
+        points += self._points(range(numbers.start + len(points), numbers.stop))
+        for number, drawn in zip(numbers, points, strict=True):
+            point: ParameterSet | None = drawn
+            if drawn in tried:
+                rng = np.random.default_rng((self.config.seed, number, 1))
+                point = tried.another(self.space, rng)
+            if point is None:
+                break
+            tried.add(point)
+            sets.append(point)
+        return sets
+
+    @abstractmethod
+    def _points(self, numbers: range) -> list[ParameterSet]: ...
+
+
+class SobolSampler(PointSampler):
+    """Points of a scrambled Sobol sequence."""
+
+    def _points(self, numbers: range) -> list[ParameterSet]:
+        return sobol_points(self.space, self.config.seed, numbers)
+
+
+def sobol_points(space: ParameterSpace, seed: int, numbers: range) -> list[ParameterSet]:
+    """Points `numbers` of a scrambled Sobol sequence."""
+    if not numbers:
+        return []
+    sobol = qmc.Sobol(len(space), rng=np.random.default_rng((seed, 0)))
+    if numbers.start:
+        sobol.fast_forward(numbers.start)
+    # One by one: scipy warns if the number of points is not a power of two.
+    return space.from_unit(np.concatenate([sobol.random(1) for _ in numbers]))
+
+
+class RandomSampler(PointSampler):
+    """Uniform in the unit cube, or points of a grid in random order."""
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        axes = RandomSettings.model_validate(config.sampler_settings).grid
+        self._grid = None if axes is None else make_grid(space, axes)
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        if self._grid is None:
+            return super()._propose(numbers, history)
+        order = _shuffled(self._grid.size, self.config.seed, numbers.stop)
+        return _walk(self._grid, order, self.space.baseline, numbers)
+
+    def _points(self, numbers: range) -> list[ParameterSet]:
+        seed, size = self.config.seed, len(self.space)
+        drawn = [np.random.default_rng((seed, n)).random(size) for n in numbers]
+        return self.space.from_unit(np.array(drawn).reshape(len(drawn), size))
+
+
+class GridSampler(Sampler):
+    """Points of a grid in row-major order: the last parameter changes fastest."""
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        axes = GridSettings.model_validate(config.sampler_settings).grid
+        self._grid = make_grid(space, axes)
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:  # noqa: ARG002
+        order = iter(range(min(numbers.stop, self._grid.size)))
+        return _walk(self._grid, order, self.space.baseline, numbers)
+
+
+def _walk(
+    grid: Grid, order: Iterator[int], baseline: ParameterSet, numbers: range
+) -> list[ParameterSet]:
+    """Sets `numbers` of a list: the baseline, then the other points of a grid in their order."""
+    known = grid.index(baseline)
+    rest = islice((i for i in order if i != known), max(numbers.start - 1, 0), numbers.stop - 1)
+    return [baseline] * (numbers.start == 0) + [grid[i] for i in rest]
+
+
+def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
+    """Numbers below `size` in random order, at least `n` of them; `n` does not change the order."""
+    rng = np.random.default_rng((seed, 0))
+    if size <= _SHUFFLED:
+        yield from rng.permutation(size).tolist()
+        return
+    drawn: NDArray[np.int64] = rng.integers(size, size=2 * n + 64)
+    _, at = np.unique(drawn, return_index=True)
+    yield from drawn[np.sort(at)].tolist()
+
+
+# Optuna's samplers, through its ask-and-tell interface.
+
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+CONSTRAINED = (
+    optuna.samplers.TPESampler,
+    optuna.samplers.GPSampler,
+    optuna.samplers.NSGAIISampler,
+    optuna.samplers.NSGAIIISampler,
+)
+"""Samplers that take constraints."""
+_ATTEMPTS = 32
+_ROUNDED = 1e-6
+"""By how much a proposal may exceed its range."""
+
+
+class AskedSampler(Sampler):
+    """Begins with points of a Sobol sequence, and then asks an Optuna sampler.
+
+    Many Optuna samplers keep notes on the trials that they proposed: a generation, a population,
+    the state of their random numbers. A resumed search therefore asks again for the earlier
+    proposals, and answers from the history. Samplers without notes receive the history instead,
+    and begin every batch with a seed of its own; so do those that no longer propose what they did,
+    because sequences were added or removed, or another version is installed. Nothing is kept on
+    disk.
+
+    If the sampler proposes a set that was tried before, it receives the known value at once and is
+    asked again. After many attempts, a random set is taken.
+    """
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        self._distributions = {name: _distribution(p) for name, p in space.parameters.items()}
+        self._forgetful = config.sampler in FORGETFUL
+        self._begin(0, ())
+        self.constrained = isinstance(self._study.sampler, CONSTRAINED)
+
+    def _begin(self, seed: int, history: Sequence[SamplerResult]) -> None:
+        self._study = optuna.create_study(
+            sampler=self._sampler(seed), directions=["minimize"] * len(self.config.objective)
+        )
+        self._study.add_trials(
+            optuna.trial.create_trial(
+                params=self._encode(result.parameters),
+                distributions=self._distributions,
+                values=np.atleast_1d(result.value).tolist(),
+                constraints=_named(result.constraints),
+            )
+            for result in history
+        )
+        self._history = list(history)
+        self._known = {key(result.parameters): result for result in history}
+        self._waiting: dict[str, tuple[ParameterSet, list[Any]]] = {}
+
+    def _sampler(self, batch: int) -> Any:
+        config = self.config
+        if config.sampler == "annealing":
+            settings = AnnealingSettings.model_validate(config.sampler_settings)
+            return AnnealingSampler(settings, n_startup_trials=config.initial, seed=config.seed)
+        all_usual: dict[str, dict[str, Any]] = {
+            "cmaes": {"n_startup_trials": config.initial, "warn_independent_sampling": False},
+            "gp": {"n_startup_trials": 1, "warn_independent_sampling": False},
+            "nsga2": {"population_size": max(config.batch, 2)},
+            "qmc": {"scramble": True, "warn_independent_sampling": False},
+            # The initial points are the start-up; TPE needs no random points of its own.
+            "tpe": {"n_startup_trials": 1},
+        }
+        usual = all_usual.get(config.sampler, {})
+        seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
+        return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        if self._history != list(history[: len(self._history)]):
+            self._begin(0, ())
+        while len(self._history) < numbers.start and not self._forgetful:
+            first = len(self._history)
+            batch = range(first, first + self.config.batch)
+            self._ask(batch)
+            self._answer(history[batch.start : batch.stop])
+        if self._forgetful:
+            self._begin(numbers.start // self.config.batch, history)
+        return self._ask(numbers)
+
+    def _ask(self, numbers: range) -> list[ParameterSet]:
+        """Sets of the next batch; the same sets until they are answered."""
+        if not self._waiting and not self._stalled():
+            tried = Tried(result.parameters for result in self._history)
+            n_initial = self._n_initial(numbers)
+            given = [self.space.baseline] if numbers.start == 0 else []
+            given += sobol_points(
+                self.space, self.config.seed, range(numbers.start + len(given), n_initial)
+            )
+            for number in numbers:
+                first = given[number - numbers.start] if number < n_initial else None
+                if not self._ask_once(number, first, tried):
+                    break
+        return [parameters for parameters, _ in self._waiting.values()]
+
+    def _stalled(self) -> bool:
+        sampler = self._study.sampler
+        if isinstance(sampler, AnnealingSampler) and sampler.stalled(self._study):
+            self.end = "all chains have stalled"
+            return True
+        return False
+
+    def reannealed(self, history: Sequence[tuple[Any, ...]]) -> list[int]:
+        """Which results of a history were followed by reannealing, see `propose`; by their index.
+
+        There are none where the sampler does not anneal.
+        """
+        self.propose(history)
+        sampler, found = self._study.sampler, []
+        heated = sampler.reannealed(self._study) if isinstance(sampler, AnnealingSampler) else []
+        # Sets that were proposed twice have several trials here.
+        seen: set[str] = set()
+        for trial in self._study.get_trials(deepcopy=False):
+            seen.add(key(self._decode(trial.params)))
+            found += [len(seen) - 1] if trial.number in heated else []
+        return found
+
+    def _n_initial(self, numbers: range) -> int:
+        n = 1 if self.config.sampler == "qmc" else self.config.initial
+        return max(numbers.start, min(numbers.stop, n))
+
+    def _ask_once(self, number: int, given: ParameterSet | None, tried: Tried) -> bool:
+        for attempt in range(_ATTEMPTS):
+            if attempt == _ATTEMPTS - 1:
+                rng = np.random.default_rng((self.config.seed, number, 1))
+                given = tried.another(self.space, rng)
+                if given is None:
+                    return False
+            if given is not None:
+                self._study.enqueue_trial(self._encode(given))
+            trial = self._study.ask(self._distributions)
+            parameters, given = given or self._decode(trial.params), None
+            name = key(parameters)
+            if name in self._known:
+                self._tell(trial, self._known[name])
+            elif name in self._waiting:
+                self._waiting[name][1].append(trial)
+            else:
+                self._waiting[name] = (parameters, [trial])
+                tried.add(parameters)
+                return True
+        raise AssertionError
+
+    def _answer(self, results: Sequence[SamplerResult]) -> None:
+        asked = [parameters for parameters, _ in self._waiting.values()]
+        if asked != [result.parameters for result in results]:
+            self._forgetful = True
+            return
+        for (_, trials), result in zip(self._waiting.values(), results, strict=True):
+            for trial in trials:
+                self._tell(trial, result)
+            self._known[key(result.parameters)] = result
+        self._history += results
+        self._waiting = {}
+
+    def _tell(self, trial: optuna.Trial, result: SamplerResult) -> None:
+        for name, by in _named(result.constraints).items():
+            trial.set_constraint(name, by)
+        self._study.tell(trial, result.value)
+
+    # For Optuna, as for Python, the choices 1 and True are equal: it receives their index.
+
+    def _encode(self, parameters: ParameterSet) -> dict[str, Any]:
+        return {
+            name: p.index(parameters[name]) if isinstance(p, Categorical) else parameters[name]
+            for name, p in self.space.parameters.items()
+        }
+
+    def _decode(self, params: dict[str, Any]) -> ParameterSet:
+        decoded: ParameterSet = {}
+        for name, p in self.space.parameters.items():
+            value = params[name]
+            if isinstance(p, Categorical):
+                decoded[name] = p.choices[value]
+                continue
+            inside = min(max(value, p.low), p.high)
+            if not math.isclose(value, inside, rel_tol=_ROUNDED, abs_tol=_ROUNDED):
+                what = f"{self.config.sampler} proposed {value!r} for {name}"
+                raise SamplerError(f"{what}, which is not between {p.low:g} and {p.high:g}")
+            decoded[name] = float(inside) if isinstance(p, Float) else int(inside)
+        return decoded
+
+
+def _named(constraints: Sequence[float]) -> dict[str, float]:
+    return {str(i): by for i, by in enumerate(constraints)}
+
+
+def _distribution(parameter: Float | Integer | Categorical) -> Any:
+    if isinstance(parameter, Categorical):
+        return optuna.distributions.CategoricalDistribution(range(len(parameter.choices)))
+    return distribution(parameter)
+
+
+# Proposals for several odometries: a sampler for each, which share the batches.
+
+
+Make = Callable[[ParameterSpace, OfflineConfig], Sampler]
+"""Makes a sampler for one odometry."""
+
+
+class PooledSampler(Sampler):
+    """A sampler for each odometry, over its own parameters and with the results of its own sets.
+
+    The first trials are the baselines of all odometries. Then the odometries take turns until
+    ``config.initial`` trials. After that each batch is split: an odometry whose best value so far
+    is the k-th best of all gets a share in proportion to 1 / k. It gets one set at least where the
+    batch has enough.
+    """
+
+    space: PooledSpace
+
+    def __init__(self, space: PooledSpace, config: OfflineConfig, make: Make):
+        super().__init__(space, config)
+        n = len(space.spaces)
+        self._n_initial = max(config.initial, n)
+        turns = [len(range(i, self._n_initial, n)) for i in range(n)]
+        of_each = zip(space.spaces.items(), turns, _seeds(config, n), strict=True)
+        self._samplers = {
+            label: make(own, config.model_copy(update={"initial": initial, "seed": seed}))
+            for (label, own), initial, seed in of_each
+        }
+        self.constrained = all(sampler.constrained for sampler in self._samplers.values())
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        of = {label: self._own(label, history) for label in self._samplers}
+        sets: dict[str, list[ParameterSet]] = {label: [] for label in of}
+        able = list(of)
+        while (n := sum(map(len, sets.values()))) < len(numbers) and able:
+            for label, more in self._split(range(numbers.start + n, numbers.stop), of, able):
+                wanted = len(sets[label]) + more
+                # Asked for more, a sampler proposes the same sets first.
+                sets[label] = self._asked(label, wanted, of[label])
+                if len(sets[label]) < wanted:
+                    able.remove(label)
+        return _spread(sets, numbers.start)
+
+    def _asked(self, label: str, n: int, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        """The next `n` sets of one odometry; fewer where nothing else is left."""
+        first = len(history)
+        proposed = self._samplers[label]._propose(range(first, first + n), history)
+        return [{ODOMETRY: label, **own} for own in proposed]
+
+    def _own(self, label: str, history: Sequence[SamplerResult]) -> list[SamplerResult]:
+        """The results of the sets of one odometry, as its sampler takes them."""
+        own = []
+        for result in history:
+            of, parameters = self.space.split(result.parameters)
+            if of == label:
+                own.append(result._replace(parameters=parameters))
+        return own
+
+    def _split(
+        self, numbers: range, of: dict[str, list[SamplerResult]], labels: Sequence[str]
+    ) -> list[tuple[str, int]]:
+        """How many of the next trials each odometry gets; those that get none are left out."""
+        initial = range(numbers.start, max(numbers.start, min(numbers.stop, self._n_initial)))
+        counts = dict.fromkeys(labels, 0)
+        for number in initial:
+            counts[labels[number % len(labels)]] += 1
+        rest = len(numbers) - len(initial)
+        best = {label: _best(of[label]) for label in labels}
+        ranked = sorted(labels, key=lambda label: best[label])
+        shares = 1.0 / np.arange(1, len(ranked) + 1)
+        ideal = rest * shares / shares.sum()
+        whole = np.floor(ideal).astype(int)
+        whole[np.argsort(whole - ideal, kind="stable")[: rest - whole.sum()]] += 1
+        while rest >= len(whole) and not whole.all():
+            # Nobody is given up for a bad beginning.
+            whole[whole.argmax()] -= 1
+            whole[whole.argmin()] += 1
+        for label, n in zip(ranked, whole.tolist(), strict=True):
+            counts[label] += n
+        return [(label, n) for label, n in counts.items() if n]
+
+
+def _best(history: Sequence[SamplerResult]) -> float:
+    """The least first value of a set that keeps the limits."""
+    kept = (result.value for result in history if not exceeded(result.constraints))
+    return min((float(np.atleast_1d(value)[0]) for value in kept), default=np.inf)
+
+
+def _seeds(config: OfflineConfig, n: int) -> list[int]:
+    """A seed for each of `n` odometries."""
+    state = np.random.SeedSequence((config.seed, 1)).generate_state(n)
+    return [int(seed) for seed in state]
+
+
+def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:
+    """The sets of a batch, those of each odometry evenly along it; trial `first` says who begins.
+
+    So the first half of a batch, which a search for a bank takes, has sets of all.
+    """
+    labels = list(sets)
+    order = [*labels[first % len(labels) :], *labels[: first % len(labels)]]
+    placed = [(k / len(sets[label]), own) for label in order for k, own in enumerate(sets[label])]
+    return [own for _, own in sorted(placed, key=itemgetter(0))]
+
+
+# Samplers of the user, in processes of their own, see `adaptune.processes`.
+
+
+class HostedSampler(Sampler):
+    """A sampler of the user; `AskedSampler` asks it in the other process."""
+
+    constrained = True  # the other process sees to constraints
+
+    def __init__(self, space: ParameterSpace, config: Any):
+        super().__init__(space, config)
+        self._process = processes.Hosted(SERVICE, config.sampler, "propose")
+        self._about = {
+            "space": space.dump(),
+            "config": config.model_dump(mode="json", exclude={"storage"}),
+        }
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        try:
+            answer = self._process.ask(self._about | {"history": history})
+        except processes.HostError as error:
+            trials = f"trials {numbers.start} to {numbers.stop - 1}"
+            raise SamplerError(f"offline.sampler, at {trials}: {error}") from error
+        sets: list[ParameterSet] = answer.header["sets"]
+        return sets
+
+
+# What follows runs in the other process.
+
+
+def load(name: str) -> None:
+    """Import a sampler."""
+    optuna_class(name)
+
+
+def make(reader: Readable, writer: BinaryIO, name: str) -> None:
+    """Make a sampler and say how that went."""
+
+    def answer(message: Message) -> dict[str, Any]:
+        optuna_sampler(name, message.header["settings"], message.header["seed"])
+        return {}
+
+    processes.answer_all(reader, writer, answer)
+
+
+def propose(reader: Readable, writer: BinaryIO, _: str) -> None:
+    """Propose one batch after another."""
+    from offline.config import OfflineConfig
+
+    made: dict[str, AskedSampler] = {}
+
+    def answer(message: Message) -> dict[str, Any]:
+        about = message.header
+        key = json.dumps([about["space"], about["config"]])
+        if key not in made:
+            space = ParameterSpace.load(about["space"])
+            made[key] = AskedSampler(space, OfflineConfig.model_validate(about["config"]))
+        history = [
+            SamplerResult(set_, tuple(value) if isinstance(value, list) else value, tuple(by))
+            for set_, value, by in about["history"]
+        ]
+        return {"sets": made[key].propose(history)}
+
+    processes.answer_all(reader, writer, answer)

@@ -1,0 +1,655 @@
+"""Charts of the replays of a sequence: errors, parameters and places."""
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.metrics import travelled
+from adaptune.model import ErrorModel
+from adaptune.report.chart import (
+    Axis,
+    Band,
+    Chart,
+    Charts,
+    Drawn,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shares,
+    Spans,
+    charts_of,
+)
+from adaptune.report.paper import plain
+from adaptune.space import ParameterSpace
+from adaptune.study.study import Study
+from adaptune.trajectory import Trajectory, read_tum
+from online.compare import current_modes
+from online.record import StoredReplay, damaged, read_applied, read_columns
+from online.replay_picture import FEW, Track, drawn_modes
+from online.statistics import ALL, ComparisonRow, Reference, reference_of, seen_from, track_of
+from online.verdict import of_lengths, short_replays
+
+# The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
+
+
+_VERSUS = "vs "
+_LINE, _BELOW = 0.12, 0.3
+"""Height of a mode's line, and by which share of it the ratios on each sequence lie lower."""
+_MOST_NAMED = 6
+"""Sequences that each have a look of their own."""
+
+
+def charts_of_comparison(rows: Sequence[ComparisonRow]) -> Charts:
+    """The chart of a comparison, or why there is none."""
+    chart = comparison_chart([row.columns() for row in rows])
+    return charts_of((chart or "No ratios of errors: no sequence has a reference.",))
+
+
+def comparison_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
+    """Ratios to the yardstick's error, a line for each mode, the least at the top.
+
+    Parameters
+    ----------
+    rows
+        Of ``comparison.json``, see `online.comparison_row.ComparisonRow.columns`.
+    """
+    versus = next((key for key in (rows[0] if rows else {}) if key.startswith(_VERSUS)), "")
+    yardstick = versus.removeprefix(_VERSUS)
+    known = [
+        row
+        for row in rows
+        if row.get(versus) is not None and row["mode"] != yardstick and not row.get("twin")
+    ]
+    if not known:
+        return None
+    # Those over all sequences, or on the only one.
+    last = [row for row in known if row["sequence"] == known[-1]["sequence"]]
+    last.sort(key=lambda row: float(row[versus]), reverse=True)
+    place = {str(row["mode"]): float(i) for i, row in enumerate(last)}
+    of_sequences = [row for row in known if row["sequence"] != ALL and row["mode"] in place]
+    several = last[0]["sequence"] == ALL
+    where = "geometric mean over all sequences" if several else str(last[0]["sequence"])
+    drawn: list[Drawn] = [
+        *_intervals(last),
+        _ratios(last, versus, place, where),
+        Mark(1.0, axis="x"),
+    ]
+    if several:
+        drawn += _of_sequences(of_sequences, versus, place)
+    x = Axis(f"error over that of {yardstick} [-]", log=True)
+    y = Axis("", names=tuple(place))
+    height = 0.3 + _LINE * len(place)
+    return Chart(
+        "comparison",
+        f"Error of each mode over that of {yardstick}, on the test sequences",
+        (Panel(x, y, tuple(drawn), height=height),),
+        f"Left of the dashed line means less error than {yardstick}, right of it more; the least "
+        f"error is at the top. Intervals are shown where the recordings are long enough, or many "
+        f"enough." + (" Below each mean are the ratios on each sequence." if several else ""),
+    )
+
+
+def _intervals(rows: Sequence[Mapping[str, Any]]) -> list[Drawn]:
+    """The intervals of rows, one below the other, where there are some."""
+    ends = [
+        (row["ratio_low"], row["ratio_high"], i)
+        for i, row in enumerate(rows)
+        if row.get("ratio_low") is not None and row.get("ratio_high") is not None
+    ]
+    x = [value for low, high, _ in ends for value in (low, high, np.nan)]
+    y = [float(i) for *_, i in ends for _ in range(3)]
+    return [Line(x, y, "95 % interval")] if ends else []
+
+
+def _ratios(
+    rows: Sequence[Mapping[str, Any]],
+    versus: str,
+    place: Mapping[str, float],
+    name: str,
+    shift: float = 0.0,
+    **look: Any,
+) -> Points:
+    """Ratios of some rows, each on the line of its mode, or a share of a line below it."""
+    x = [float(row[versus]) for row in rows]
+    y = [place[str(row["mode"])] - shift for row in rows]
+    texts = [f"{row['mode']}, {row['sequence']}" for row in rows]
+    return Points(x, y, name, texts=texts, **look)
+
+
+def _of_sequences(
+    rows: Sequence[Mapping[str, Any]], versus: str, place: Mapping[str, float]
+) -> list[Drawn]:
+    """The ratios on each sequence; of many they have the same look."""
+    names = list(dict.fromkeys(str(row["sequence"]) for row in rows))
+    if len(names) > _MOST_NAMED:
+        return [_ratios(rows, versus, place, "each sequence", _BELOW, faint=True, marker="o")]
+    return [
+        _ratios([row for row in rows if row["sequence"] == name], versus, place, name, _BELOW)
+        for name in names
+    ]
+
+
+# Where on a recording of a simulated course which scene is.
+
+
+def scene_spans(
+    legs: Sequence[tuple[str, float]], driven: Trajectory, stamps: NDArray[np.int64]
+) -> Spans:
+    """The scenes of a drive, as stretches of its time.
+
+    Metres of the road become time by the path that was driven. It is a little longer than the road,
+    because the vehicle strays and shakes: it is scaled to the road's length.
+
+    Parameters
+    ----------
+    legs
+        Name and metres of each scene, in driving order.
+    driven
+        True poses of the whole drive.
+    stamps
+        Of the scans that are shown, nanoseconds: they may be a part of the drive. Edges are seconds
+        since the first of them.
+    """
+    along = travelled(driven.T_world_sensor)
+    names, metres = zip(*legs, strict=True)
+    ends = np.cumsum([0.0, *metres])
+    path = along / max(float(along[-1]), 1e-9) * ends[-1]
+    seconds = (driven.stamps - stamps[0]) * 1e-9
+    edges = np.interp(ends, path, seconds)
+    edges[-1] = max(edges[-1], seconds[-1])
+    begin, end = 0.0, float(stamps[-1] - stamps[0]) * 1e-9
+    shown = [i for i in range(len(names)) if edges[i] < end and edges[i + 1] > begin]
+    kept = np.clip(edges[[*shown, shown[-1] + 1]], begin, end)
+    return Spans(kept, tuple(names[i] for i in shown))
+
+
+# The replays of a sequence in all modes that there are, as charts need them.
+
+
+class ModeReplay(NamedTuple):
+    """A replay in one mode, with what was measured on the way."""
+
+    track: Track
+    places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
+    familiarity: NDArray[np.float64]  # (m,): of each selection, see `Selection`; NaN if unknown
+    selection_ms: NDArray[np.float64]  # (m,): that it took; empty where none was made
+    scan_ms: NDArray[np.float64]  # (n,): to prepare and register a scan
+    late_ms: NDArray[np.float64]  # (n,): from a scan to its pose, in real time; empty otherwise
+
+    def selection_at(self) -> NDArray[np.intp]:
+        """Number of the selection that holds at each frame, of shape (n,)."""
+        after = np.searchsorted(self.track.choice_seconds, self.track.seconds, side="right")
+        return np.maximum(after - 1, 0)
+
+    @property
+    def adapts(self) -> bool:
+        """Whether anything was selected along the way."""
+        return len(self.track.choice_seconds) > 1
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedSequence:
+    """The replays of a sequence."""
+
+    name: str
+    length: float  # metres of a sub-trajectory
+    modes: Mapping[str, ModeReplay]  # in the order in which lines lie on each other
+    space: ParameterSpace
+    scenes: Spans | None = None  # of a simulated course
+    estimated: bool = False  # whether the reference was computed from the recording
+    refused: Sequence[str] = ()  # sentences about replays that are not among them
+
+
+def read_replays(study: Study, name: str) -> ReplayedSequence:
+    """Read the replays of a sequence that are finished and drawn; there may be none.
+
+    Those that `compare` refuses are not, see `online.stale_replays.current_modes`, and neither are
+    those that are too short. Of many modes on demand, none is drawn, see
+    `online.replay_picture.drawn_modes`.
+
+    Raises
+    ------
+    AdaptuneError
+        If a file is damaged, or if `compare` refuses all of them.
+    """
+    folder = study.folder / "replays" / name
+    space, reference = study.odometry.space, reference_of(study, name)
+    model = None
+    # Of a single odometry, numbers name the members of a bank.
+    if len(space.baselines) > 1 and study.model_path.exists():
+        model = ErrorModel.load(study.model_path)
+    current = current_modes(study, name)
+    drawn = drawn_modes(current.modes)
+    replays = {mode: StoredReplay.read(folder / mode) for mode in drawn}
+    replays, short = _whole(name, replays)
+    modes = {
+        mode: _read_mode(folder / mode, replay, reference, model)
+        for mode, replay in replays.items()
+    }
+    scenes = None
+    if replays:
+        scenes = scenes_along(study, name, next(iter(replays.values())).trajectory.stamps)
+    return ReplayedSequence(
+        name,
+        study.config.sub_trajectory,
+        modes,
+        space,
+        scenes,
+        reference.estimated,
+        [*current.refused, *short, *_undrawn(name, [m for m in current.modes if m not in drawn])],
+    )
+
+
+def _undrawn(name: str, modes: Sequence[str]) -> list[str]:
+    """A sentence about modes that are left out so that charts can be read, if there are some."""
+    listed = ", ".join(f"`{mode}`" for mode in modes)
+    why = f"nobody could read charts of more than {FEW} modes on demand"
+    return [f"No lines of {listed} along {name}: {why}."] if modes else []
+
+
+def _whole(
+    name: str, replays: Mapping[str, StoredReplay]
+) -> tuple[dict[str, StoredReplay], list[str]]:
+    """The replays of a sequence that are not too short, and a sentence about the others."""
+    # In real time, the scans that are dropped tell something.
+    scans = {
+        mode: len(replay.trajectory)
+        for mode, replay in replays.items()
+        if replay.summary.about.real_time is None
+    }
+    short = short_replays(scans)
+    whole = {mode: replay for mode, replay in replays.items() if mode not in short}
+    return whole, [of_lengths(name, scans, short)] if short else []
+
+
+def scenes_along(study: Study, name: str, stamps: NDArray[np.int64]) -> Spans | None:
+    """The scenes of a simulated course at scans of these stamps; None of another recording."""
+    course = study.config.courses.get(name)
+    if course is None:
+        return None
+    path = study.sequences.recording(name).with_suffix(".tum")
+    return scene_spans(course.legs, read_tum(path), stamps) if path.exists() else None
+
+
+def _read_mode(
+    folder: Path, replay: StoredReplay, reference: Reference, model: ErrorModel | None
+) -> ModeReplay:
+    track = track_of(replay, reference, model)
+    applied, frames = read_applied(folder / "selections.csv"), read_columns(folder / "frames.csv")
+    try:
+        familiarity = _numbers(applied.get("familiarity", []))
+        selection_ms = _numbers(applied.get("ms", []))
+        scan_ms = _numbers(frames["prepare_ms"]) + _numbers(frames["register_ms"])
+        late_ms = _numbers(frames.get("late_ms", []))
+    except (KeyError, ValueError) as error:
+        raise damaged(folder, error) from error
+    if not len(familiarity):
+        familiarity = np.full(len(track.choice_seconds), np.nan)
+    places = track.xy
+    if reference.trajectory is not None:
+        stamps = replay.trajectory.stamps
+        known = np.flatnonzero(np.isin(stamps, reference.trajectory.stamps))
+        if len(known):
+            seen = seen_from(reference.trajectory)
+            places = np.full((len(stamps), 2), np.nan)
+            places[known] = seen[np.searchsorted(reference.trajectory.stamps, stamps[known])]
+    return ModeReplay(track, places, familiarity, selection_ms, scan_ms, late_ms)
+
+
+def _numbers(texts: Collection[str]) -> NDArray[np.float64]:
+    return np.array([float(text or "nan") for text in texts])
+
+
+# Charts of selections: how familiar the surroundings were, and how long all took.
+
+
+_BINS = 40
+_RATIO = "error over the fixed set's [-]"
+
+
+def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
+    """Familiarity of the surroundings at each selection, over time and against the gain."""
+    known = {mode: of for mode, of in replayed.modes.items() if np.isfinite(of.familiarity).any()}
+    if not known:
+        return None
+    drawn: list[Drawn] = [] if replayed.scenes is None else [replayed.scenes]
+    drawn += [Line(of.track.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
+    y = Axis("familiarity [-]", limits=(0.0, 1.02))
+    panels = [Panel(Axis("time [s]"), y, tuple(drawn))]
+    fixed = replayed.modes.get("fixed")
+    if fixed is not None:
+        ratios = {m: period_ratios(of, fixed) for m, of in known.items() if m != "fixed"}
+        points = tuple(
+            Points(known[mode].familiarity, of, mode)
+            for mode, of in ratios.items()
+            if np.isfinite(of).any()
+        )
+        if points:
+            x = Axis("familiarity [-]", limits=(0.0, 1.02))
+            panels.append(Panel(x, Axis(_RATIO, log=True), (*points, Mark(1.0))))
+    return Chart(
+        f"{replayed.name}-familiarity",
+        f"{replayed.name}: how familiar the surroundings were",
+        tuple(panels),
+        "How much the training knows about surroundings like those at each selection: 0 means "
+        "unlike all training. Below, the error until the next selection over the fixed set's on "
+        "the same scans: a mode that loses where familiarity is low should not trust its training "
+        "there.",
+    )
+
+
+def period_ratios(of: ModeReplay, fixed: ModeReplay) -> NDArray[np.float64]:
+    """Mean error from each selection to the next over that of the fixed set, of shape (m,).
+
+    NaN where either is unknown.
+    """
+    edges = of.track.span
+
+    def means(one: ModeReplay) -> NDArray[np.float64]:
+        kept = np.isfinite(one.track.errors)
+        seconds, errors = one.track.seconds[kept], one.track.errors[kept]
+        number = np.searchsorted(edges, seconds, side="right") - 1
+        number = np.clip(number, 0, len(edges) - 2)
+        counts = np.bincount(number, minlength=len(edges) - 1)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.bincount(number, errors, len(edges) - 1) / counts)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(means(of) / means(fixed))
+
+
+def latency_chart(replayed: ReplayedSequence) -> Chart | None:
+    """How long selections and scans took in each mode, as histograms."""
+    period = _scan_period(replayed.modes)
+    kinds: dict[str, Callable[[ModeReplay], NDArray[np.float64]]] = {
+        "to select": lambda of: of.selection_ms,
+        "to prepare and register a scan": lambda of: of.scan_ms,
+        "from a scan to its pose, in real time": lambda of: of.late_ms,
+    }
+    panels = []
+    for what, get in kinds.items():
+        times = {mode: ms for mode, of in replayed.modes.items() if (ms := _positive(get(of))).size}
+        if not times:
+            continue
+        selects = what == "to select"
+        marks = () if selects else (Mark(period, "scan period", "x"),)
+        panels.append(
+            Panel(
+                Axis(f"time {what} [ms]", log=True),
+                Axis(f"share of the {'selections' if selects else 'scans'} [%]"),
+                (*histograms(times), *marks),
+            )
+        )
+    if not panels:
+        return None
+    return Chart(
+        f"{replayed.name}-latency",
+        f"{replayed.name}: how long it took",
+        tuple(panels),
+        "Histograms with bins of equal width on the logarithmic axis. What lies right of the scan "
+        "period takes longer than there is until the next scan.",
+    )
+
+
+def _positive(ms: NDArray[np.float64]) -> NDArray[np.float64]:
+    return ms[np.isfinite(ms) & (ms > 0.0)]
+
+
+def _scan_period(modes: Mapping[str, ModeReplay]) -> float:
+    """Milliseconds from scan to scan."""
+    seconds = next(iter(modes.values())).track.seconds
+    return 1e3 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else np.nan
+
+
+def histograms(times: Mapping[str, NDArray[np.float64]]) -> list[Line]:
+    """Share of each mode's times in bins that all modes have, in percent, as steps.
+
+    Parameters
+    ----------
+    times
+        By mode, positive numbers.
+    """
+    every = np.concatenate(list(times.values()))
+    edges = np.geomspace(0.99 * every.min(), 1.01 * every.max(), _BINS + 1)
+    made = []
+    for mode, ms in times.items():
+        shares = 100.0 * np.histogram(ms, edges)[0] / len(ms)
+        made.append(Line(edges, [*shares, 0.0], mode, steps=True))
+    return made
+
+
+TIME = Axis("time [s]")
+_MOST_PLACES = 200
+"""Points of a map; more would hide each other."""
+_MOST_MAPS = 12
+_SLENDER, _LOW = 0.2, 0.35
+"""A course whose height from above is a smaller share of its width has low panels."""
+_RESTARTED = "restarted by the health check"
+
+
+def charts_of_replays(study: Study, sequence: str) -> Charts:
+    """Charts of the replays of a sequence, in all modes that there are, and what is missing.
+
+    Raises
+    ------
+    AdaptuneError
+        If a file of a replay is damaged, or all are of something else than the study.
+    """
+    replayed = read_replays(study, sequence)
+    if not replayed.modes:
+        none = [f"No replays of {sequence}: run `adaptune online`."]
+        return Charts([], [*replayed.refused] or none)
+    whose = "mode whose replay can be read" if replayed.refused else "mode"
+    return charts_of(
+        (
+            *replayed.refused,
+            error_chart(replayed)
+            or f"No errors of the replays of {sequence}: it has no reference.",
+            choice_chart(replayed),
+            map_chart(replayed)
+            or f"No map of what was selected on {sequence}: no {whose} has changed anything.",
+            familiarity_chart(replayed),
+            latency_chart(replayed),
+        )
+    )
+
+
+def error_chart(replayed: ReplayedSequence) -> Chart | None:
+    """Error of every mode over time, with its switches; and what modes have measured themselves."""
+    panels = []
+    if any(np.isfinite(of.track.errors).any() for of in replayed.modes.values()):
+        panels.append(_errors(replayed))
+    for mode, of in replayed.modes.items():
+        if np.isfinite(of.track.estimated[:, 0]).any() or of.track.lost.any():
+            panels.append(_estimates(mode, of.track, replayed))
+    if not panels:
+        return None
+    measured = (
+        " Below, what a mode measured of its own error while it drove, without the reference: it "
+        "should follow the line of the true error, and the interval should hold it."
+        if len(panels) > 1
+        else ""
+    )
+    return Chart(
+        f"{replayed.name}-errors",
+        f"{replayed.name}: error over time",
+        tuple(panels),
+        f"Error of the sub-trajectory of {replayed.length:g} m that begins at each scan. Markers "
+        f"on a line are switches of its parameters.{measured}",
+        shared_x=True,
+    )
+
+
+def _errors(replayed: ReplayedSequence) -> Panel:
+    drawn: list[Drawn] = _scenes(replayed)
+    for mode, (track, *_) in replayed.modes.items():
+        drawn.append(Line(track.seconds, track.errors, mode))
+        at = np.searchsorted(track.seconds, switches(track))
+        at = at[at < len(track.seconds)]
+        if len(at):
+            drawn.append(Points(track.seconds[at], track.errors[at], mode))
+    for mode, (track, *_) in replayed.modes.items():
+        if restarts := track.restarts:
+            x, y = track.seconds[restarts], track.errors[restarts]
+            texts = [f"{mode}, {seconds:.1f} s" for seconds in x]
+            drawn.append(Points(x, y, _RESTARTED, texts=texts, marker="v"))
+    axis = Axis(f"RTE over the next {replayed.length:g} m [%]", log=True)
+    return Panel(TIME, axis, tuple(drawn), height=1.6)
+
+
+def switches(track: Track) -> NDArray[np.float64]:
+    """Seconds of the selections that changed a parameter; none of a bank, which changes weights."""
+    if track.weights or len(track.choice_seconds) < 2:
+        return np.empty(0)
+    rows = list(zip(*track.choices.values(), strict=True))
+    # As texts, because NaN does not equal itself.
+    changed = [i for i in range(1, len(rows)) if repr(rows[i]) != repr(rows[i - 1])]
+    return track.choice_seconds[changed]
+
+
+def _estimates(mode: str, track: Track, replayed: ReplayedSequence) -> Panel:
+    seconds, (estimated, low, high) = track.choice_seconds, track.estimated.T
+    drawn: list[Drawn] = []
+    if spans := track.lost_spans:
+        # Between two stretches in which it was lost lies one without a name.
+        edges = [edge for span in spans for edge in span]
+        names = [name for _ in spans for name in ("lost", "")][:-1]
+        drawn.append(Spans(edges, tuple(names), "lost"))
+    if np.isfinite(track.errors_behind).any():
+        judge = "by the estimated reference" if replayed.estimated else "true"
+        drawn.append(Line(track.seconds, track.errors_behind, judge))
+    drawn += [
+        Band(seconds, low, high, "95 % interval"),
+        Line(seconds, estimated, "measured while driving"),
+    ]
+    y = Axis(f"RTE over {replayed.length:g} m, last 30 s [%]", log=True)
+    return Panel(TIME, y, tuple(drawn), f"{mode}: its error as measured while driving")
+
+
+def choice_chart(replayed: ReplayedSequence) -> Chart | None:
+    """What every mode applied along the course: its parameters, or the weights of its bank."""
+    panels = [*_parameters(replayed), *_weights(replayed)]
+    if not panels:
+        return None
+    return Chart(
+        f"{replayed.name}-choices",
+        f"{replayed.name}: what was applied along the course",
+        tuple(panels),
+        "Parameters of each mode over time; of a bank, the shares of its members in the weighted "
+        "mean, the fixed set's first (without a model, the baseline's). Names above are the scenes "
+        "of the course, if it is a simulated one: what is applied should change with them.",
+        shared_x=True,
+    )
+
+
+def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
+    single = {mode: of.track for mode, of in replayed.modes.items() if not of.track.weights}
+    for name in dict.fromkeys(name for track in single.values() for name in track.choices):
+        chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
+        names = _names(v for values in chosen.values() for v in values)
+        drawn = _scenes(replayed)
+        for mode, values in chosen.items():
+            y = [_place(value, names) for value in values]
+            drawn.append(Line(single[mode].span, [*y, y[-1]], mode, steps=True))
+        log = name in replayed.space.logarithmic and names is None
+        axis = Axis(replayed.space.labels[name], log=log, names=names)
+        yield Panel(TIME, axis, tuple(drawn), name)
+
+
+def _names(values: Iterator[Any]) -> tuple[str, ...] | None:
+    """The names on an axis of these values; None if all are numbers."""
+    every = list(values)
+    if not any(isinstance(value, str) for value in every):
+        return None
+    return tuple(sorted({_name(value) for value in every} - {""}))
+
+
+def _name(value: Any) -> str:
+    """A value among names; the set of another odometry has none."""
+    return value if isinstance(value, str) else "" if np.isnan(value) else plain(value)
+
+
+def _place(value: Any, names: tuple[str, ...] | None) -> float:
+    if names is None:
+        return float(value)
+    return float(names.index(name)) if (name := _name(value)) else np.nan
+
+
+def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
+    for mode, (track, *_) in replayed.modes.items():
+        shares = 100.0 * np.array(list(track.weights.values()))
+        if not _changes(shares):
+            continue
+        shares = np.column_stack([shares, shares[:, -1]])
+        drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)))
+        y = Axis("weight [%]", limits=(0.0, 100.0))
+        yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
+
+
+def _changes(weights: NDArray[np.float64]) -> bool:
+    """Whether weights, of shape (n_members, m), change along the course."""
+    return bool(len(weights) > 1 and np.ptp(weights, axis=1).max() > 0.0)
+
+
+def _scenes(replayed: ReplayedSequence) -> list[Drawn]:
+    return [] if replayed.scenes is None else [replayed.scenes]
+
+
+def map_chart(replayed: ReplayedSequence) -> Chart | None:
+    """The course from above, coloured by what each mode applied there."""
+    panels = [
+        panel
+        for mode, of in replayed.modes.items()
+        if of.adapts and np.isfinite(of.places).all(axis=1).any()
+        for panel in _maps(mode, of, replayed)
+    ]
+    if not panels:
+        return None
+    return Chart(
+        f"{replayed.name}-map",
+        f"{replayed.name}: what was applied where, from above",
+        tuple(panels[:_MOST_MAPS]),
+        "Each point is a scan where the sensor was, seen from its first pose; its colour is what "
+        "was applied there. Of a bank, it is the share of the heaviest member other than its first "
+        "one, which is the fixed set, or without a model the baseline. Places that look alike "
+        "should have the same colour.",
+        # A course that leads straight ahead needs the whole width, and no height.
+        columns=1 if panels[0].height < 1.0 else min(2, len(panels)),
+    )
+
+
+def _maps(mode: str, of: ModeReplay, replayed: ReplayedSequence) -> Iterator[Panel]:
+    if of.track.weights:
+        weights = 100.0 * np.array(list(of.track.weights.values()))
+        if _changes(weights):
+            title = f"{mode}: heaviest other member"
+            yield _map(of, weights[1:].max(axis=0), "weight [%]", title)
+        return
+    for name, values in of.track.choices.items():
+        if any(isinstance(v, str) for v in values) or len(set(map(repr, values))) < 2:
+            continue
+        chosen = np.array(values, float)
+        label, log = replayed.space.labels[name], name in replayed.space.logarithmic
+        yield _map(of, chosen, label, f"{mode}: {name}", log)
+
+
+def _map(
+    of: ModeReplay, chosen: NDArray[np.float64], label: str, title: str, log: bool = False
+) -> Panel:
+    """A panel with what was chosen at each selection, of shape (m,), at some of the scans."""
+    known = np.flatnonzero(np.isfinite(of.places).all(axis=1))
+    some = known[np.unique(np.linspace(0, len(known) - 1, _MOST_PLACES).astype(int))]
+    x, y = of.places[some].T
+    texts = [f"{seconds:.1f} s" for seconds in of.track.seconds[some]]
+    drawn = (
+        Points(x, y, "", chosen[of.selection_at()][some], label, log, texts),
+        Points(x[:1], y[:1], "start", marker="P"),
+    )
+    wide, high = (float(np.ptp(of.places[known][:, axis])) + 1.0 for axis in (0, 1))
+    height = _LOW if high < _SLENDER * wide else 1.0
+    return Panel(Axis("x [m]"), Axis("y [m]"), drawn, title, equal=True, height=height)

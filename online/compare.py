@@ -1,0 +1,671 @@
+"""The comparison of baseline, fixed and adaptive on the replayed sequences."""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means, worst_tenth
+from adaptune.model import ErrorModel
+from adaptune.report import tables as report
+from adaptune.report.paper import LINES
+from adaptune.study.config import ALSO
+from adaptune.study.inputs import check_model, read_oracle
+from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, PER_STRETCH, RIVALS, Study
+from online.modes import BASELINE, UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
+from online.record import (
+    ReplaySummary,
+    StoredReplay,
+    StoredReplayError,
+    check_reference,
+    read_repeats,
+)
+from online.replay_picture import draw_replays, drawn_modes
+from online.run import shared_identity
+from online.statistics import (
+    ALL,
+    ERROR_FACTOR,
+    NO_DIFFERENCE,
+    ORACLES,
+    ComparisonRow,
+    JudgedModes,
+    Ratio,
+    Repeats,
+    StandardErrors,
+    allowing_for,
+    compare_modes,
+    mean_of,
+    oracle_rows,
+    reference_of,
+    seen_from,
+    track_of,
+)
+from online.tables import tables
+from online.verdict import CONTROLS, remarks
+
+# Which replays are compared: the modes that were replayed on every sequence.
+
+
+class ComparedModes(NamedTuple):
+    """What is compared."""
+
+    sequences: tuple[str, ...]
+    modes: tuple[str, ...]  # replayed on all of them, in the order of `LINES`
+    twins: Mapping[str, str]  # by mode that is not replayed itself, the one whose replay it has
+    # By mode that somebody may expect, the sequences on which it was not replayed.
+    missing: Mapping[str, Sequence[str]]
+    unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
+
+    def words(self, study: Study) -> list[str]:
+        """Sentences about what is not shown because another mode is the same, or is missing."""
+        said = [
+            f"`{mode}` is what `{twin}` drives here: it has the same numbers, shown once."
+            for mode, twin in self.twins.items()
+        ]
+        if self.unfinished:
+            there = [m for m in self.modes if m not in ALSO or self.modes == WITHOUT_MODEL]
+            lacking = (
+                f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(study, name, m))})"
+                for name in self.unfinished
+            )
+            command = replayed_by(study, UNTRAINED if self.modes == WITHOUT_MODEL else "fixed")
+            said.append(
+                f"Not compared, because replays are missing: {', '.join(lacking)}; "
+                f"{command} makes them."
+            )
+        where: dict[tuple[str, ...], list[str]] = {}
+        for mode, names in self.missing.items():
+            where.setdefault(tuple(names), []).append(mode)
+        for names, modes in where.items():
+            are = "are" if len(modes) > 1 else "is"
+            each = " and ".join(f"`{mode}`" for mode in modes)
+            on = "any sequence" if names == self.sequences else " and ".join(names)
+            command = " or ".join(dict.fromkeys(replayed_by(study, mode) for mode in modes))
+            said.append(
+                f"{each} {are} not compared: there is no replay on {on}; {command} makes what "
+                f"is missing."
+            )
+        return said
+
+
+def replayed_by(study: Study, mode: str) -> str:
+    """The command that replays a mode, as `adaptune online --thorough`."""
+    on_demand = mode in ALSO and mode not in study.config.online.also
+    option = "--untrained" if mode == UNTRAINED else "--thorough"
+    return f"`adaptune online{f' {option}' if on_demand else ''}`"
+
+
+def compared_modes(study: Study) -> ComparedModes:
+    """Find what was replayed on all test sequences, or without a model.
+
+    Raises
+    ------
+    StoredReplayError
+        If the fixed set was replayed on none of them, and baseline and untrained bank not on all.
+    """
+    setup = ReplaySetup.of(study)
+    names, without_model = study.config.test, sequences_without_model(study)
+    of_model = [mode for mode in LINES if mode not in WITHOUT_MODEL]
+    if not _any(study, names, of_model) and _any(study, without_model, [UNTRAINED]):
+        made, unfinished = _finished(study, without_model, WITHOUT_MODEL)
+        if made:
+            return ComparedModes(made, WITHOUT_MODEL, {}, {}, unfinished)
+    if not names:
+        raise StoredReplayError("test: name at least one sequence to compare on")
+    unfixed = [name for name in names if not _is_there(study, name, "fixed")]
+    if len(unfixed) == len(names):
+        if all(_is_there(study, name, m) for name in names for m in WITHOUT_MODEL):
+            return ComparedModes(names, WITHOUT_MODEL, {}, {"fixed": unfixed})
+        ReplaySummary.read(_folder(study, names[0], "fixed"))
+    names, unfinished = _finished(study, names, ("fixed", BASELINE, *setup.rules))
+    model = _model(study, names[0])
+    also = _on_demand(study, setup, model)
+    twins = {} if model is None else {m: setup.twin(m, model) for m in also}
+    twins = {mode: twin for mode, twin in twins.items() if twin != mode}
+    there = {
+        mode: [name for name in names if _is_there(study, name, mode)]
+        for mode in LINES
+        if mode in (BASELINE, *RIVALS, "fixed", *setup.rules, *also) and mode not in twins
+    }
+    expected = (BASELINE, *setup.rules, *also)
+    return ComparedModes(
+        names,
+        tuple(mode for mode, on in there.items() if len(on) == len(names)),
+        {mode: twin for mode, twin in twins.items() if len(there.get(twin, [])) == len(names)},
+        {
+            mode: [name for name in names if name not in on]
+            for mode, on in there.items()
+            if len(on) < len(names) and mode in expected
+        },
+        unfinished,
+    )
+
+
+def _finished(
+    study: Study, names: Sequence[str], modes: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Sequences that were replayed in all modes that any was, and those that were not yet."""
+    made = [mode for mode in modes if _any(study, names, [mode])]
+    finished = tuple(n for n in names if all(_is_there(study, n, mode) for mode in made))
+    if not finished:  # no mode is everywhere: those with the fixed set are compared
+        finished = tuple(n for n in names if _is_there(study, n, "fixed"))
+    return finished, tuple(name for name in names if name not in finished)
+
+
+def _on_demand(study: Study, setup: ReplaySetup, model: ErrorModel | None) -> list[str]:
+    """The modes on demand that were asked for or replayed, and those that are another's replay."""
+    names, asked = study.config.test, study.config.online.also
+    found: list[str] = [mode for mode in ALSO if mode in asked or _any(study, names, [mode])]
+    if model is None:
+        return found
+    if any(mode != UNTRAINED for mode in found):
+        found += [mode for mode in ALSO if mode not in found and setup.twin(mode, model) != mode]
+    return [mode for mode in found if not setup.obstacle(mode, model)]
+
+
+def _model(study: Study, name: str) -> ErrorModel | None:
+    """The model of the replays of a sequence; None if its file is gone, or they need none."""
+    there = (mode for mode in LINES if _is_there(study, name, mode))
+    summaries = (ReplaySummary.read(_folder(study, name, mode)) for mode in there)
+    files = [s.model_file for s in summaries if s.model_file and s.about.model]
+    path = Path(files[0]) if files else study.model_path
+    return ErrorModel.load(path) if path.exists() else None
+
+
+def _any(study: Study, names: Iterable[str], modes: Sequence[str]) -> bool:
+    return any(_is_there(study, name, mode) for name in names for mode in modes)
+
+
+def _is_there(study: Study, name: str, mode: str) -> bool:
+    return (_folder(study, name, mode) / "replay.json").exists()
+
+
+def _folder(study: Study, name: str, mode: str) -> Path:
+    return study.folder / "replays" / name / mode
+
+
+# The comparison over all sequences.
+
+
+SEED = 0
+"""Of the resampling."""
+LEAST_STRETCHES = 10
+"""With fewer, there is no worst tenth."""
+
+
+def pooled(
+    judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow] = ()
+) -> list[ComparisonRow]:
+    """For every mode the mean errors over all sequences, and the geometric mean of the ratios.
+
+    Parameters
+    ----------
+    judged
+        The sequences; those without a reference do not count.
+    oracles
+        Rows of the best set in hindsight, where it is known.
+    """
+    known = [one for one in judged if one.rows[0].rte is not None]
+    modes = [row.mode for row in known[0].rows]
+    made = [_pooled(mode, known) for mode in modes]
+    in_hindsight = [
+        _mean_row(mode, rows)
+        for mode in ORACLES
+        if len(rows := [row for row in oracles if row.mode == mode]) == len(known)
+    ]
+    return [*with_gaps(made, in_hindsight), *in_hindsight]
+
+
+def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
+    rows = [row for one in judged for row in one.rows if row.mode == mode]
+    recordings = len({one.recording or one.name for one in judged})
+    row = replace(_mean_row(mode, rows), recordings=recordings)
+    if mode == row.yardstick:
+        return row
+    ends = [row.ratio_interval for row in rows if row.ratio_interval is not None]
+    logs = _of_stretches(judged, mode)
+    enough = len(logs) >= LEAST_STRETCHES
+    return replace(
+        row,
+        ratio_interval=ratio_to(judged, mode).interval,
+        worst_tenth=float(np.exp(worst_tenth(logs))) if enough else None,
+        stretches=len(logs),
+        better=sum(row.ratio < 1.0 - NO_DIFFERENCE for row in rows if row.ratio is not None),
+        worse=sum(row.ratio > 1.0 + NO_DIFFERENCE for row in rows if row.ratio is not None),
+        surely_better=sum(high < 1.0 for _, high in ends) if ends else None,
+        surely_worse=sum(low > 1.0 for low, _ in ends) if ends else None,
+    )
+
+
+def _mean_row(mode: str, rows: Sequence[ComparisonRow]) -> ComparisonRow:
+    """Means of what was measured, and sums of what was counted."""
+    ratios = [row.ratio for row in rows if row.ratio is not None]
+    return ComparisonRow(
+        ALL,
+        mode,
+        mean_of([row.rte for row in rows]),
+        float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12))))),
+        sum(row.restarts for row in rows),
+        sum(row.switches for row in rows),
+        sum(row.poor_scans for row in rows),
+        standard=StandardErrors.pooled([row.standard for row in rows if row.standard]),
+        yardstick=rows[0].yardstick,
+        estimated=mean_of([row.estimated for row in rows]),
+        lost_seconds=sum(row.lost_seconds for row in rows),
+        reference=" and ".join(sorted({row.reference for row in rows})),
+        cpu_ms=mean_of([row.cpu_ms for row in rows]),
+        cores=mean_of([row.cores for row in rows]),
+        memory_mb=max((m for row in rows if (m := row.memory_mb) is not None), default=None),
+        repeats=rows[0].repeats,
+    )
+
+
+def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None) -> Ratio:
+    """Geometric mean of the ratios of two modes' errors, and its interval.
+
+    The 95 % interval comes from a paired block bootstrap. With `MIN_RECORDINGS` recordings or more,
+    recordings are drawn, too, and it speaks of others like these. With fewer it speaks of these,
+    and there is none unless each holds `MIN_BLOCKS` blocks. (The parts of one recording are one.)
+    Means of few recordings vary too little in a bootstrap, hence the factor. What an estimated
+    reference errs is allowed for as on a sequence.
+
+    Parameters
+    ----------
+    judged
+        Sequences with a reference.
+    mode, other
+        Of which the errors are compared; with the yardstick's by default.
+    """
+    pairs = [(one.pair(mode, other), one.block) for one in judged]
+    value = float(np.exp(np.mean([_log(errors) for errors, _ in pairs])))
+    place = np.unique([one.recording or one.name for one in judged], return_inverse=True)[1]
+    n, rng, scale = int(place.max()) + 1, np.random.default_rng(SEED), 1.0
+    if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block in pairs):
+        return Ratio(value)
+    logs = np.array([_resampled_logs(errors, block, rng) for errors, block in pairs])
+    counts = np.bincount(place).astype(float)
+    sums = np.zeros((n, RESAMPLES))
+    np.add.at(sums, place, logs)
+    if n >= MIN_RECORDINGS:
+        drawn = rng.integers(0, n, (n, RESAMPLES))
+        means = sums[drawn, rng.integers(0, RESAMPLES, (n, RESAMPLES))].sum(axis=0)
+        means /= counts[drawn].sum(axis=0)
+        scale = float(np.sqrt(n / (n - 1)))
+    else:
+        means = sums.sum(axis=0) / counts.sum()
+    low, high = means.mean() + scale * (np.percentile(means, [2.5, 97.5]) - means.mean())
+    reference_errors = [one.rows[0].reference_error for one in judged]
+    wider = np.mean(
+        [_allowed(errors, own) for (errors, _), own in zip(pairs, reference_errors, strict=True)], 0
+    )
+    return Ratio(value, (float(np.exp(low + wider[0])), float(np.exp(high + wider[1]))))
+
+
+def _log(errors: NDArray[np.float64]) -> float:
+    """Logarithm of the ratio of two mean errors, from their values of shape (2, n)."""
+    mine, others = np.maximum(errors.mean(axis=1), 1e-12)
+    return float(np.log(mine / others))
+
+
+def _resampled_logs(
+    errors: NDArray[np.float64], block: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Logarithms of the ratio in resamples of one sequence, of shape (RESAMPLES,)."""
+    means = np.maximum(resampled_means(errors, min(block, errors.shape[1]), rng), 1e-12)
+    return np.asarray(np.log(means[0] / means[1]))
+
+
+def _allowed(errors: NDArray[np.float64], reference_error: float | None) -> tuple[float, float]:
+    """By how much the reference's own error may move the logarithm of a ratio, down and up."""
+    if reference_error is None:
+        return 0.0, 0.0
+    mine, other = errors.mean(axis=1).tolist()
+    ratio, error = mine / max(other, 1e-12), ERROR_FACTOR * reference_error
+    _, (low, high) = allowing_for((mine, mine), (ratio, ratio), other, error)
+    with np.errstate(divide="ignore"):
+        return float(np.log(low / ratio)), float(np.log(high / ratio))
+
+
+def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float64]:
+    """Logarithms of the ratio on each stretch: as many whole ones as a sequence has, or one."""
+    found = []
+    for one in judged:
+        errors = one.pair(mode)
+        n = max(1, errors.shape[1] // (PER_STRETCH * one.block))
+        found += [_log(part) for part in np.array_split(errors, n, axis=1)]
+    return np.array(found)
+
+
+def with_gaps(
+    rows: Sequence[ComparisonRow], oracles: Sequence[ComparisonRow]
+) -> list[ComparisonRow]:
+    """Fill in the share of what the best set of each sequence gains over the fixed set."""
+    best = {row.mode: row.rte for row in oracles}.get(ORACLES[0])
+    others: Mapping[str, float | None] = {row.mode: row.rte for row in rows}
+    fixed = others.get("fixed")
+    if best is None or fixed is None or best >= fixed:
+        return list(rows)
+    return [
+        replace(row, gap_closed=(fixed - row.rte) / (fixed - best))
+        if row.rte is not None and row.mode != "fixed"
+        else row
+        for row in rows
+    ]
+
+
+# Replays that are not of what the study is now: neither compared nor drawn.
+
+
+class CurrentModes(NamedTuple):
+    """The modes whose replays of a sequence are of what the study is now."""
+
+    modes: tuple[str, ...]  # in the order of `LINES`
+    refused: tuple[str, ...]  # sentences about the others
+
+
+def check_replays(
+    study: Study, setup: ReplaySetup, names: Sequence[str], modes: Sequence[str]
+) -> ErrorModel | None:
+    """Refuse replays that are missing, or of another recording, model or configuration.
+
+    Returns
+    -------
+    ErrorModel or None
+        What the replays are of; None if its file is not there any more.
+
+    Raises
+    ------
+    StoredReplayError
+    """
+    made = {
+        (name, mode): ReplaySummary.read(study.folder / "replays" / name / mode)
+        for name in names
+        for mode in modes
+    }
+    path, model = _model_of(study, made.values())
+    model = model and setup.pinned(model)
+    # Both read what they are about.
+    shared = {name: shared_identity(study, name) for name in names}
+    _check_rates(study, made.values())
+    for (name, mode), summary in made.items():
+        if differing := _differing(study, setup, summary, model, shared[name]):
+            command = _command(study, mode, path)
+            raise StoredReplayError(_refusal(study, name, [mode], differing, command))
+    for name in names:
+        _check_reference(study, name, modes)
+    return model
+
+
+def current_modes(study: Study, name: str) -> CurrentModes:
+    """Tell the replays of a sequence that `check_replays` would refuse from the others.
+
+    Of replays with different models, those with the study's own are the others.
+
+    Raises
+    ------
+    AdaptuneError
+        If it would refuse all of them.
+    """
+    folder, setup = study.folder / "replays" / name, ReplaySetup.of(study)
+    there = [mode for mode in LINES if (folder / mode / "replay.json").exists()]
+    made = {mode: ReplaySummary.read(folder / mode) for mode in there}
+    if not made:
+        return CurrentModes((), ())
+    own = study.model_path.resolve()
+    if len(_files(made.values())) > 1 and own.exists():
+        of: tuple[Path, ErrorModel | None] = own, _load(study, own)
+    else:
+        of = _model_of(study, made.values())
+    path, model = of[0], of[1] and setup.pinned(of[1])
+    considered = _considered(setup, model)
+    made = {mode: summary for mode, summary in made.items() if mode in considered}
+    _check_rates(study, made.values())
+    _check_reference(study, name, list(made))
+    shared = shared_identity(study, name)
+    current, refused = [], dict[tuple[str, ...], list[str]]()
+    for mode, summary in made.items():
+        if differing := _differing(study, setup, summary, model, shared):
+            refused.setdefault((_command(study, mode, path), *differing), []).append(mode)
+        else:
+            current.append(mode)
+    said = (
+        f"{_refusal(study, name, modes, differing, command)}."
+        for (command, *differing), modes in refused.items()
+    )
+    return CurrentModes(tuple(current), tuple(said))
+
+
+def _considered(setup: ReplaySetup, model: ErrorModel | None) -> set[str]:
+    """The modes that the study may have; a replay that is left of another one is not looked at."""
+    rivals: Iterable[str] = RIVALS
+    also: Iterable[str] = ALSO
+    if model is not None:
+        rivals = [mode for mode in RIVALS if mode in model.rivals]
+        also = [m for m in ALSO if setup.twin(m, model) == m and not setup.obstacle(m, model)]
+    return {BASELINE, *rivals, "fixed", *setup.rules, *also}
+
+
+def _differing(
+    study: Study,
+    setup: ReplaySetup,
+    summary: ReplaySummary,
+    model: ErrorModel | None,
+    shared: Mapping[str, Any],
+) -> list[str]:
+    """In what a replay differs from one that would be made now, given what all modes share."""
+    # What was made in real time may be compared without saying so.
+    now, about = {**shared, "real_time": None}, summary.about.model_dump() | {"real_time": None}
+    mode = summary.about.mode
+    if model is not None or mode in WITHOUT_MODEL:
+        whole = setup.identity(mode, model, "" if model is None else model.digest)
+        now |= {key: whole[key] for key in ("model", "parameters")}
+        if not _is_automatic(study, whole["switching"], about["switching"]):
+            now["switching"] = whole["switching"]
+    return [key for key, value in now.items() if about[key] != value]
+
+
+def _command(study: Study, mode: str, path: Path) -> str:
+    """The command that makes a replay again, with the model of a file."""
+    command = replayed_by(study, mode)
+    if mode == UNTRAINED or path == study.model_path.resolve():
+        return command
+    return f"{command[:-1]} --model {path}`"
+
+
+def _refusal(
+    study: Study, name: str, modes: Sequence[str], differing: Sequence[str], command: str
+) -> str:
+    """Why replays of a sequence are refused."""
+    folder = study.folder / "replays" / name
+    what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
+    return f"{what} replayed with another {', '.join(differing)}; run {command} with this study"
+
+
+def _check_rates(study: Study, summaries: Collection[ReplaySummary]) -> None:
+    if len({str(summary.about.real_time) for summary in summaries}) > 1:
+        raise StoredReplayError(
+            f"{study.folder / 'replays'}: some were made in real time, and others not, or not so; "
+            f"run `adaptune online` again, with --rate or without"
+        )
+
+
+def _check_reference(study: Study, name: str, modes: Sequence[str]) -> None:
+    option = " --untrained" if UNTRAINED in modes and "fixed" not in modes else ""
+    check_reference(study.folder / "replays" / name, study.sequences.reference(name), option)
+
+
+def _files(summaries: Iterable[ReplaySummary]) -> dict[str, str]:
+    """The files of the models of replays, by digest."""
+    return {s.about.model: s.model_file for s in summaries if s.about.model and s.model_file}
+
+
+def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:
+    """File of the model that all replays are of, and the model if the file is still there."""
+    files = _files(summaries)
+    if len(files) > 1:
+        commands = {replayed_by(study, s.about.mode) for s in summaries if s.about.model}
+        raise StoredReplayError(
+            f"{study.folder / 'replays'}: holds replays with different models "
+            f"({' and '.join(sorted(set(files.values())))}); run {max(commands, key=len)} again"
+        )
+    path = Path(next(iter(files.values()), study.model_path.resolve()))
+    return path, _load(study, path) if path.exists() else None
+
+
+def _load(study: Study, path: Path) -> ErrorModel:
+    """A model; the study's own is still of its recordings."""
+    model = ErrorModel.load(path)
+    if path == study.model_path.resolve():
+        check_model(study, model.sequences, model.provenance)
+    return model
+
+
+def _is_automatic(study: Study, now: Any, made: Any) -> bool:
+    """Whether a replay differs only in the mechanism that this machine would choose."""
+    if study.config.online.switching.mechanism != "auto" or None in (now, made):
+        return False
+    return bool(now["mechanism"] != made["mechanism"])
+
+
+class ComparedReplays(NamedTuple):
+    """What `compare` has found."""
+
+    # A row for every sequence and mode; over several sequences, a row for every mode follows.
+    rows: list[ComparisonRow]
+    words: list[str]  # sentences: what was gained, and what must be known to trust it
+    unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
+
+
+def compare(study: Study, write: bool = True) -> ComparedReplays:
+    """Compare the replays that were made, and write tables and pictures.
+
+    A mode is compared if it was replayed on all sequences that are compared, see
+    `online.compared_modes.compared_modes`. The untrained bank is compared with the baseline alone
+    if only these two were replayed.
+
+    Parameters
+    ----------
+    study
+        The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, the
+        tables as Markdown (``tables.md``) and LaTeX (``tables.tex``), and a picture (PNG and SVG)
+        for every sequence.
+    write
+        Whether it does.
+
+    Raises
+    ------
+    StoredReplayError
+        If that of the fixed set is missing, or one is damaged, or of another recording or
+        configuration.
+    """
+    setup, compared = ReplaySetup.of(study), compared_modes(study)
+    names, modes = compared.sequences, compared.modes
+    model = check_replays(study, setup, names, modes)
+    judged: list[JudgedModes] = []
+    oracles: list[ComparisonRow] = []
+    for name in names:
+        folder = study.folder / "replays" / name
+        replays = {mode: read_repeats(folder / mode) for mode in modes}
+        reference = reference_of(study, name)
+        every = _with_twins(replays, model, compared.twins)
+        of_modes = compare_modes(name, every, reference)
+        judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
+        oracle = None if model is None else read_oracle(study, name, model)
+        if oracle is not None and model is not None:
+            period = study.config.online.period
+            oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
+        if not write:
+            continue
+        draw_replays(
+            study.folder / "comparison" / f"{name}.png",
+            f"{study.name}: {name}",
+            study.config.sub_trajectory,
+            {mode: track_of(replays[mode][0], reference, model) for mode in drawn_modes(modes)},
+            None if reference.trajectory is None else seen_from(reference.trajectory),
+            setup.odometry.space,
+            reference.estimated,
+        )
+    twins = compared.twins
+    rows = [replace(row, twin=twins.get(row.mode, "")) for row in _rows(judged, oracles)]
+    words = [*remarks(rows), *_equal_cost(model, modes), *compared.words(study)]
+    words += _missing_repeats(judged, study.config.online.repeats)
+    words += _without_oracle(judged, oracles) if model is not None else []
+    if write:
+        folder = study.folder / "comparison"
+        report.write_rows(folder, "comparison", [row.columns() for row in rows])
+        made = tables(rows, study.config.sub_trajectory)
+        report.write_tables(folder, study.name, made, words)
+    return ComparedReplays(rows, words, compared.unfinished)
+
+
+def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:
+    """That the fixed set is its own rival, if it is and is compared."""
+    if model is None or "fixed" not in modes or model.rivals.get(EQUAL_COST) != model.fixed:
+        return []
+    return [
+        "`equal_cost` is the fixed set: in training, no single set that costs no more than what is "
+        "driven was better."
+    ]
+
+
+def _missing_repeats(judged: Sequence[JudgedModes], repeats: int) -> list[str]:
+    """Which replays were repeated less often than the study says."""
+    few = [
+        f"{row.mode} on {one.name} {row.repeats}"
+        for one in judged
+        for row in one.rows
+        if row.repeats < repeats
+    ]
+    what = f"Replayed less often than {repeats} times (`adaptune online` goes on)"
+    return [f"{what}: {', '.join(few)}."] if few else []
+
+
+def _without_oracle(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[str]:
+    """On which sequences the best choice in hindsight is not known."""
+    known = {row.sequence for row in oracles}
+    names = [one.name for one in judged if one.rows[0].rte is not None and one.name not in known]
+    if not names:
+        return []
+    where = "" if len(names) == len(judged) else f" on {', '.join(names)}"
+    return [f"What the best set would have gained{where} is not known; `adaptune oracle` tells."]
+
+
+def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+    """The rows of each sequence, and if there are several, those over all."""
+    rows = [row for one in judged for row in one.rows]
+    known = [one for one in judged if one.rows[0].rte is not None]
+    if not known:
+        return rows
+    if len(judged) > 1:
+        last = pooled(judged, oracles)
+    else:
+        last, rows = [*with_gaps(rows, oracles), *oracles], []
+    return [*rows, *(_against(row, known, last) for row in last)]
+
+
+def _against(
+    row: ComparisonRow, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]
+) -> ComparisonRow:
+    """Compare a mode that adapts with controls and rivals, too, on the same frames."""
+    if row.mode not in ("paired", UNTRAINED):
+        return row
+    others = [other.mode for other in rows if other.mode in (*CONTROLS, *RIVALS)]
+    return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})
+
+
+def _with_twins(
+    replays: Repeats, model: ErrorModel | None, twins: Mapping[str, str]
+) -> dict[str, Sequence[StoredReplay]]:
+    """The replays by mode, also for each mode that has that of another one.
+
+    Of several odometries, a rival that is the fixed set has its replay.
+    """
+    same = {mode: replays[twin] for mode, twin in twins.items()}
+    if model is not None and "fixed" in replays and len(model.sets.space.baselines) > 1:
+        of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
+        same |= dict.fromkeys(of_fixed, replays["fixed"])
+    every = {**same, **replays}
+    return {mode: every[mode] for mode in LINES if mode in every}

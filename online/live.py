@@ -1,0 +1,418 @@
+"""Scans from a topic, as they come."""
+
+import json
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from rosbags.typesys.store import Typestore
+
+from adaptune.errors import AdaptuneError
+from adaptune.geometry import Poses, to_quaternions
+from adaptune.recording.clouds import PointCloud2, from_fields, message_stamp, read_points
+from adaptune.recording.recording import ImuSettings
+from adaptune.recording.scan import Imu, Scan, Timing
+from adaptune.ros.link import LinkError, RosLink
+from adaptune.selection import Selection
+from adaptune.selector import BACK
+from online.real_time import Arrival
+from online.replay import RealTimeRecord
+
+SILENCE = 2.0
+"""Seconds without a scan after which the log says so."""
+IMU_WAIT = 0.1
+"""Seconds that a scan waits for the IMU's measurements up to its end."""
+_MOST_IMU = 20_000
+"""Measurements that are kept."""
+CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
+
+_log = logging.getLogger(__name__)
+
+
+class LiveScans:
+    """Scans of a topic, with what the IMU measured.
+
+    A scan that is not newer than the one before is ignored. Of the scans that come while nobody
+    asks, the newest ones wait.
+
+    Parameters
+    ----------
+    link
+        To the robot.
+    points
+        Topic of the point clouds.
+    timing
+        Meaning of their stamps.
+    queue
+        Scans that may wait; with 0 all do.
+    imu
+        How to read the IMU, its topic included; None without.
+
+    Attributes
+    ----------
+    ignored : int
+        Scans that came twice, or after a newer one.
+    damaged : int
+        Messages that held no scan.
+    frame : str
+        Name of the sensor's frame, by the newest cloud.
+    """
+
+    def __init__(
+        self,
+        link: RosLink,
+        points: str,
+        timing: Timing,
+        queue: int = 1,
+        imu: ImuSettings | None = None,
+    ):
+        self.ignored = self.damaged = 0
+        self.frame = "sensor"
+        self._link, self._points, self._timing, self._queue = link, points, timing, queue
+        self._settings = imu
+        _warm_up(timing)
+        self._news = threading.Condition()
+        self._waiting: deque[tuple[Scan, float]] = deque()
+        self._measured: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MOST_IMU)
+        self._dropped = 0
+        self._stopped = False
+        if imu is not None and imu.topic is not None:
+            link.subscribe(imu.topic, IMU, self._take_imu)
+        link.subscribe(points, CLOUD, self._take)
+
+    def stop(self) -> None:
+        """End all iterations."""
+        with self._news:
+            self._stopped = True
+            self._news.notify()
+
+    def arrivals(self) -> Iterator[Arrival]:
+        """Scans as they come, until the clock goes back or `stop` is called.
+
+        The scan at which the clock goes back begins the next iteration.
+        """
+        last: int | None = None
+        while (found := self._next(last)) is not None:
+            (scan, came), dropped = found
+            if last is not None and scan.stamp <= last:
+                self.ignored += 1
+                continue
+            before, last = last, scan.stamp
+            yield Arrival(self._with_imu(scan, before), came, dropped)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called."""
+        return self._stopped
+
+    def _next(self, last: int | None) -> tuple[tuple[Scan, float], int] | None:
+        """The next scan, and how many were dropped before it; None at the end."""
+        silent = 0.0
+        while not self._is_there():
+            silent += SILENCE
+            if not self._link.alive:
+                raise LinkError("adaptune's node in ROS has ended; start again")
+            # Again after twice as long.
+            if np.log2(silent / SILENCE) % 1.0 == 0.0:
+                self._tell_of_silence(silent)
+        with self._news:
+            if self._stopped:
+                return None
+            stamp = self._waiting[0][0].stamp
+            if last is not None and stamp < last - BACK:
+                _log.warning("the clock went back by %.1f s: a new drive", (last - stamp) * 1e-9)
+                self._measured.clear()
+                return None
+            if silent:
+                _log.warning("%s: scans come again, after %.0f s", self._points, silent)
+            dropped, self._dropped = self._dropped, 0
+            return self._waiting.popleft(), dropped
+
+    def _is_there(self) -> bool:
+        """Whether there is a scan, or the end, before the silence is too long."""
+        with self._news:
+            return self._news.wait_for(lambda: bool(self._waiting or self._stopped), SILENCE)
+
+    def _tell_of_silence(self, seconds: float) -> None:
+        hint = ""
+        try:
+            topics = self._link.topics()
+            if self._points not in topics:
+                clouds = sorted(topic for topic, kind in topics.items() if kind == CLOUD)
+                among = f"point clouds come on {', '.join(clouds)}" if clouds else "no point clouds"
+                hint = f"; nobody publishes it ({among})"
+        except LinkError as error:
+            hint = f"; {error}"
+        _log.warning("%s: no scan for %.0f s%s", self._points, seconds, hint)
+
+    def _take(self, message: Any) -> None:
+        came = time.perf_counter()
+        try:
+            scan = to_scan(message, self._timing)
+        except AdaptuneError as error:
+            self.damaged += 1
+            _log.warning("%s: %s; the scan is left out", self._points, error)
+            return
+        with self._news:
+            self.frame = message.header.frame_id or self.frame
+            self._waiting.append((scan, came))
+            if self._queue and len(self._waiting) > self._queue:
+                self._waiting.popleft()
+                self._dropped += 1
+            self._news.notify()
+
+    def _take_imu(self, message: Any) -> None:
+        w, a = message.angular_velocity, message.linear_acceleration
+        values = (w.x, w.y, w.z, a.x, a.y, a.z)
+        stamp = message_stamp(message)
+        with self._news:
+            if np.isfinite(values).all() and (not self._measured or stamp > self._measured[-1][0]):
+                self._measured.append((stamp, values))
+                self._news.notify()
+
+    def _with_imu(self, scan: Scan, before: int | None) -> Scan:
+        """The scan with what was measured since the scan before."""
+        if self._settings is None:
+            return scan
+        end = scan.stamp + scan.span
+        with self._news:
+            self._news.wait_for(
+                lambda: self._stopped or (self._measured and self._measured[-1][0] >= end),
+                IMU_WAIT,
+            )
+            # The first scan gets those during it, and the one before.
+            taken: list[tuple[int, tuple[float, ...]]] = []
+            while self._measured and (not taken or taken[-1][0] < end):
+                taken.append(self._measured.popleft())
+        if before is None:
+            taken = [one for one in taken if one[0] > scan.stamp] or taken[-1:]
+        stamps = np.array([stamp for stamp, _ in taken], np.int64)
+        values = np.array([values for _, values in taken], np.float64).reshape(-1, 6)
+        T = np.eye(4) if self._settings.T_sensor_imu is None else self._settings.T_sensor_imu
+        acceleration = values[:, 3:] * self._settings.scale
+        imu = Imu(stamps, values[:, :3], acceleration, T, self._settings.noise)
+        return replace(scan, imu=imu)
+
+
+def _warm_up(timing: Timing) -> None:
+    """Load compiled code, for which the first scans should not wait."""
+    numbers = np.ones(1, np.float32)
+    from_fields(dict.fromkeys("xyz", numbers), 0, timing)
+
+
+def to_scan(message: Any, timing: Timing) -> Scan:
+    """The scan of a sensor_msgs/PointCloud2.
+
+    Raises
+    ------
+    AdaptuneError
+        If it holds no points with x, y and z.
+    """
+    fields = tuple((one.name, one.offset, one.datatype, one.count) for one in message.fields)
+    cloud = PointCloud2(
+        message_stamp(message),
+        message.height,
+        message.width,
+        fields,
+        bool(message.is_bigendian),
+        message.point_step,
+        message.row_step,
+        memoryview(message.data),
+    )
+    return from_fields(read_points(cloud), cloud.stamp, timing)
+
+
+# What adaptune publishes while a robot drives.
+
+
+UNKNOWN = 5.0
+"""Percent of the way that an odometry is believed to err by before anything is known of it."""
+_OK, _WARN, _ERROR = 0, 1, 2
+
+
+class Uncertainty:
+    """How uncertain a pose is, by the errors that were measured on the way.
+
+    Errors of sub-trajectories are taken to be independent: over each metre, the variance grows by
+    the squared error times the length of a sub-trajectory. The heading is taken to err by as much,
+    in radians, over a sub-trajectory.
+
+    Parameters
+    ----------
+    length
+        Metres of a sub-trajectory.
+    """
+
+    def __init__(self, length: float):
+        self._length = length
+        self._share = 1e-2 * UNKNOWN
+        self.position = self.rotation = 0.0  # variances: square metres, square radians
+
+    def learn(self, selection: Selection) -> None:
+        """Go on with the error of a selection: the measured one, or else the predicted."""
+        for error in (selection.estimated_error, selection.predicted_error):
+            if math.isfinite(error):
+                self._share = 1e-2 * error
+                return
+
+    def move(self, T_previous_current: Poses) -> None:
+        """Move on, by a motion of shape (4, 4)."""
+        metres = float(np.linalg.norm(T_previous_current[:3, 3]))
+        if math.isfinite(metres):
+            self.position += self._share**2 * self._length * metres
+            self.rotation += self._share**2 * metres / self._length
+
+
+class RosMessages:
+    """Makes messages of one ROS.
+
+    Parameters
+    ----------
+    store
+        Its types.
+    frame
+        Name of the odometry's frame.
+    """
+
+    def __init__(self, store: Typestore, frame: str):
+        self._types, self._frame = store.types, frame
+
+    def _make(self, kind: str, **fields: Any) -> Any:
+        return self._types[kind](**fields)
+
+    def _header(self, stamp: int, frame: str) -> Any:
+        seconds, nanoseconds = divmod(stamp, 10**9)
+        time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+        kind: Any = self._types["std_msgs/msg/Header"]
+        # ROS 1 counts messages.
+        numbered = {"seq": 0} if "seq" in kind.__dataclass_fields__ else {}
+        return kind(stamp=time, frame_id=frame, **numbered)
+
+    def _vector(self, kind: str, values: Any) -> Any:
+        x, y, z = map(float, values)
+        return self._make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+    def _quaternion(self, T: Poses) -> Any:
+        x, y, z, w = to_quaternions(T[None])[0].tolist()
+        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def odometry(
+        self, stamp: int, T_odom_sensor: Poses, child: str, uncertainty: Uncertainty
+    ) -> Any:
+        """nav_msgs/Odometry; the twist is not known."""
+        position = self._vector("Point", T_odom_sensor[:3, 3])
+        pose = self._make(
+            "geometry_msgs/msg/Pose", position=position, orientation=self._quaternion(T_odom_sensor)
+        )
+        variances = np.repeat([uncertainty.position, uncertainty.rotation], 3)
+        zero = self._vector("Vector3", (0.0, 0.0, 0.0))
+        twist = self._make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+        # By convention -1 says that a value is not known.
+        unknown = np.zeros(36)
+        unknown[0] = -1.0
+        return self._make(
+            "nav_msgs/msg/Odometry",
+            header=self._header(stamp, self._frame),
+            child_frame_id=child,
+            pose=self._make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=pose,
+                covariance=np.diag(variances).ravel(),
+            ),
+            twist=self._make(
+                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown
+            ),
+        )
+
+    def transform(self, stamp: int, T_odom_sensor: Poses, child: str) -> Any:
+        """tf2_msgs/TFMessage."""
+        moved = self._make(
+            "geometry_msgs/msg/Transform",
+            translation=self._vector("Vector3", T_odom_sensor[:3, 3]),
+            rotation=self._quaternion(T_odom_sensor),
+        )
+        one = self._make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp, self._frame),
+            child_frame_id=child,
+            transform=moved,
+        )
+        return self._make("tf2_msgs/msg/TFMessage", transforms=[one])
+
+    def selection(self, stamp: int, selection: Selection, why_not: str) -> Any:
+        """std_msgs/String with JSON: what was selected."""
+        found = {
+            "stamp": stamp,
+            "trial": selection.trial,
+            "parameters": dict(selection.parameters),
+            "weights": {str(k): v for k, v in (selection.weights or {}).items()} or None,
+            "predicted_error": _number(selection.predicted_error),
+            "predicted_fixed": _number(selection.predicted_fixed),
+            "estimated_error": _number(selection.estimated_error),
+            "lost": selection.lost,
+            "why_not": why_not or None,
+        }
+        return self._make("std_msgs/msg/String", data=json.dumps(found))
+
+    def diagnostics(
+        self, stamp: int, selection: Selection | None, status: "Status", before: "Status"
+    ) -> Any:
+        """diagnostic_msgs/DiagnosticArray: what happened since the message before."""
+        level, said = _OK, "keeps up"
+        if (status.dropped, status.missed) != (before.dropped, before.missed):
+            level, said = _WARN, "was too late"
+        if before.restarts:
+            level, said = _ERROR, "restarts for want of healthy poses"
+        if selection is not None and selection.lost:
+            level, said = _ERROR, "is lost"
+        values = {
+            "pose after the scan [ms]": f"{1e3 * status.late:.1f}",
+            "dropped scans": str(status.dropped),
+            "ignored scans": str(status.ignored),
+            "missed selections": str(status.missed),
+        }
+        if selection is not None:
+            values |= {
+                "trial": str(selection.trial),
+                "estimated error [%]": f"{selection.estimated_error:.3f}",
+                "predicted error [%]": f"{selection.predicted_error:.3f}",
+            }
+        kind = "diagnostic_msgs/msg/KeyValue"
+        found = self._make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name="adaptune: odometry",
+            message=said,
+            hardware_id="",
+            values=[self._make(kind, key=key, value=value) for key, value in values.items()],
+        )
+        header = self._header(stamp, "")
+        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[found])
+
+
+@dataclass
+class Status:
+    """Counts since the start, and restarts since a message."""
+
+    dropped: int = 0
+    missed: int = 0
+    ignored: int = 0
+    late: float = 0.0  # seconds from the newest scan to its pose
+    restarts: int = 0
+
+    @classmethod
+    def of(cls, record: RealTimeRecord, ignored: int) -> Self:
+        """The counts of a drive."""
+        late = record.late[-1] if record.late else 0.0
+        return cls(record.dropped, record.missed, ignored, late)
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None

@@ -1,0 +1,537 @@
+"""Drive on a robot: scans from a topic, poses and selections on others."""
+
+import csv
+import io
+import itertools
+import logging
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from adaptune.errors import AdaptuneError, OdometryError, in_one_line, nearest
+from adaptune.geometry import Poses, invert
+from adaptune.model import ErrorModel
+from adaptune.odometry.base import LastMotion, Motions, OdometryInstance, Registration, Usage
+from adaptune.odometry.tracker import RegisteredScan
+from adaptune.recording.clouds import POSES
+from adaptune.recording.config import ImuConfig, SequenceConfig, to_pose
+from adaptune.recording.opening import imu_settings
+from adaptune.recording.scan import Scan, Timing
+from adaptune.ros.link import RosLink, Steering
+from adaptune.selection import Selection
+from adaptune.selector import BACK, AnySelector, Selector
+from adaptune.study.config import RealTimeConfig, SteerConfig
+from adaptune.study.study import ModeError, Study
+from adaptune.trajectory import Trajectory, tum_lines
+from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
+from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, needed
+from online.real_time import RealTimeDrive, SelectorProcess, outlook
+from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
+from online.replay import Choice, Look, Progressed, RealTimeRecord
+
+# What a drive leaves on disk, written while it lasts.
+
+
+class DriveLog:
+    """Writes ``trajectory.tum``, ``frames.csv`` and ``selections.csv``, line by line.
+
+    Where the disk is full, the log ends and the drive goes on.
+
+    Parameters
+    ----------
+    folder
+        Where to; it is made.
+    names
+        Of the parameters, for the columns of ``selections.csv``.
+    goes_on
+        Whether the drive goes on where nothing can be recorded from the start.
+
+    Attributes
+    ----------
+    lost : str
+        Why the log ended; empty while it lasts.
+
+    Raises
+    ------
+    OSError
+        If the files cannot be made, unless the drive goes on.
+    """
+
+    def __init__(self, folder: Path, names: list[str], *, goes_on: bool = False):
+        self.folder, self.lost = folder, ""
+        self._names = names
+        self._files: dict[str, IO[str]] = {}
+        try:
+            self._open()
+        except OSError as error:
+            if not goes_on:
+                raise
+            self._end(error)
+
+    def _open(self) -> None:
+        folder, names = self.folder, self._names
+        folder.mkdir(parents=True)
+        heads = {
+            "trajectory.tum": "",
+            "frames.csv": _csv(FRAME_COLUMNS),
+            "selections.csv": _csv((*SELECTION_COLUMNS, *names)),
+        }
+        # A line is on disk when it is written: the robot may be switched off.
+        self._files |= {
+            name: (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
+            for name in heads
+        }
+        for name, head in heads.items():
+            self._write(name, head)
+
+    def scan(self, step: RegisteredScan, late: float) -> None:
+        """Note a scan: its pose, and how late that was in seconds."""
+        stamps = np.array([step.stamp], np.int64)
+        (line,) = tum_lines(stamps, step.T_odom_sensor[None])
+        self._write("trajectory.tum", line)
+        self._write("frames.csv", _csv(frame_row(step, late)))
+
+    def choice(self, choice: Choice) -> None:
+        """Note a selection."""
+        self._write("selections.csv", _csv(selection_row(choice, self._names)))
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files.values():
+            try:
+                file.close()
+            except OSError as error:
+                self._end(error)
+
+    def _write(self, name: str, line: str) -> None:
+        if not self.lost:
+            try:
+                self._files[name].write(line)
+            except OSError as error:
+                self._end(error)
+
+    def _end(self, error: OSError) -> None:
+        if not self.lost:
+            self.lost = in_one_line(error)
+            _log.warning("%s: nothing more is recorded (%s); the drive goes on", self.folder, error)
+
+
+def _csv(row: Iterable[Any]) -> str:
+    text = io.StringIO()
+    csv.writer(text).writerow(row)
+    return text.getvalue()
+
+
+# Somebody else's odometry node, of which only parameters are set.
+
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+PATIENCE = 0.3
+"""Seconds after a scan in which the node's pose must be there."""
+SILENT = 10
+"""Scans in a row without a pose after which the log says so."""
+_COMMAND = 5.0
+"""Seconds for a command that sets a parameter."""
+"""Poses that are kept."""
+_GAP = 1.0
+"""Seconds between poses over which a pose is interpolated."""
+
+
+class SteeredNode(OdometryInstance):
+    """An odometry that runs elsewhere and publishes its poses.
+
+    Parameters
+    ----------
+    link
+        To the robot.
+    settings
+        The node, its topic, and how its parameters are set.
+    """
+
+    faults = ()
+    rewinds = False
+
+    def __init__(self, link: RosLink, settings: SteerConfig):
+        self._settings = settings
+        extrinsic = settings.extrinsic
+        self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
+        self._news = threading.Condition()
+        self._poses: deque[tuple[int, Poses]] = deque(maxlen=_KEPT)
+        self._last_motion = LastMotion()
+        self._begun: tuple[int, Poses] | None = None
+        self._T_odom_node: Poses | None = None
+        self._steering = Steering(
+            settings.node,
+            lambda parameters: link.set_parameters(settings.node, parameters),
+            settings.command,
+            _run,
+        )
+        self._silent = 0
+        link.subscribe(settings.odometry, ODOMETRY, self._take)
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(0.0, None)
+
+    @property
+    def motions(self) -> Motions:
+        return self._last_motion.motions
+
+    def prepare(self, scan: Scan) -> Scan:
+        return scan
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        # The node goes on; its motions continue from here.
+        self._begun, self._T_odom_node = (prepared.stamp, np.array(T_odom_sensor)), None
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+
+    def submit(self, prepared: Scan) -> None:
+        self._submitted = prepared.stamp
+
+    def collect(self) -> Registration:
+        T_node = self._pose(self._submitted, PATIENCE)
+        T_odom_sensor = np.full((4, 4), np.nan)
+        known = bool(np.isfinite(T_node).all())
+        self._tell_of_silence(known)
+        if known:
+            if self._T_odom_node is None:
+                assert self._begun is not None
+                stamp, T = self._begun
+                T_begin = self._pose(stamp, 0.0)
+                T_first = T_begin if np.isfinite(T_begin).all() else T_node
+                self._T_odom_node = T @ invert(T_first)
+            T_odom_sensor = self._T_odom_node @ T_node
+        self._last_motion.move(T_odom_sensor)
+        return Registration(T_odom_sensor, known)
+
+    def _tell_of_silence(self, known: bool) -> None:
+        """Log that the node gives no poses, or gives some again."""
+        self._silent = 0 if known else self._silent + 1
+        if self._silent == SILENT:
+            what = "%s: no pose of %s for %d scans; is it the topic, and does the node run?"
+            _log.warning(what, self._settings.odometry, self._settings.node, SILENT)
+
+    def apply(self, selection: Selection) -> None:
+        """Set the parameters, see `adaptune.ros.link.Steering.apply`."""
+        self._steering.apply(selection.parameters)
+
+    def close(self) -> None:
+        return  # it runs on without adaptune
+
+    def _take(self, message: Any) -> None:
+        for stamp, _, position, orientation in POSES[ODOMETRY](message):
+            values = (position.x, position.y, position.z)
+            quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
+            try:
+                T = to_pose((*values, *quaternion))
+            except ValueError:
+                continue  # no pose, which the health check sees
+            with self._news:
+                if self._poses and stamp < self._poses[-1][0] - BACK:
+                    self._poses.clear()
+                if not self._poses or stamp > self._poses[-1][0]:
+                    self._poses.append((stamp, T @ self._T_base_sensor))
+                self._news.notify()
+
+    def _pose(self, stamp: int, seconds: float) -> Poses:
+        """The node's pose at a stamp, of shape (4, 4); NaN if it does not come in time."""
+        with self._news:
+            self._news.wait_for(lambda: self._poses and self._poses[-1][0] >= stamp, seconds)
+            poses = list(self._poses)
+        if not poses:
+            return np.full((4, 4), np.nan)
+        stamps, T = zip(*poses, strict=True)
+        # Only the poses around it are needed.
+        i = int(np.searchsorted(stamps, stamp))
+        part = slice(max(i - 1, 0), i + 2)
+        known = Trajectory(np.array(stamps[part], np.int64), np.array(T[part]))
+        found: Poses = known.at(np.array([stamp], np.int64), _GAP)[0]
+        return found
+
+
+def _run(command: list[str]) -> tuple[int, str]:
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_COMMAND, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise OdometryError(f"{command[0]}: {error}") from error
+    return done.returncode, done.stderr or done.stdout
+
+
+SELECTION_TOPIC, DIAGNOSTICS_TOPIC = "adaptune/selection", "/diagnostics"
+_KEPT = 1000
+"""Scans whose times are kept."""
+_EVERY = 10**9
+"""Nanoseconds from one message of diagnostics to the next."""
+
+_PUBLISHED = 5.0
+"""Seconds in which a topic that nobody has named must be published."""
+
+_FIRST = 10
+"""Scans from which the sensor's rate is known."""
+
+_log = logging.getLogger(__name__)
+
+
+class DriveRecord(NamedTuple):
+    """What became of a drive."""
+
+    folder: Path  # of its trajectory, selections and scans
+    scans: int
+    record: RealTimeRecord  # of its last part, where the clock went back
+    ignored: int  # scans that came twice or too late
+
+
+class RobotDrive:
+    """A study's odometry, or somebody else's node, on a robot.
+
+    Parameters
+    ----------
+    study
+        The study; ``drives/<time>`` in its folder receives the drive.
+    mode
+        One of `ReplaySetup.modes`, or `untrained`.
+    model_path
+        The error model; None for `untrained` and `baseline`.
+
+    Raises
+    ------
+    AdaptuneError
+        If the mode, the model and the study do not go together.
+    """
+
+    def __init__(self, study: Study, mode: str, model_path: Path | None):
+        config = study.config
+        real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
+        # What is only compared with is for replays.
+        setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
+        self._study, self._mode, self._setup, self._settings = study, mode, setup, real_time
+        self._ros = config.online.ros
+        self._model = None if model_path is None else setup.model(study, model_path)
+        self._like = _like(study)
+        self._scans: LiveScans | None = None
+        self._stopped = False
+        modes = WITHOUT_MODEL if self._model is None else (*setup.modes(self._model), UNTRAINED)
+        if mode not in modes:
+            raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
+        if self._ros.steer is not None:
+            if mode not in setup.rules:
+                raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
+        elif study.odometry.description.whole:
+            raise ModeError(
+                f"{study.odometry.name} runs whole recordings: name the node that runs it on the "
+                f"robot (online.ros.steer)"
+            )
+
+    def run(self, link: RosLink, look: Look = lambda *_: None) -> DriveRecord:
+        """Drive until Ctrl-C, or until `stop` is called.
+
+        Where the clock goes back, all begins anew.
+
+        Parameters
+        ----------
+        link
+            To the robot.
+        look
+            Called after every scan, see `online.dashboard.Dashboard.look`.
+        """
+        done = 0
+        with ExitStack() as stack:
+            steered = None if self._ros.steer is None else SteeredNode(link, self._ros.steer)
+            selector = None
+            if steered is not None or self._setup.adapts(self._mode):
+                make = partial(_selector, self._setup, self._mode, self._model, self._steers)
+                period = self._study.config.online.period
+                selector = stack.enter_context(closing(SelectorProcess(make, period)))
+            self._scans = scans = self._topics(link)
+            publisher = _Publisher(link, self._study, scans)
+            driven = None
+            while driven is None or not (scans.stopped or self._stopped):
+                odometry = steered or self._setup.instance(self._mode, self._model)
+                with closing(odometry):
+                    driven = self._part(odometry, selector, publisher, look, done)
+                done = driven.scans
+        return driven
+
+    def stop(self) -> None:
+        """End the drive; any thread may call it."""
+        self._stopped = True
+        if self._scans is not None:
+            self._scans.stop()
+
+    @property
+    def _steers(self) -> bool:
+        return self._ros.steer is not None
+
+    def _topics(self, link: RosLink) -> LiveScans:
+        """Subscribe to scans, and to an IMU if the odometry needs one."""
+        like, imu = self._like, None
+        timing = Timing(like.stamp, like.time_unit, like.period)
+        needs = self._study.odometry.description.needs_imu and not self._steers
+        if needs:
+            settings = imu_settings(like.imu) or imu_settings(ImuConfig())
+            assert settings is not None
+            imu = replace(settings, topic=_topic(link, settings.topic, IMU, "imu.topic"))
+        points = _topic(link, self._ros.points or like.points, CLOUD, "online.ros.points")
+        return LiveScans(link, points, timing, self._settings.queue, imu)
+
+    def _part(
+        self,
+        odometry: OdometryInstance,
+        selector: SelectorProcess | None,
+        publisher: "_Publisher",
+        look: Look,
+        done: int,
+    ) -> DriveRecord:
+        """Drive until the clock goes back; so many scans were there before."""
+        assert self._scans is not None
+        folder, names = _new_folder(self._study.folder / "drives"), self._study.odometry.space.names
+        # A robot that drives goes on, whatever happens to its disk.
+        with closing(DriveLog(folder, list(names), goes_on=done > 0)) as log:
+            publisher.begin(log)
+            if selector is not None:
+                self._begin_with(odometry, selector.fixed, goes_on=done > 0)
+            health, note = self._study.config.health, publisher.choice
+            drive = RealTimeDrive(odometry, health, self._settings, selector, note, "drive")
+            drive.record.late = deque(maxlen=_KEPT)
+            drive.record.waited = deque(maxlen=_KEPT)
+            arrived: list[int] = []
+            if self._stopped:
+                self._scans.stop()
+            try:
+                for arrival in self._scans.arrivals():
+                    step = drive.step(arrival)
+                    done += 1 + arrival.dropped
+                    self._tell_of_rate(arrived, arrival.due)
+                    publisher.step(step, drive.record)
+                    look("drive", 0, Progressed(done, step, publisher.newest, drive.record))
+            except KeyboardInterrupt:
+                self._scans.stop()
+            return DriveRecord(folder, done, drive.finished(), self._scans.ignored)
+
+    def _begin_with(self, odometry: OdometryInstance, fixed: Selection, *, goes_on: bool) -> None:
+        """Apply the fixed set; an error at the start of the drive if that fails."""
+        try:
+            odometry.apply(fixed)
+        except AdaptuneError as error:
+            if not goes_on:
+                raise
+            _log.warning("the fixed set cannot be applied: %s", error)
+
+    def _tell_of_rate(self, arrived: list[int], due: float) -> None:
+        """Log whether this machine holds the sensor's rate, as soon as that is known."""
+        if len(arrived) < _FIRST:
+            arrived.append(round(due * 1e9))
+            core_ms = np.nan if self._steers else self._setup.core_ms(self._mode, self._model)
+            if len(arrived) == _FIRST and (said := outlook(arrived, self._settings, core_ms)):
+                _log.info("%s", said)
+
+
+class _Publisher:
+    """Publishes and records what a drive finds."""
+
+    def __init__(self, link: RosLink, study: Study, scans: LiveScans):
+        ros, self._scans = study.config.online.ros, scans
+        self._messages = RosMessages(link.store, ros.frame)
+        self._length = study.config.sub_trajectory
+        self._selection = link.advertise(SELECTION_TOPIC, "std_msgs/msg/String")
+        diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
+        self._diagnostics = link.advertise(DIAGNOSTICS_TOPIC, diagnostics)
+        # A node that is steered publishes its own poses.
+        own = ros.steer is None
+        self._odometry = link.advertise(ros.odometry, ODOMETRY) if own else None
+        tf = own and ros.tf
+        self._tf = link.advertise("/tf", "tf2_msgs/msg/TFMessage") if tf else None
+
+    def begin(self, log: DriveLog) -> None:
+        """Begin a drive, which has a log of its own."""
+        self._log = log
+        self.newest: Choice | None = None
+        self._uncertainty = Uncertainty(self._length)
+        self._last: RegisteredScan | None = None
+        self._told: int | None = None
+        self._status = Status()
+
+    def choice(self, choice: Choice) -> None:
+        """Tell of a selection."""
+        self.newest = choice
+        self._log.choice(choice)
+        if not choice.why_not:
+            self._uncertainty.learn(choice.selection)
+        self._selection(self._messages.selection(choice.stamp, choice.selection, choice.why_not))
+
+    def step(self, step: RegisteredScan, record: RealTimeRecord) -> None:
+        """Tell of a pose."""
+        self._log.scan(step, record.late[-1])
+        if self._last is not None:
+            self._uncertainty.move(invert(self._last.T_odom_sensor) @ step.T_odom_sensor)
+        self._last = step
+        where = step.stamp, step.T_odom_sensor, self._scans.frame
+        if self._odometry is not None:
+            self._odometry(self._messages.odometry(*where, self._uncertainty))
+        if self._tf is not None:
+            self._tf(self._messages.transform(*where))
+        self._status.restarts += step.unhealthy is not None
+        if self._told is None or step.stamp - self._told >= _EVERY:
+            self._told = step.stamp
+            selection = None if self.newest is None else self.newest.selection
+            before, self._status = self._status, Status.of(record, self._scans.ignored)
+            message = self._messages.diagnostics(step.stamp, selection, self._status, before)
+            self._diagnostics(message)
+
+
+def _like(study: Study) -> SequenceConfig:
+    """The sequence of the study that was recorded with the robot's sensor."""
+    name = study.config.online.ros.like or study.config.training[0]
+    known = (*study.config.sequences, *study.config.courses)
+    if name not in known:
+        raise AdaptuneError(f"online.ros.like: no sequence {name!r}; {nearest(name, known)}")
+    return study.sequences.config(name)
+
+
+def _selector(
+    setup: ReplaySetup, mode: str, model: ErrorModel | None, steers: bool
+) -> AnySelector | None:
+    """Make the selector; a node that is steered has one set at a time."""
+    if not steers:
+        return setup.selector(mode, model)
+    cost, names, dwell = setup.switch_cost, setup.descriptors, setup.dwell
+    return Selector(needed(mode, model), mode, (), cost, names, dwell)
+
+
+def _topic(link: RosLink, name: str | None, kind: str, key: str) -> str:
+    """A topic, or the only one of a kind that is published."""
+    if name is not None:
+        return name
+    end = time.monotonic() + _PUBLISHED
+    found: list[str] = []
+    while not found and time.monotonic() < end:
+        found = sorted(topic for topic, of in link.topics().items() if of == kind)
+        time.sleep(0.0 if found else 0.2)
+    if len(found) != 1:
+        there = ", ".join(found) or "none"
+        raise AdaptuneError(f"{key}: name the topic; of {kind}, {there} is published")
+    return found[0]
+
+
+def _new_folder(parent: Path) -> Path:
+    """A folder named by the time, which is not there yet."""
+    name = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
+    numbers = itertools.count(2)
+    folder = parent / name
+    while folder.exists():
+        folder = parent / f"{name}_{next(numbers)}"
+    return folder

@@ -1,0 +1,297 @@
+"""The online stage: replay the test sequences in every mode."""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adaptune.errors import AdaptuneError
+from adaptune.model import ErrorModel
+from adaptune.model.descriptor import DescriptorError
+from adaptune.processes import release_memory
+from adaptune.recording.scan import Recording
+from adaptune.selection import Selection
+from adaptune.study.config import StudyConfig
+from adaptune.study.inputs import odometry_inputs
+from adaptune.study.references import ensure_references
+from adaptune.study.study import Study
+from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
+from online.real_time import SelectorProcess, replay_in_real_time
+from online.record import (
+    ReplayIdentity,
+    StoredReplay,
+    is_reference_of,
+    other_keys,
+    repeat_folder,
+    write_reference,
+    write_replay,
+)
+from online.replay import Look, Progressed, Replay, Watch, replay
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is."""
+
+SCANT = 1.5
+"""Training sequences below which a selection rests on hardly more than one."""
+
+_log = logging.getLogger(__name__)
+
+
+class ReplayError(AdaptuneError):
+    """A study that cannot be replayed."""
+
+
+def run_replays(
+    study: Study,
+    model_path: Path,
+    again: bool = False,
+    progress: Progress = lambda *_: None,
+    look: Look | None = None,
+) -> int:
+    """Replay every test sequence in every mode, as often as asked, unless that was done before.
+
+    Parameters
+    ----------
+    study
+        The study; ``replays/<sequence>/<mode>`` in its folder receives the results, and
+        ``repeat_2`` in it, and so on, those of repeats.
+    model_path
+        The error model.
+    again
+        Replay even what was done before.
+    progress
+        Called about every scan.
+    look
+        Sees every scan, see `online.dashboard.Dashboard.look`.
+
+    Returns
+    -------
+    int
+        Number of replays that were made.
+
+    Raises
+    ------
+    AdaptuneError
+        If there is no test sequence, the model is of another odometry, other parameters or other
+        sub-trajectories, or what the study's own model was fitted to has changed.
+    """
+    setup = ReplaySetup.of(study)
+    model = setup.model(study, model_path)
+    if not study.config.test:
+        raise ReplayError("test: name at least one sequence to replay")
+    for mode in setup.also:
+        if (twin := setup.twin(mode, model)) != mode:
+            _log.info("%s is not replayed again: %s drives the same", mode, twin)
+        elif why := setup.obstacle(mode, model):
+            _log.warning("%s is not replayed: %s", mode, why)
+    of = _Modes(setup, setup.modes(model), look, model, model_path)
+    return _replay_all(study, study.config.test, of, again, progress)
+
+
+def run_untrained(
+    study: Study,
+    again: bool = False,
+    progress: Progress = lambda *_: None,
+    look: Look | None = None,
+) -> int:
+    """Replay sequences with the baseline, and with a bank that needs no model.
+
+    Neither trials nor references are needed. The sequences are those of
+    `online.modes.sequences_without_model`; for the rest see `run_replays`.
+
+    Raises
+    ------
+    AdaptuneError
+        If a bank of the odometry is not possible.
+    """
+    setup = ReplaySetup.of(study)
+    setup.untrained_sets()
+    modes = _Modes(setup, WITHOUT_MODEL, look)
+    return _replay_all(study, sequences_without_model(study), modes, again, progress)
+
+
+class _Run(NamedTuple):
+    """A replay to make."""
+
+    sequence: str
+    mode: str
+    repeat: int = 1
+
+    def __str__(self) -> str:
+        again = "" if self.repeat == 1 else f", repeat {self.repeat}"
+        return f"{self.sequence}, {self.mode}{again}"
+
+
+class _Modes(NamedTuple):
+    """The modes to replay, who looks on, and the model of those that need one."""
+
+    setup: ReplaySetup
+    names: tuple[str, ...]
+    look: Look | None = None
+    model: ErrorModel | None = None
+    model_path: Path | None = None
+
+
+def _replay_all(
+    study: Study, sequences: Sequence[str], modes: _Modes, again: bool, progress: Progress
+) -> int:
+    """Replay what was not replayed before; the number of replays that were made.
+
+    Sequences without a reference get an estimated one before, where that is possible.
+    """
+    study.open()
+    refused = ensure_references(study, sequences, progress, required=False)
+    for said in refused.values():
+        _log.warning("%s; it is replayed without a reference, and not judged", said)
+    made = 0
+    for name in sequences:
+        folder, due = study.folder / "replays" / name, dict[_Run, ReplayIdentity]()
+        for run, about in _identities(study, name, modes).items():
+            keys = other_keys(repeat_folder(folder / run.mode, run.repeat), about)
+            if keys:
+                _log.info("%s: replayed again, with another %s", run, ", ".join(keys))
+            if again or keys != []:
+                due[run] = about
+        if due:
+            _replay_due(study, name, due, modes, progress)
+        else:
+            _renew_reference(study, name, folder / modes.names[0])
+        made += len(due)
+    return made
+
+
+def _identities(study: Study, name: str, modes: _Modes) -> dict[_Run, ReplayIdentity]:
+    """All replays of a sequence; each mode has its first one before any has its second."""
+    shared = shared_identity(study, name)
+    digest = "" if modes.model is None else modes.model.digest
+    about = {
+        mode: ReplayIdentity(**modes.setup.identity(mode, modes.model, digest), **shared)
+        for mode in modes.names
+    }
+    return {
+        _Run(name, mode, repeat): of.model_copy(update={"repeat": repeat})
+        for repeat in range(1, study.config.online.repeats + 1)
+        for mode, of in about.items()
+    }
+
+
+def _replay_due(
+    study: Study,
+    name: str,
+    due: Mapping[_Run, ReplayIdentity],
+    modes: _Modes,
+    progress: Progress,
+) -> None:
+    """Make some replays of a sequence."""
+    folder = study.folder / "replays" / name
+    poses, sequence = study.sequences.reference(name), study.sequences.open(name)
+    for i, (run, about) in enumerate(due.items()):
+        what = str(run)
+        release_memory()
+        drive = _in_lockstep if study.config.online.real_time is None else _in_real_time
+        try:
+            watch = partial(_watch, progress, modes.look, what, sequence.n_messages)
+            result = drive(study.config, sequence, run, modes, watch)
+        except DescriptorError as error:
+            raise ReplayError(f"sequences.{name}: {error}") from error
+        progress(what, sequence.n_messages, sequence.n_messages)
+        if i == 0:
+            write_reference(folder, sequence.reference(), result.trajectory, poses)
+        write_replay(repeat_folder(folder / run.mode, run.repeat), result, about, modes.model_path)
+        if modes.model is not None and result.choices:
+            selections = [choice.selection for choice in result.choices]
+            warn_of_scant_evidence(what, selections, modes.setup.fixed(run.mode, modes.model))
+
+
+def _watch(progress: Progress, look: Look | None, what: str, n: int, at: Progressed) -> None:
+    """Pass on how far a replay is."""
+    progress(what, at.done, n)
+    if look is not None:
+        look(what, n, at)
+
+
+def _renew_reference(study: Study, name: str, replayed: Path) -> None:
+    """Write the reference beside the replays again, if it has changed."""
+    poses = study.sequences.reference(name)
+    if not is_reference_of(replayed.parent, poses):
+        trajectory = StoredReplay.read(replayed).trajectory
+        reference = study.sequences.open(name).reference()
+        write_reference(replayed.parent, reference, trajectory, poses)
+        _log.info("%s: the reference has changed; no replay depends on it", name)
+
+
+def _in_lockstep(
+    config: StudyConfig,
+    sequence: Recording,
+    run: _Run,
+    modes: _Modes,
+    watch: Watch,
+) -> Replay:
+    odometry = modes.setup.instance(run.mode, modes.model, run.sequence)
+    selector = modes.setup.selector(run.mode, modes.model, run.sequence, run.repeat)
+    with closing(odometry):
+        return replay(
+            sequence,
+            odometry,
+            config.health,
+            selector,
+            config.online.period,
+            watch,
+            str(run),
+            None if selector is None else selector.fall_back(),
+        )
+
+
+def _in_real_time(
+    config: StudyConfig,
+    sequence: Recording,
+    run: _Run,
+    modes: _Modes,
+    watch: Watch,
+) -> Replay:
+    period, setup = config.online.period, modes.setup
+    assert config.online.real_time is not None
+    odometry = setup.instance(run.mode, modes.model, run.sequence)
+    selector = None
+    with closing(odometry), ExitStack() as stack:
+        if setup.adapts(run.mode):
+            make = partial(setup.selector, run.mode, modes.model, run.sequence, run.repeat)
+            selector = stack.enter_context(closing(SelectorProcess(make, period)))
+        return replay_in_real_time(
+            sequence,
+            odometry,
+            config.health,
+            config.online.real_time,
+            selector,
+            watch,
+            str(run),
+            setup.core_ms(run.mode, modes.model),
+        )
+
+
+def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:
+    """Warn of selections that rest on hardly more than one training stretch."""
+    left = [s for s in selections if s.trial != fixed]
+    few = sum(s.n_sequences < SCANT for s in left)
+    if few:
+        _log.warning(
+            "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
+            "one stretch of the training (see selections.csv); more recordings would show whether "
+            "they hold",
+            what,
+            few,
+            len(left),
+        )
+
+
+def shared_identity(study: Study, name: str) -> dict[str, Any]:
+    """What the replays of a sequence depend on in all modes."""
+    in_real_time = study.config.online.real_time
+    return {
+        "period": study.config.online.period,
+        "real_time": in_real_time and in_real_time.model_dump(mode="json"),
+        "odometry": odometry_inputs(study),
+        "health": study.config.health.model_dump(mode="json"),
+    } | study.sequences.identity(name)

@@ -1,0 +1,346 @@
+import logging
+
+import faulty
+import numpy as np
+import pytest
+import turns
+from needs import needs_evalio
+from walker import at, every, kept, makes, selected, x_of, x_on
+
+from adaptune.bank.bank import Bank
+from adaptune.bank.hand_over import HandOver
+from adaptune.geometry import invert
+from adaptune.odometry import OdometryError
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.evalio import EvalioSettings
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
+from adaptune.odometry.remote import MOST_FAULTS, Isolated, Limits
+from adaptune.selection import Selection
+
+NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+FAR = {"max_correspondence_distance": 1.0, "keyframe_interval": 4.0}
+
+
+def gicp(parameters):
+    return InProcess(KeyframeGicp(parameters))
+
+
+def weigh(bank, *weights):
+    """Apply weights of the members, in their order."""
+    bank.apply(Selection(bank.trials[0], {}, dict(zip(bank.trials, weights, strict=True))))
+
+
+def test_the_mean_of_all_motions_is_taken_by_their_weights():
+    make, made = makes()
+    odometry = Bank(
+        make, {7: {"speed": 1.0}, 3: {"speed": 1.05}, 5: {"speed": 1.09}}, every(3.0), 0.1
+    )
+    x = x_of(odometry, range(5), {2: 5})
+    np.testing.assert_allclose(np.diff(x), [1.0, 1.09, 1.09, 1.09])
+    weigh(odometry, 0.5, 0.0, 0.5)
+    np.testing.assert_allclose(np.diff([x[-1], *x_on(odometry, range(5, 8))]), 1.045)
+    weigh(odometry, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(np.diff(x_on(odometry, range(8, 10))), (1.0 + 1.05 + 1.09) / 3)
+    assert odometry.restarts == 0
+    assert len(made) == 3
+
+
+@pytest.mark.parametrize("lost", range(3))
+def test_a_lost_one_is_left_out_and_started_anew(lost):
+    speeds, weights = np.array([1.0, 1.02, 1.06]), np.array([0.4, 0.3, 0.3])
+    make, made = makes({speeds[lost]: {5: 4.0}})
+    sets = {trial: {"speed": speed} for trial, speed in zip((7, 3, 5), speeds, strict=True)}
+    odometry = Bank(make, sets, every(2.0), 0.1)
+    weigh(odometry, *weights)
+    x = x_of(odometry, range(9))
+    mean, weights[lost] = weights @ speeds, 0.0
+    rest = weights @ speeds / weights.sum()  # Two are more than one, whatever its place.
+    np.testing.assert_allclose(np.diff(x), [mean] * 4 + [rest] + [mean] * 3)
+    assert odometry.restarts == 1
+    # Scans 3, 4 and 5 lie within two seconds.
+    assert [second for second, _ in made[lost].starts] == [0, 3]
+    assert made[lost].seen[-7:] == [5, 3, 4, 5, 6, 7, 8]
+
+
+def test_where_two_disagree_the_heavier_is_believed():
+    make, _ = makes()
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    assert x_of(odometry, range(5), {3: 3}) == [0, 1, 2, 5, 8]
+    for heavy, step, seconds in ((0.4, 1.0, range(5, 8)), (0.6, 3.0, range(8, 11))):
+        weigh(odometry, 1.0 - heavy, heavy)
+        np.testing.assert_allclose(np.diff(x_on(odometry, seconds)), step)
+    assert odometry.restarts == 0
+
+
+def test_a_member_restarts_once_a_second_at_most():
+    make, made = makes({1.02: dict.fromkeys(range(60), 4.0)})
+    sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}
+    odometry = Bank(make, sets, every(2.0), 3.0)
+    odometry.start(odometry.prepare(at(0)), np.eye(4))
+    x = [odometry.register(odometry.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, 41)]
+    # It is lost all the time.
+    np.testing.assert_allclose(np.diff(x), 1.0)
+    assert odometry.restarts == len(made[1].starts) - 1 == 4
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_two_lost_members_that_agree_do_not_outvote_the_one_that_fits_the_scans(place):
+    make, _ = makes()
+    speeds = np.roll([turns.STEP, 0.0, 0.0, 3 * turns.STEP], place)
+    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)}, every(1.0))
+    weigh(bank, *[0.25] * 4)
+    scans = list(map(turns.turn, range(13)))
+    bank.start(bank.prepare(scans[0]), np.eye(4))
+    x = [bank.register(bank.prepare(scan)).T_odom_sensor[0, 3] for scan in scans[1:]]
+    np.testing.assert_allclose(x, turns.STEP * np.arange(1, 13))
+    # The other three, at the first scan and a second later.
+    assert bank.restarts == 6
+
+
+def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
+    make, _ = makes()
+    sets = {trial: {"speed": speed} for trial, speed in enumerate((0.0, 0.001, turns.STEP))}
+    x = {}
+    for lost in (False, True):
+        bank = Bank(make, sets, every(1.0))
+        bank.apply(Selection(0, {}, dict.fromkeys(range(3), 1 / 3), lost=lost))
+        bank.start(bank.prepare(turns.turn(0)), np.eye(4))
+        x[lost] = bank.register(bank.prepare(turns.turn(1))).T_odom_sensor[0, 3]
+    assert x[True] == pytest.approx(turns.STEP)
+    assert x[False] == pytest.approx(0.0005)
+
+
+def test_members_restart_where_the_selection_says_so():
+    make, made = makes()
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
+    x_of(odometry, range(5))
+    odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, restart=frozenset({3})))
+    x_on(odometry, range(5, 8))
+    assert odometry.restarts == 1
+    assert made[0].starts == [(0, 0.0)]
+    # Scan 2 of the last two seconds, at the bank's pose, before the next scan.
+    assert made[1].starts == [(0, 0.0), (2, 2.0)]
+    assert made[1].seen[-6:] == [2, 3, 4, 5, 6, 7]
+
+
+def test_members_that_rest_see_no_scans_until_they_are_woken():
+    make, made = makes()
+    sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.04}}
+    odometry = Bank(make, sets, every(2.0), 0.1)
+    alone = Selection(7, {}, {7: 1.0}, resting=frozenset({3, 5}))
+    odometry.apply(alone)
+    assert x_of(odometry, range(5)) == [0, 1, 2, 3, 4]
+    assert [len(one.seen) for one in made] == [5, 0, 0]
+    assert [t for t, T in odometry.motions.members.items() if np.isfinite(T).all()] == [7]
+    odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, resting=frozenset({5})))
+    np.testing.assert_allclose(np.diff([4.0, *x_on(odometry, range(5, 8))]), 1.01)
+    # As one that restarts, it begins two seconds ago at the bank's pose.
+    assert made[1].starts == [(2, 2.0)]
+    assert made[1].seen == [2, 3, 4, 5, 6, 7]
+    assert not made[2].seen
+    odometry.apply(alone)
+    np.testing.assert_allclose(np.diff(x_on(odometry, range(8, 11))), 1.0)
+    assert len(made[1].seen) == 6
+    # Where the bank starts, those that rest do not.
+    odometry.start(odometry.prepare(at(11)), np.eye(4))
+    assert [len(one.starts) for one in made] == [2, 1, 0]
+    # One that is woken then begins as the others do.
+    odometry.apply(Selection(7, {}, {7: 1.0}))
+    odometry.start(odometry.prepare(at(12)), np.eye(4))
+    x_on(odometry, [13])
+    assert [one.starts[1:] for one in made[1:]] == [[(12, 0.0)], []]
+
+
+@pytest.mark.parametrize("chosen", [1.0, 3.0])
+def test_no_pose_is_worse_than_any(chosen):
+    make, _ = makes({1.0: {3: np.nan}})
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    x = x_of(odometry, range(6), {0: 7 if chosen == 1.0 else 3})
+    assert np.diff(x).tolist() == [chosen, chosen, 3.0, chosen, chosen]
+    assert odometry.restarts == 1
+
+
+def test_no_pose_at_all_is_told():
+    make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    x = x_of(odometry, range(4))
+    assert np.isnan(x[3])
+    # The caller starts it anew.
+    T = np.eye(4)
+    T[0, 3] = 7.0
+    odometry.start(odometry.prepare(at(3)), T)
+    assert odometry.register(odometry.prepare(at(4))).T_odom_sensor[0, 3] == 8.0
+
+
+def test_a_bank_has_no_other_sets():
+    make, _ = makes()
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}}, every(1.0))
+    with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4"):
+        bank.apply(selected(4))
+    with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4, 5"):
+        bank.apply(Selection(7, {}, {7: 0.5, 5: 0.3, 4: 0.2}))
+
+
+def test_motions_of_the_members_by_trial_number():
+    make, made = kept(makes({1.02: {5: 4.0}})[0])
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1)
+    x_of(bank, range(6))
+    whole, members, starts = bank.motions
+    assert starts == 1
+    assert list(members) == [7, 3, 5]
+    # The motion of the lost member before it was restarted.
+    assert [T[0, 3] for T in members.values()] == pytest.approx([1.0, 4.0, 1.06])
+    assert whole[0, 3] == pytest.approx(1.0)
+    motion = np.eye(4)
+    motion[0, 3] = 0.3
+    bank.start(bank.prepare(at(6)), np.eye(4), motion)
+    assert [T[0, 3] for T in (bank.motions[0], *bank.motions[1].values())] == [0.3] * 4
+    made[0].faults, made[2].faults = ["lost"], ["lost, too"]
+    assert bank.faults == ["lost", "lost, too"]
+    assert bank.usage.cpu == sum(instance.usage.cpu for instance in made)
+
+
+def drive(odometry, switch=None, n=30):
+    poses = [np.eye(4)]
+    for i in range(n):
+        if switch and i and i % 5 == 0:
+            odometry.apply(selected(switch[i // 5 % len(switch)]))
+        prepared = odometry.prepare(turns.turn(i % 15))
+        if i == 0:
+            odometry.start(prepared, np.eye(4))
+        else:
+            poses.append(odometry.register(prepared).T_odom_sensor)
+    return np.array(poses)
+
+
+def test_a_bank_of_equal_instances_is_the_single_run():
+    bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    switched = drive(bank, [0, 1], n=15)
+    np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
+
+
+def test_a_bank_that_rests_is_the_single_run():
+    bank = Bank(gicp, {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    bank.apply(Selection(0, {}, {0: 1.0}, resting=frozenset({1})))
+    np.testing.assert_allclose(drive(bank, n=15), drive(gicp(NEAR), n=15), atol=1e-12)
+
+
+def test_a_bank_in_other_processes_is_the_same():
+    def elsewhere(parameters):
+        return Isolated("gicp", parameters, KeyframeSettings(), Limits())
+
+    a, b = (
+        drive(Bank(make, {0: NEAR, 1: FAR}, every(0.5)), [0, 1], 15) for make in (gicp, elsewhere)
+    )
+    np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
+def test_real_odometries_go_straight_on(mechanism):
+    if mechanism == "bank":
+        sets = {0: NEAR, 1: FAR, 2: {**NEAR, "keyframe_interval": 2.0}}
+        poses = drive(Bank(gicp, sets, every(0.5)), [1, 0], n=15)
+    else:
+        poses = drive(HandOver(gicp, NEAR, every(0.5)), [FAR, NEAR], n=15)
+    steps = invert(poses[:-1]) @ poses[1:]
+    np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
+    np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)
+
+
+def with_faulty(fault):
+    """A bank of a walker and an odometry in another process, with their numbers 7 and 3."""
+    walkers, _ = makes()
+
+    def make(parameters):
+        if "x" not in parameters:
+            return walkers(parameters)
+        limits = Limits(seconds=1.0, memory=1.0)
+        return Isolated("faulty:Faulty", {"x": 0.1}, faulty.Settings(fault=fault), limits)
+
+    sets = {3: {"odometry": "mine", "x": 0.1}, 7: {"speed": 0.1}}
+    return Bank(make, sets, every(2.0))
+
+
+def steps_of(bank, n):
+    """How far the bank comes along x with each of so many scans, ten a second."""
+    bank.start(bank.prepare(at(0)), np.eye(4))
+    x = [bank.register(bank.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, n)]
+    return np.diff(x)
+
+
+def test_a_member_that_a_fault_has_ended_is_told_once_and_starts_again(caplog):
+    bank = with_faulty("abort")
+    with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
+        np.testing.assert_allclose(steps_of(bank, 20), 0.1)
+    told = [r.getMessage() for r in caplog.records if r.name == "adaptune.bank.bank"]
+    # The warm-up meets the fault again; after that, it begins without a past.
+    assert told == [
+        "trial 3 (mine) ended: its process was ended by SIGABRT: about to go wrong; the bank goes "
+        "on without it",
+        "trial 3 (mine) is back",
+    ]
+    assert len(bank.faults) >= bank.restarts == 1
+    assert not bank.dead
+    bank.close()
+
+
+def test_one_that_cannot_start_is_out_for_good(caplog):
+    bank = with_faulty("never begins")
+    with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
+        np.testing.assert_allclose(steps_of(bank, 90), 0.1)
+    assert bank.dead == {3}
+    assert len(bank.faults) == MOST_FAULTS
+    # Twice for every restart, with a past and without.
+    assert bank.restarts < MOST_FAULTS
+    told = [r for r in caplog.records if r.name == "adaptune.bank.bank"]
+    assert len(told) == 1
+
+
+def test_other_processes_work_while_members_of_this_one_do():
+    calls, walkers = [], makes()[0]
+
+    class Noted(InProcess):
+        def submit(self, prepared):
+            calls.append(("submit", self.apart))
+            super().submit(prepared)
+
+        def collect(self):
+            calls.append(("collect", self.apart))
+            return super().collect()
+
+    def make(parameters):
+        one = Noted(walkers(parameters).odometry)
+        one.apart = parameters["speed"] > 1.0
+        return one
+
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
+    x_of(bank, range(2))
+    assert calls == [("submit", True), ("submit", False), ("collect", False), ("collect", True)]
+    assert [T[0, 3] for T in bank.motions.members.values()] == [1.0, 1.02]
+
+
+def test_odometries_with_global_state_are_as_if_they_were_alone():
+    needs_evalio()
+    sets = {0: {"voxel_size": 0.4}, 1: {"voxel_size": 0.8}}
+
+    def genz(parameters):
+        return Isolated("genz_icp", parameters, EvalioSettings(), Limits())
+
+    bank, moved = Bank(genz, sets, every(1.0)), []
+    alone = {trial: genz(parameters) for trial, parameters in sets.items()}
+    for i in range(12):
+        if i == 0:
+            bank.start(bank.prepare(turns.turn(0)), np.eye(4))
+            for one in alone.values():
+                one.start(one.prepare(turns.turn(0)), np.eye(4))
+            continue
+        bank.register(bank.prepare(turns.turn(i)))
+        for one in alone.values():
+            one.register(one.prepare(turns.turn(i)))
+        for trial, one in alone.items():
+            np.testing.assert_array_equal(bank.motions.members[trial], one.motions[0])
+        moved.append([T[0, 3] for T in bank.motions.members.values()])
+    assert bank.restarts == 0
+    assert not np.array_equal(*np.transpose(moved))
+    for one in (bank, *alone.values()):
+        one.close()

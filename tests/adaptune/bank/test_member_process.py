@@ -1,0 +1,157 @@
+import os
+import signal
+from pathlib import Path
+
+import drives
+import numpy as np
+import pytest
+
+from adaptune.bank.bank import Bank
+from adaptune.bank.members import KEPT, Member, spread
+from adaptune.odometry.base import InProcess, WarmUp
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.remote import SERVICE, Limits
+from adaptune.processes import server
+from adaptune.recording.scan import Scan
+from adaptune.selection import Selection
+
+POOL = OdometryPool(
+    {
+        name: OdometryFactory(name, {}, odometry_class(name).space, Limits())
+        for name in ("gicp", "vgicp")
+    }
+)
+SETS = [
+    {"odometry": "gicp", "keyframe_interval": 1.0},
+    {"odometry": "vgicp", "keyframe_interval": 2.0},
+    {"odometry": "gicp", "downsampling": 1.0},
+    {"odometry": "vgicp", "resolution": 0.7},
+    {"odometry": "gicp", "keyframe_interval": 3.0, "downsampling": 1.0},
+]
+STEP = 0.25
+"""Metres between scans."""
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return [Scan(stamp, points) for stamp, points, _ in drives.scans(0, 40, STEP)]
+
+
+def bank(n_cores, seconds=1.0):
+    return Bank(
+        POOL,
+        {3 * i: POOL.space.complete(one) for i, one in enumerate(SETS)},
+        WarmUp(seconds=seconds),
+        cores=n_cores,
+    )
+
+
+def run(odometry, scans, before=lambda _: None):
+    """Poses and motions of the members at each scan, with even weights."""
+    trials = odometry.trials
+    odometry.apply(Selection(trials[0], {}, dict.fromkeys(trials, 1.0 / len(trials))))
+    poses, moved = [], []
+    for i, scan in enumerate(scans):
+        before(i)
+        prepared = odometry.prepare(scan)
+        if i == 0:
+            odometry.start(prepared, np.eye(4))
+        else:
+            poses.append(odometry.register(prepared).T_odom_sensor)
+            moved.append(list(odometry.motions.members.values()))
+    odometry.close()
+    return np.array(poses), np.array(moved)
+
+
+def test_members_are_spread_over_the_cores():
+    made = spread(POOL, [POOL.space.complete(one) for one in SETS], 2)
+    # Those that prepare alike are together, and this process has the smaller share.
+    assert [isinstance(one, Member) for one in made] == [False, False, True, True, True]
+    assert len({one.preparation for one in made if isinstance(one, Member)}) == 1
+    made = spread(POOL, [POOL.space.complete(one) for one in SETS], 9)
+    assert sum(isinstance(one, InProcess) for one in made) == 1
+    assert len({one.preparation for one in made}) == 5
+
+
+@pytest.mark.parametrize("n_cores", [2, 3, 8])
+def test_the_number_of_cores_changes_no_motion(scans, n_cores):
+    alone, motions = run(bank(1), scans)
+    together, same = run(bank(n_cores), scans)
+    np.testing.assert_array_equal(together, alone)
+    np.testing.assert_array_equal(same, motions)
+    np.testing.assert_allclose(alone[-1, :3, 3], [STEP * 39, 0.0, 0.0], atol=0.1)
+
+
+def test_members_that_restart_see_the_same_scans(scans):
+    """More scans than a process keeps, and members that are told to restart."""
+
+    def restarting(odometry):
+        def before(i):
+            if i in (10, 25):
+                told = frozenset(odometry.trials[1:])
+                weights = dict.fromkeys(odometry.trials, 0.2)
+                odometry.apply(Selection(0, {}, weights, restart=told))
+
+        return before
+
+    one, other = bank(1), bank(2)
+    poses, motions = run(one, scans, restarting(one))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("adaptune.bank.members.KEPT", 4)
+        # The other process has its own limit: it must know what this one forgot.
+        same, others = run(other, scans, restarting(other))
+    assert one.restarts == other.restarts == 8
+    np.testing.assert_array_equal(same, poses)
+    np.testing.assert_array_equal(others, motions)
+    assert KEPT > 12 * 10
+
+
+def children(process):
+    return map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split())
+
+
+def test_a_process_that_is_killed_costs_its_members_weight(scans):
+    odometry = bank(2)
+
+    def kill(i):
+        if i == 15:
+            for name in ("gicp", "vgicp"):
+                for watcher in children(server(SERVICE, name).process.pid):
+                    for process in children(watcher):
+                        os.kill(process, signal.SIGKILL)
+
+    dead = []
+    poses, _ = run(odometry, scans, lambda i: (kill(i), dead.append(len(odometry.dead))))
+    assert max(dead) == 3
+    assert dead[-1] == 0
+    assert len(odometry.faults) == 3
+    assert set(odometry.faults) == {"its process was ended by SIGKILL"}
+    np.testing.assert_allclose(poses[-1, :3, 3], [STEP * 39, 0.0, 0.0], atol=0.1)
+
+
+def test_usage_counts_the_process_once(scans):
+    odometry = bank(2)
+    run(odometry, scans[:10])
+    used = odometry.usage
+    assert 0.0 < used.elsewhere < used.cpu
+    assert 50.0 < used.memory < 5_000.0
+
+
+def test_parameters_change_in_the_process(scans):
+    for cls, name in ((KeyframeGicp, "gicp"), (KeyframeVgicp, "vgicp")):
+        factory = OdometryFactory(name, {}, cls.space, Limits())
+        other = {"keyframe_interval": 1.0}
+        found = []
+        for n_cores in (1, 2):
+            # The member of the other process, if there is one, is the last.
+            member = spread(factory, [cls.space.baseline] * 2, n_cores)[-1]
+            member.start(member.prepare(scans[0]), np.eye(4))
+            for i, scan in enumerate(scans[1:20]):
+                if i == 5:
+                    member.apply(Selection(0, other))
+                pose = member.register(member.prepare(scan)).T_odom_sensor
+            found.append(pose)
+            member.close()
+        np.testing.assert_array_equal(*found)

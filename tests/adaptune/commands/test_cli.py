@@ -1,0 +1,307 @@
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import commands
+import drives
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from adaptune.archive import Archive
+from adaptune.commands import terminal
+from adaptune.commands.cli import app
+from adaptune.reference.check import proposed_sub_trajectory
+from adaptune.trajectory import Trajectory
+from offline.config import load_study
+
+
+@pytest.fixture
+def adaptune(tmp_path, monkeypatch):
+    """Call the command line in this process, with a terminal of 80 columns."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(terminal.console, "width", 80)
+    return commands.call
+
+
+def process(*arguments, cwd):
+    """Call the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "adaptune.commands.cli", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=os.environ | {"COLUMNS": "80"},
+    )
+
+
+def next_words(done):
+    """The words of the command that is named as the next one, which is said last."""
+    *_, last = done.stdout.splitlines()
+    match = re.fullmatch(r"Next: (?:.*; then )?adaptune (.*?)    # .*", last)
+    assert match, last
+    return shlex.split(match[1])
+
+
+def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file, tmp_path):
+    (tmp_path / "one.bag").symlink_to(study_file.parent / "one.bag")
+    done = adaptune("inspect", "one.bag")
+    assert done.exit_code == 0, done.stderr
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    words = [*next_words(done), "-o", "offline.trials=4", "--folder", "my study[v2]"]
+    for command in ("offline", "online", "compare"):
+        assert words[0] == command
+        done = adaptune(*words)
+        assert done.exit_code == 0, done.stderr
+        words = next_words(done)
+        fewer = [] if command == "compare" else ["-o", "offline.trials=4"]
+        assert words[1:] == ["one.yaml", "--folder", "my study[v2]", *fewer]
+        lines = [line for line in done.stdout.splitlines() if line.strip()]
+        assert len(set(lines)) == len(lines)
+        assert (command == "online") != ("Fixed set: my study[v2]/fixed.yaml" in done.stdout)
+    assert "one_60-100" in done.stdout
+    assert "# try 64 sets; 6 training recordings tell of other recordings" in done.stdout
+    assert (tmp_path / "my study[v2]/comparison/one_60-100.png").exists()
+
+
+def test_what_inspect_prints_with_a_picture_is_a_study(study_file, tmp_path):
+    bag = study_file.parent / "one.bag"
+    done = CliRunner().invoke(app, ["inspect", str(bag), "--png", str(tmp_path / "one.png")])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[-1] == f"First scan: {tmp_path / 'one.png'}"
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    assert load_study(tmp_path / "one.yaml", [], tmp_path / "run").training == ["one_0-60"]
+
+
+@pytest.mark.parametrize(
+    ("tested", "length"),
+    [(0.4, 1.0), (6.0, 2.0), (8.0, 5.0), (20.0, 5.0), (99.0, 10.0), (1e3, 25.0)],
+)
+def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
+    stamps = np.arange(101) * 10**9
+    T = np.tile(np.eye(4), (101, 1, 1))
+    T[:, 0, 3] = np.concatenate([np.linspace(0, 5e3, 61), 5e3 + np.linspace(0, tested, 41)[1:]])
+    assert proposed_sub_trajectory(Trajectory(stamps, T)) == length
+
+
+def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for i, (_, points, _) in enumerate(drives.scans(n_scans=3)):
+        np.save(folder / f"{i}.npy", points)
+    done = CliRunner().invoke(app, ["inspect", str(folder)])
+    assert done.exit_code == 0, done.output
+    assert "reference: none; adaptune estimates one from the scans" in done.stdout
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    study = load_study(tmp_path / "one.yaml", [], tmp_path / "run")
+    assert study.training == ["scans_0-60"]
+    assert study.config.sub_trajectory == 5.0
+
+
+def test_inspect_says_what_to_do_where_the_reference_does_not_serve(tmp_path):
+    still = [(stamp, points, np.eye(4)) for stamp, points, _ in drives.scans(n_scans=3)]
+    bag = drives.write_bag(tmp_path / "still.bag", still)
+    done = CliRunner().invoke(app, ["inspect", str(bag)])
+    assert done.exit_code == 0, done.output
+    assert "write `reference: estimated`" in done.stdout.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("command", "following"),
+    [
+        (["trials"], "validate"),
+        (["trials", "-o", "offline.trials=12"], "offline"),
+        (["validate"], "online"),
+        (["switching", "--seconds", "10"], "online"),
+        (["model", "show", "MODEL"], "online"),
+        (["cache"], "cache"),
+    ],
+)
+def test_other_commands_name_the_next_too(
+    adaptune, study_file, trained_folder, tmp_path, command, following
+):
+    folder = tmp_path / "run"
+    shutil.copytree(trained_folder, folder)
+    if "MODEL" in command:
+        words = [*command[:-1], folder / "model.safetensors"]
+    elif command == ["cache"]:
+        words = command
+    else:
+        words = [*command, study_file, "--folder", folder]
+    done = adaptune(*words)
+    assert done.exit_code == 0, done.stderr
+    assert next_words(done)[0] == following
+    csv = adaptune("trials", study_file, "--folder", folder, "--csv")
+    assert "Next" not in csv.stdout
+
+
+def test_a_model_in_a_study_folder_names_a_command_that_works(adaptune, study_file, tmp_path):
+    folder = tmp_path / "my run"
+    roles = ("-o", "training=[one]", "-o", "test=[two]", "-o", "offline.trials=4")
+    assert adaptune("offline", study_file, *roles, "--folder", folder).exit_code == 0
+    done = adaptune("model", "show", folder)
+    assert "Not validated yet: `adaptune validate` shows what adapting gains" in done.stdout
+    done = adaptune(*next_words(done))
+    assert done.exit_code == 0, done.stderr
+    assert "4 of 4 replays made" in done.stdout
+    done = adaptune("online", folder / "study.yaml", "--folder", folder)
+    assert "All 4 replays were there already" in done.stdout
+    shutil.copy(folder / "model.safetensors", tmp_path)
+    assert "Next:" not in adaptune("model", "show", "model.safetensors").stdout
+
+
+def test_parts_of_a_course_are_recorded_once(adaptune, study_file, tmp_path):
+    course = "courses={cave: {scenes: [cave], length: 10, seed: 1, columns: 64}}"
+    roles = ["training=[cave: 0-50%]", "test=[cave: 50-100%]"]
+    overrides = [word for text in (course, *roles) for word in ("-o", text)]
+    words = ("simulate", study_file, "--folder", "run", *overrides)
+    done = adaptune(*words)
+    assert done.exit_code == 0, done.stderr
+    assert "Recorded 1 of 1 courses" in done.stdout
+    assert [path.name for path in (tmp_path / "run/recordings").glob("*.bag")] == ["cave.bag"]
+    assert "Recorded 0 of 1" in adaptune(*words).stdout
+
+
+def test_the_whole_way(study_file, tmp_path):
+    done = process("offline", study_file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert re.search(
+        r"^Fixed: \d.* % against the baseline's \d.* \(2 sequences\)", done.stdout, re.MULTILINE
+    )
+    assert "Parameters of the fixed set: max_correspondence_distance" in done.stdout
+    assert next_words(done)[:2] == ["validate", str(study_file)]
+    done = process("online", study_file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4 replays made" in done.stdout
+    assert next_words(done)[:2] == ["compare", str(study_file)]
+    done = process("compare", study_file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for mode in ("baseline", "fixed", "paired", "paper"):
+        assert mode in done.stdout
+    assert all(name in done.stdout for name in ("APE [m]", "RPE [m]"))
+    assert done.stdout.startswith("Whether adapting gains is not known, on three: `paired` has ")
+    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Tables and pictures")]
+    assert max(map(len, table.splitlines())) <= 80
+    assert (tmp_path / "runs/small/comparison/three.svg").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["offline", "none.yaml"], "none.yaml: there is no such file or folder; give the YAML"),
+        (["offline", "STUDY", "-o", "offline.sampler=best"], "offline.sampler"),
+        (["simulate", "STUDY"], "there is none to simulate; add one"),
+        (["online", "STUDY"], "model.safetensors: there is no such model"),
+        (["compare", "STUDY"], "run `adaptune online`"),
+        (["online", "STUDY", "--model", "STUDY"], "is not an error model, or damaged"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, [str(study_file) if a == "STUDY" else a for a in arguments])
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_process_ends_with_a_sentence_too(tmp_path):
+    done = process("offline", "none.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "none.yaml: there is no such file" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_inspect_and_cache(adaptune, study_file, tmp_path):
+    done = adaptune("inspect", study_file.parent / "one.bag", "--png", "one.png")
+    assert done.exit_code == 0, done.stderr
+    assert "/points" in done.stdout
+    assert "sequences:" in done.stdout
+    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
+    done = adaptune("inspect", study_file)
+    assert done.exit_code == 2
+    assert "Traceback" not in done.stderr
+    assert adaptune("cache").exit_code == 0
+    assert adaptune("cache", "clear").stdout.startswith("Freed")
+
+
+def test_help_and_version(adaptune):
+    done = adaptune("--help")
+    assert done.exit_code == 0
+    for command in (
+        "inspect",
+        "simulate",
+        "offline",
+        "validate",
+        "online",
+        "oracle",
+        "switching",
+        "compare",
+        "cache",
+    ):
+        assert command in done.stdout
+    assert adaptune("--version").stdout.startswith("adaptune 0.")
+
+
+def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
+    command = [sys.executable, "-m", "adaptune.commands.cli", "offline", str(study_file)]
+    many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
+    campaign = subprocess.Popen(
+        command + many,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # What runs in a shell's background is told to ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+    )
+    archive = Archive(tmp_path / "runs/small/trials")
+    deadline = time.monotonic() + 60
+    while not archive.trial_path("one", 3).exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(campaign.pid, signal.SIGINT)
+    _, said = campaign.communicate(timeout=30)
+    assert campaign.returncode == 130
+    assert "run the same command again" in said
+    assert "Traceback" not in said
+    finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
+    assert adaptune("offline", study_file).exit_code == 0
+    assert {p: p.stat().st_mtime_ns for p in finished} == finished
+
+
+def test_a_deep_inspection_measures_the_reference(adaptune, study_file, tmp_path):
+    bag = study_file.parent / "one.bag"
+    shallow, deep = adaptune("inspect", bag), adaptune("inspect", bag, "--deep")
+    assert deep.exit_code == 0, deep.stderr
+    assert "reference: `--deep` also measures how wrong it is" in shallow.stdout
+    assert "reference: wrong by at most" in deep.stdout
+    # Wrong by a fifth.
+    drive = [
+        (stamp, points, T * np.array([[1, 1, 1, 0.8]] + [[1] * 4] * 3))
+        for stamp, points, T in drives.scans(0, 60)
+    ]
+    done = adaptune("inspect", drives.write_bag(tmp_path / "wrong.bag", drive), "--deep")
+    assert done.exit_code == 0, done.stderr
+    assert re.search(r"sets that\s+differ by less cannot be told apart", done.stdout)
+    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
+    (tmp_path / "wrong.yaml").write_text(done.stdout[begin:end])
+    assert load_study(tmp_path / "wrong.yaml").training == ["wrong_0-60"]
+
+
+def test_a_study_of_one_trial_tells_how_much_the_baseline_varies(adaptune, study_file):
+    keys = ("offline.trials=1", "offline.baseline_runs=3", "offline.runs=whole")
+    options = [word for key in keys for word in ("-o", key)]
+    done = adaptune("offline", study_file, *options, "--folder", "once")
+    assert done.exit_code == 0, done.stderr
+    assert re.search(r"The baseline ran 3 times: rte \[%\] \d\.\d+ in the mean, ", done.stdout)
+    assert "standard deviation 0." in done.stdout  # GICP always does the same
+    assert "the fixed set is the baseline." in done.stdout

@@ -1,0 +1,128 @@
+import dataclasses
+import io
+import logging
+import sys
+import time
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from adaptune.commands import terminal
+from adaptune.commands.cli import app
+from adaptune.commands.terminal import say_next
+from adaptune.model import ErrorModel
+from adaptune.report import tables
+
+ODD = "my[v2] [/b] :x: [red]"
+
+
+def test_text_is_printed_as_it_is(capsys):
+    terminal.say(ODD)
+    terminal.console.print(tables.table(f"title {ODD}", [{f"key {ODD}": ODD}], f"caption {ODD}"))
+    terminal.errors.print(ODD)
+    out, err = capsys.readouterr()
+    assert " ".join(out.split()).count(ODD) == 5
+    assert ODD in err
+
+
+def test_bars_print_names_as_they_are(monkeypatch):
+    screen = Console(file=io.StringIO(), force_terminal=True, width=200)
+    monkeypatch.setattr(terminal, "errors", screen)
+    with terminal.progress() as show:
+        show(ODD, 1, 2, f"remark {ODD}")
+    text = screen.file.getvalue()
+    assert text.count(ODD) >= 2
+
+
+def test_a_line_is_not_broken(capsys):
+    terminal.say("x" * 500)
+    assert "x" * 500 in capsys.readouterr().out
+
+
+def test_errors_print_names_as_they_are(study_file):
+    done = CliRunner().invoke(app, ["offline", str(study_file.with_name("my[v2] [b] :x:.yaml"))])
+    assert "my[v2] [b] :x:.yaml: there is no such file" in done.stderr
+
+
+def test_model_show_prints_what_a_file_says_as_it_is(trained_folder, tmp_path):
+    model = ErrorModel.load(trained_folder / "model.safetensors")
+    file = tmp_path / "my[v2].safetensors"
+    dataclasses.replace(model, provenance={"made by": ODD}).save(file)
+    (tmp_path / "study.yaml").touch()
+    done = CliRunner().invoke(app, ["model", "show", str(file)])
+    assert ODD in " ".join(done.stdout.split())
+    assert f"--model '{file}'" in done.stdout
+
+
+def test_a_log_has_a_line_of_progress_now_and_then(caplog, monkeypatch):
+    monkeypatch.setattr(terminal, "errors", Console(file=io.StringIO(), force_terminal=False))
+    clock = iter(range(100))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    with caplog.at_level(logging.INFO), terminal.progress() as show:
+        for i in range(21):
+            show("trials", i / 2, 10, "best rte 1.0")
+    assert [record.message for record in caplog.records] == [
+        "trials: 2 of 10, about 15 s left, best rte 1.0",
+        "trials: 5 of 10, about 9 s left, best rte 1.0",
+        "trials: 8 of 10, about 3 s left, best rte 1.0",
+    ]
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_time_left_is_told_once_a_piece_is_done_and_no_sooner(caplog, monkeypatch, is_terminal):
+    screen = Console(file=io.StringIO(), force_terminal=is_terminal, width=200)
+    monkeypatch.setattr(terminal, "errors", screen)
+    clock = iter(range(0, 10000, 10))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    with caplog.at_level(logging.INFO), terminal.progress() as show:
+        for done in (0.0, 0.001, 0.9):
+            show("baseline", done, 1)
+        show("runs", 0, 4)
+        show("runs", 0.5, 4)
+        assert " left" not in caplog.text + screen.file.getvalue()
+        show("runs", 2, 4)
+    assert "left" in caplog.text + screen.file.getvalue()
+
+
+def test_what_a_resumed_study_has_done_already_does_not_count(caplog, monkeypatch):
+    monkeypatch.setattr(terminal, "errors", Console(file=io.StringIO(), force_terminal=False))
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    with caplog.at_level(logging.INFO), terminal.progress() as show:
+        # In the first second 1,000 of 2,000, then one a second.
+        for i in range(1000):
+            now = 0.001 * i
+            show("runs", i, 2000)
+        for i in range(1000, 1100):
+            now += 1.0
+            show("runs", i, 2000)
+    assert caplog.messages[-1].startswith("runs: 1099 of 2000, about 15 min left")
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_what_a_second_worker_reads_is_not_shown_again(caplog, monkeypatch, is_terminal):
+    screen = Console(file=io.StringIO(), force_terminal=is_terminal, width=200)
+    monkeypatch.setattr(terminal, "errors", screen)
+    monkeypatch.setattr(terminal, "LOG_EVERY", -1.0)
+    with caplog.at_level(logging.INFO), terminal.progress() as show:
+        for done in (3, 8, 8, 3):
+            show("reading hall", done, 8)
+    said = caplog.text + screen.file.getvalue()
+    assert said.count("3 of 8") <= 1 if not is_terminal else "3/8" not in said
+    assert "8 of 8" in said or "8/8" in said
+
+
+@pytest.mark.parametrize(
+    ("called", "found", "typed"),
+    [
+        (".venv/bin/adaptune", None, ".venv/bin/adaptune"),
+        ("/usr/bin/adaptune", "/usr/bin/adaptune", "adaptune"),
+        ("adaptune/__main__.py", None, "adaptune"),
+    ],
+)
+def test_the_next_command_can_be_copied(capsys, monkeypatch, called, found, typed):
+    monkeypatch.setattr(sys, "argv", [called])
+    monkeypatch.setattr("shutil.which", lambda _: found)
+    say_next("why", "offline", "my study.yaml")
+    assert capsys.readouterr().out == f"Next: {typed} offline 'my study.yaml'    # why\n"

@@ -1,0 +1,147 @@
+"""Descriptors by name, one or several of them."""
+
+import sys
+from importlib import metadata
+
+import numpy as np
+import pytest
+import turns
+
+from adaptune.model.descriptor import (
+    DESCRIPTORS,
+    MOTION,
+    Describer,
+    DescriptorError,
+    averaged,
+    descriptor,
+    lowest_elevation,
+    ndt_histogram,
+)
+from adaptune.recording import Scan
+
+EMPTY = Scan(0, np.empty((0, 3), np.float32))
+
+
+def lit(points):
+    """A scan of what reflects the more the higher it is."""
+    return Scan(0, points, intensities=100.0 + points[:, 2])
+
+
+MINE = """
+import numpy as np
+
+def shape(scan):
+    return [float(len(scan)), 0.5]
+
+def grows(scan):
+    return np.zeros(2 if len(scan) else 1)
+
+def flat(scan):
+    return np.zeros((2, 2))
+
+def unknown(scan):
+    return np.full(3, np.nan if len(scan) else 0.0)
+
+other = 3
+"""
+
+
+@pytest.fixture(autouse=True)
+def mine(tmp_path, monkeypatch):
+    (tmp_path / "my_descriptors.py").write_text(MINE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    sys.modules.pop("my_descriptors", None)
+
+
+@pytest.mark.parametrize("name", DESCRIPTORS)
+def test_every_descriptor_describes_any_scan_by_as_many_numbers(name):
+    describe = Describer([name])
+    sizes = set()
+    for scan in (
+        EMPTY,
+        lit(turns.turn(0).points),
+        lit(turns.turn(0).points[:1]),
+        lit(turns.turn(1).points),
+    ):
+        described = describe(scan)
+        assert described.dtype == np.float32
+        assert np.isfinite(described).all()
+        sizes.add(described.shape)
+    assert sizes == {(describe.blocks[name],)}
+
+
+@pytest.mark.parametrize("name", [name for name in DESCRIPTORS if name != MOTION])
+def test_every_descriptor_tells_places_apart_and_not_headings(name):
+    describe = Describer([name])
+    here, there = turns.turn(0).points, turns.turn(40).points
+    # The street's end, and the same place faced backwards: columns of rays stay where they were.
+    turned = here * np.array([-1, -1, 1], np.float32)
+    one, other, again = (describe(lit(points)) for points in (here, there, turned))
+    assert np.linalg.norm(one - again) < 0.3 * np.linalg.norm(one - other)
+
+
+def test_several_descriptors_stand_one_after_the_other():
+    describe = Describer(["my_descriptors:shape", "ndt"])
+    scan = turns.turn(0)
+    assert describe.blocks == {"my_descriptors:shape": 2, "ndt": 90}
+    want = np.concatenate([[len(scan), 0.5], ndt_histogram(scan.points)])
+    np.testing.assert_array_equal(describe(scan), want)
+
+
+def test_descriptors_of_other_packages(monkeypatch):
+    point = metadata.EntryPoint("theirs", "my_descriptors:shape", "adaptune.descriptors")
+    monkeypatch.setattr("adaptune.plugins.entry_points", lambda group: [point] * bool(group))
+    assert Describer(["theirs"]).blocks == {"theirs": 2}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("ntd", "there is no descriptor 'ntd': did you mean 'ndt'.*module:function"),
+        ("no_such_module:f", "cannot import no_such_module .*PYTHONPATH"),
+        ("my_descriptors:shap", "my_descriptors has no shap"),
+        ("my_descriptors:", "my_descriptors has no function"),
+        ("my_descriptors:other", "not a function"),
+    ],
+)
+def test_names_that_do_not_do(name, message):
+    with pytest.raises(DescriptorError, match=message):
+        descriptor(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("my_descriptors:grows", r"scan 0 by an array of shape \(2,\), instead of \(1,\)"),
+        ("my_descriptors:flat", r"of shape \(2, 2\), instead of one axis"),
+        ("my_descriptors:unknown", "NaN or infinity"),
+    ],
+)
+def test_arrays_that_do_not_do(name, message):
+    with pytest.raises(DescriptorError, match=message):
+        Describer([name])(turns.turn(0))
+
+
+def test_averages_are_of_what_a_selector_has_seen():
+    stamps = np.array([0.0, 0.4, 1.0, 1.4, 2.1, 2.5, 6.0])
+    descriptors = np.arange(7, dtype=np.float32)[:, None] ** 2
+    found = averaged(descriptors, (stamps * 1e9).astype(np.int64), 3, 1.0)
+    # Frames at or before t, t - 1 and t - 2, where there are such.
+    seen = [[0], [1], [2, 0], [3, 1], [4, 2, 0], [5, 3, 1], [6, 5, 5]]
+    np.testing.assert_allclose(found[:, 0], [np.mean(np.square(s)) for s in seen], rtol=1e-6)
+    np.testing.assert_array_equal(
+        averaged(descriptors, (stamps * 1e9).astype(np.int64), 1, 1.0), descriptors
+    )
+
+
+def test_lowest_elevation_is_the_lowest_beams():
+    azimuth = np.linspace(-np.pi, np.pi, 500)
+    beams = []
+    for degrees in (-30.0, -10.0, 10.0):
+        r = 5.0 + np.sin(azimuth)
+        beams.append([r * np.cos(azimuth), r * np.sin(azimuth), r * np.tan(np.radians(degrees))])
+    points = np.concatenate([np.array(b).T for b in beams]).astype(np.float32)
+    points[7] = [1.0, 0.0, -50.0]  # one stray return
+    assert lowest_elevation(Scan(0, points)) == pytest.approx(-30.0, abs=1e-3)
+    assert np.isnan(lowest_elevation(Scan(0, np.empty((0, 3), np.float32))))

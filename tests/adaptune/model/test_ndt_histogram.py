@@ -1,0 +1,254 @@
+"""The histogram of NDT cells, and its principal components."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptune.model.descriptor import ndt_histogram
+
+modest = settings(max_examples=20, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def street(seed=0, n=4000, turn=0.0):
+    """Points of a ground, two walls, poles and a few bushes, float32 of shape (about n, 3)."""
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-1, 1, (n, 3))
+    ground = np.c_[25 * u[:, 0], 25 * u[:, 1], np.full(n, -1.73)][: n // 3]
+    walls = np.c_[30 * u[:, 0], 9.3 * np.sign(u[:, 1]), 4 + 5 * u[:, 2]][: n // 3]
+    at = rng.uniform(-20, 20, (12, 2))[rng.integers(0, 12, n // 6)]
+    poles = np.c_[at, rng.uniform(-1.7, 5, n // 6)]
+    at = rng.uniform(-15, 15, (6, 3))[rng.integers(0, 6, n // 6)]
+    points = np.concatenate([ground, walls, poles, at + rng.normal(0, 0.5, at.shape)])
+    points += rng.normal(0, 0.02, points.shape)
+    return (points @ turn_z(turn).T).astype(np.float32)
+
+
+def turn_z(angle):
+    return np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+
+
+def blob(seed, n, deviations, rotation=None, at=(0.5, 0.5, 0.5)):
+    """Points in one cell, whose covariance is exactly as asked."""
+    points = np.random.default_rng(seed).normal(size=(n, 3))
+    points -= points.mean(axis=0)
+    # Whitened by their own covariance.
+    points = points @ np.linalg.inv(np.linalg.cholesky(points.T @ points / n)).T
+    points *= deviations
+    if rotation is not None:
+        points = points @ rotation.T
+    assert np.abs(points).max() < 0.5
+    return (points + np.asarray(at)).astype(np.float32)
+
+
+def plain_histogram(points):
+    """The same by np.linalg.eigh, a cell at a time."""
+    points = np.asarray(points, np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    counts = np.zeros((10, 9))
+    cells = {}
+    for point in points:
+        cells.setdefault(tuple(np.floor(point).astype(int)), []).append(point)
+    for members in cells.values():
+        if len(members) < 6:
+            continue
+        mean = np.mean(members, axis=0)
+        distance = int(np.hypot(mean[0], mean[1]) / 3.0)
+        values, vectors = np.linalg.eigh(np.cov(np.transpose(members), bias=True))
+        if distance >= 10 or values[2] < 1e-12:
+            continue
+        counts[distance, plain_shape(values, vectors)] += 1
+    return counts.ravel()
+
+
+def plain_shape(values, vectors):
+    (l3, l2, l1), (v3, _, v1) = values, vectors.T
+    if l2 / l1 < 0.1:
+        return min(2, int(3 * abs(v1[2])))
+    if l3 / l2 < 0.1:
+        return 3 + min(2, int(3 * abs(v3[2])))
+    return 6 + (0 if l2 / l1 < 0.25 else 1 if l2 / l1 < 0.5 else 2)
+
+
+@modest
+@given(seeds)
+def test_histogram_follows_its_definition(seed):
+    points = street(seed)
+    histogram = ndt_histogram(points)
+    assert histogram.sum() > 50
+    np.testing.assert_array_equal(histogram, plain_histogram(points))
+
+
+@modest
+@given(seeds, st.floats(0.01, 0.3), st.floats(0.01, 1.0), st.floats(0.01, 1.0))
+def test_any_shape_follows_its_definition(seed, size, second, third):
+    """Cells of every kind, through their covariance."""
+    rng = np.random.default_rng(seed)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = []
+    for _ in range(20):
+        cell = rng.integers([-31, -31, -20], [31, 31, 20]) + 0.5
+        points.append(
+            np.clip(rng.normal(size=(40, 3)) * size * np.array([1, second, third]), -0.45, 0.45)
+            @ rotation.T
+            * 0.55
+            + cell
+        )
+    points = np.concatenate(points).astype(np.float32)
+    np.testing.assert_array_equal(ndt_histogram(points), plain_histogram(points))
+
+
+def tilted(angle):
+    """Turns x to an elevation of `angle`, about y."""
+    return np.array(
+        [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+    )
+
+
+LINE, PLANE = (0.1, 0.02, 0.01), (0.1, 0.1, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("deviations", "angle", "shape"),
+    [
+        (LINE, 0.0, 0),
+        (LINE, np.arcsin(0.32), 0),
+        (LINE, np.arcsin(0.35), 1),
+        (LINE, -np.arcsin(0.65), 1),
+        (LINE, np.arcsin(0.68), 2),
+        (LINE, np.pi / 2, 2),
+        ((0.1, 0.0, 0.0), np.pi / 2, 2),
+        (PLANE, 0.0, 5),
+        (PLANE, np.arccos(0.68), 5),
+        (PLANE, np.arccos(0.65), 4),
+        (PLANE, -np.arccos(0.35), 4),
+        (PLANE, np.arccos(0.32), 3),
+        (PLANE, np.pi / 2, 3),
+        ((0.1, 0.1, 0.0), 0.0, 5),
+        # Variances, of which the ratios are taken, are squares.
+        ((0.1, 0.1 * 0.31**0.5, 0.031), 0.3, 7),
+        ((0.1, 0.1 * 0.09**0.5, 0.03), np.pi / 2, 2),
+        ((0.1, 0.1 * 0.11**0.5, 0.03), 0.3, 6),
+        ((0.1, 0.1 * 0.24**0.5, 0.03), 0.3, 6),
+        ((0.1, 0.1 * 0.26**0.5, 0.03), 0.3, 7),
+        ((0.1, 0.1 * 0.49**0.5, 0.03), 0.3, 7),
+        ((0.1, 0.1 * 0.51**0.5, 0.03), 0.3, 8),
+        ((0.1, 0.1, 0.1), 0.0, 8),
+        ((0.1, 0.1, 0.1 * 0.11**0.5), 0.0, 8),
+        ((0.1, 0.1, 0.1 * 0.09**0.5), 0.0, 5),
+    ],
+)
+def test_shapes(deviations, angle, shape):
+    for seed in range(3):
+        histogram = ndt_histogram(blob(seed, 60, deviations, tilted(angle)))
+        assert np.flatnonzero(histogram).tolist() == [shape]
+        assert histogram[shape] == 1
+
+
+@pytest.mark.parametrize(
+    ("at", "distance"),
+    [
+        ((0.5, 0.5, 0.5), 0),
+        ((2.5, 1.5, 0.5), 0),
+        ((2.5, 1.7, 0.5), 1),
+        ((-0.5, 3.5, -40.5), 1),
+        ((-20.5, -20.5, 0.5), 9),
+        ((29.6, 0.5, 100.5), 9),
+        ((21.5, -21.5, 0.5), None),
+        ((30.5, 0.5, 0.5), None),
+        ((1e6 + 0.5, 0.5, 0.5), None),
+        ((0.5, 0.5, 1e9), None),
+    ],
+)
+def test_distance_is_horizontal_to_the_mean(at, distance):
+    histogram = ndt_histogram(blob(1, 50, (0.03, 0.03, 0.03), at=at))
+    assert np.flatnonzero(histogram).tolist() == ([] if distance is None else [9 * distance + 8])
+
+
+def test_the_mean_decides_where_a_cell_lies():
+    far = blob(1, 30, (0.01, 0.01, 0.01), at=(29.95, 2.5, 0.5))
+    near = blob(2, 30, (0.01, 0.01, 0.01), at=(29.05, 2.5, 0.5))
+    assert ndt_histogram(far).sum() == 0
+    assert ndt_histogram(near).sum() == 1
+    # Points beyond 30 m still belong to a cell whose mean is nearer.
+    both = np.concatenate([near, near, far])
+    np.testing.assert_array_equal(ndt_histogram(both), plain_histogram(both))
+    assert ndt_histogram(both)[81:].sum() == 1
+
+
+def test_a_cell_needs_six_points():
+    points = blob(3, 6, (0.05, 0.05, 0.05))
+    assert ndt_histogram(points).sum() == 1
+    assert ndt_histogram(points[:5]).sum() == 0
+
+
+def test_points_of_two_cells_do_not_mix():
+    # Half a metre apart, on both sides of a face at 0, with five points each.
+    left, right = (
+        blob(4, 5, (0.05, 0.05, 0.05)),
+        blob(5, 5, (0.05, 0.05, 0.05), at=(-0.5, 0.5, 0.5)),
+    )
+    assert ndt_histogram(np.concatenate([left, right])).sum() == 0
+
+
+def test_one_point_seen_many_times_has_no_shape():
+    assert ndt_histogram(np.full((50, 3), 0.3, np.float32)).sum() == 0
+
+
+def test_an_empty_cloud():
+    assert ndt_histogram(np.empty((0, 3), np.float32)).tolist() == [0.0] * 90
+
+
+@modest
+@given(seeds, st.sampled_from([1, 2, 3]))
+def test_quarter_turns_change_nothing(seed, quarters):
+    points = street(seed)
+    x, y, z = points[(points[:, :2] % 1 != 0).all(axis=1)].T
+    for _ in range(quarters):
+        x, y = -y, x
+    turned = np.stack([x, y, z], axis=1)
+    np.testing.assert_array_equal(ndt_histogram(turned), ndt_histogram(points))
+
+
+def l1_share(a, b):
+    return np.abs(a - b).sum() / (a.sum() + b.sum())
+
+
+@modest
+@given(seeds, st.floats(0.0, 2 * np.pi))
+def test_any_turn_changes_little(seed, angle):
+    """Cells are cut differently, but what the place looks like stays."""
+    points = street(seed, 20000)
+    still, turned = ndt_histogram(points), ndt_histogram(street(seed, 20000, angle))
+    bare = ndt_histogram(points[points[:, 2] < -1.5])
+    assert l1_share(still, turned) < 0.2
+    assert l1_share(still, turned) < 0.5 * l1_share(still, bare)
+
+
+@modest
+@given(seeds)
+def test_order_does_not_matter(seed):
+    points = street(seed)
+    shuffled = np.random.default_rng(seed).permutation(points)
+    np.testing.assert_array_equal(ndt_histogram(shuffled), ndt_histogram(points))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_points_that_are_not_finite_do_not_count(bad):
+    points = street()
+    rows = np.repeat(points[:300], 2, axis=0)
+    rows[np.arange(600), np.arange(600) % 3] = bad
+    mixed = np.random.default_rng(0).permutation(np.concatenate([points, rows]))
+    np.testing.assert_array_equal(ndt_histogram(mixed), ndt_histogram(points))
+    assert ndt_histogram(rows).sum() == 0
+
+
+def test_other_layouts_and_types_of_points():
+    points = street()
+    want = ndt_histogram(points)
+    np.testing.assert_array_equal(ndt_histogram(points.astype(np.float64)), want)
+    np.testing.assert_array_equal(ndt_histogram(np.asfortranarray(points)), want)
+    np.testing.assert_array_equal(ndt_histogram(np.repeat(points, 2, axis=0)[::2]), want)

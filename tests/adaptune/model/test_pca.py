@@ -1,0 +1,70 @@
+"""Principal components of descriptors."""
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+from sklearn.decomposition import PCA
+from sklearn.pipeline import make_pipeline
+
+from adaptune.model.descriptor import ScaledPCA
+
+
+def counts(seed, n=60):
+    """Histograms of a random mixture of places, of shape (n, 90)."""
+    rng = np.random.default_rng(seed)
+    places = rng.gamma(0.3, 40.0, (4, 90))
+    return rng.poisson(rng.dirichlet(np.ones(4), n) @ places).astype(float)
+
+
+def test_components_are_those_of_sklearn_divided_by_one_number():
+    X = counts(0)
+    scaled = ScaledPCA().fit(X)
+    want = PCA(10, svd_solver="full").fit(X)
+    deviations = want.transform(X).std(axis=0)
+    np.testing.assert_allclose(scaled.scale_, deviations.mean())
+    fresh = counts(1, 20)
+    np.testing.assert_allclose(scaled.transform(fresh), want.transform(fresh) / deviations.mean())
+    assert scaled.transform(X).std(axis=0).mean() == pytest.approx(1.0)
+
+
+def test_the_unit_of_the_counts_does_not_matter():
+    X = counts(2)
+    near, far = ScaledPCA().fit(X), ScaledPCA().fit(7.0 * X)
+    np.testing.assert_allclose(near.transform(X), far.transform(7.0 * X), atol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "components"), [(60, 10), (10, 10), (7, 7), (2, 2), (1, 1)])
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_few_scans_have_few_components(n, components):
+    X = counts(3, n)
+    transformed = ScaledPCA().fit_transform(X)
+    assert transformed.shape == (n, components)
+    assert np.isfinite(transformed).all()
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_scans_that_are_all_the_same():
+    X = np.tile(counts(4, 1), (8, 1))
+    scaled = ScaledPCA().fit(X)
+    np.testing.assert_allclose(scaled.transform(X), 0.0, atol=1e-9)
+    assert np.abs(scaled.transform(X + 1.0)).max() < 100
+
+
+def test_each_block_has_components_of_its_own():
+    rng = np.random.default_rng(0)
+    a, b = rng.gamma(1.0, 100.0, (40, 20)), rng.normal(size=(40, 3))
+    both = ScaledPCA(n_components=5, blocks=(20, 3)).fit(np.hstack([a, b]))
+    fresh = np.hstack([a, b])[:7] + 0.1
+    want = [ScaledPCA(n_components=5).fit(x) for x in (a, b)]
+    assert both.components_.shape == (8, 23)
+    np.testing.assert_allclose(
+        both.transform(fresh),
+        np.hstack([want[0].transform(fresh[:, :20]), want[1].transform(fresh[:, 20:])]),
+        atol=1e-9,
+    )
+
+
+def test_it_is_an_sklearn_estimator():
+    pca = clone(ScaledPCA(n_components=4))
+    assert pca.get_params() == {"n_components": 4, "blocks": None}
+    assert make_pipeline(pca).fit_transform(counts(3, 8)).shape == (8, 4)

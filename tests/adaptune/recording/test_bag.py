@@ -1,0 +1,434 @@
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptune.errors import AdaptuneError
+from adaptune.recording import SequenceConfig, SequenceError
+from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.recording.opening import open_sequence
+
+
+def opened(path: Path | list[Path], **options: Any) -> Any:
+    bag = [str(p) for p in path] if isinstance(path, list) else str(path)
+    return open_sequence(SequenceConfig(**({"bag": bag, "cache": False} | options)))
+
+
+def same(a: list[Any], b: list[Any], shift: int = 0) -> bool:
+    return len(a) == len(b) and all(
+        x.stamp == y.stamp + shift
+        and np.array_equal(x.points, y.points)
+        and np.array_equal(x.times, y.times)
+        and np.array_equal(x.rings, y.rings)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "compression"),
+    [
+        ("a.bag", None),
+        ("a.bag", "BZ2"),
+        ("a.bag", "LZ4"),
+        ("a.sqlite3", None),
+        ("a.sqlite3", "FILE"),
+        ("a.sqlite3", "MESSAGE"),
+        ("a.mcap", None),
+        ("a.mcap", "STORAGE"),
+        ("a.mcap", "FILE"),
+    ],
+)
+def test_every_container_and_compression_gives_the_same(
+    rec: Any, tmp_path: Path, name: str, compression: str | None
+) -> None:
+    sequence = opened(rec.drive(tmp_path / name, compression=compression), reference="/poses")
+    scans = list(sequence)
+    clouds = rec.scans(20)
+    assert [scan.stamp for scan in scans] == [rec.START + i * 10**8 for i in range(20)]
+    assert sequence.n_messages == 20
+    for scan, points in zip(scans, clouds, strict=True):
+        assert np.array_equal(scan.points, points)
+        assert np.array_equal(scan.times, rec.velodyne(points)["time"])
+        assert np.array_equal(scan.rings, np.arange(60) % 16)
+    reference = sequence.reference()
+    assert reference.stamps[0] == rec.START
+    np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.1 * np.arange(40))
+
+
+def test_bare_files_and_folders_without_metadata_are_read(rec: Any, tmp_path: Path) -> None:
+    whole = list(opened(rec.drive(tmp_path / "a.mcap")))
+    folder = rec.drive(tmp_path / "b.sqlite3")
+    (folder / "metadata.yaml").unlink()
+    assert same(list(opened(tmp_path / "a.mcap" / "a.mcap.mcap")), whole)
+    assert same(list(opened(folder)), whole)
+    assert same(list(opened(next(folder.glob("*.db3")))), whole)
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_bags_that_follow_each_other_are_one(rec: Any, tmp_path: Path, suffix: str) -> None:
+    clouds, parts = rec.scans(6), []
+    for part in range(3):
+        path = tmp_path / f"part_{part}{suffix}"
+        store = rec.store_of(path)
+        stamps = [rec.START + i * 10**8 for i in (2 * part, 2 * part + 1)]
+        messages = [
+            ("/points", s, rec.cloud(rec.velodyne(clouds[2 * part + i]), s, store))
+            for i, s in enumerate(stamps)
+        ]
+        parts.append(rec.write_bag(path, messages))
+    sequence = opened(parts[::-1])
+    assert "2 more" in sequence.name
+    scans = list(sequence)
+    assert all(np.array_equal(s.points, c) for s, c in zip(scans, clouds, strict=True))
+    assert same(list(opened(tmp_path / f"part_*{suffix}")), scans)
+    if suffix == ".bag":
+        assert same(list(opened(tmp_path)), scans)
+
+
+def test_a_section_counts_from_the_first_scan(rec: Any, tmp_path: Path) -> None:
+    bag = rec.drive(tmp_path / "a.bag")
+    stamps = [(s.stamp - rec.START) // 10**8 for s in opened(bag, start=0.45, stop=1.5, stride=3)]
+    assert stamps == [5, 8, 11, 14]
+    with pytest.raises(SequenceError, match=r"no scan between start = 7 s and stop = the end"):
+        list(opened(bag, start=7))
+
+
+def test_topics_are_found_or_asked_for(rec: Any, tmp_path: Path) -> None:
+    bag = rec.drive(tmp_path / "a.bag")
+    for options, message in [
+        ({"points": "/pionts"}, r"no topic /pionts; did you mean '/points'\?"),
+        ({"points": "/poses"}, "/poses is geometry_msgs/msg/PoseStamped, not point clouds"),
+        ({"reference": "/points"}, "not poses"),
+        ({"imu": {"topic": "/imu"}}, "no topic /imu"),
+    ]:
+        with pytest.raises(SequenceError, match=message):
+            opened(bag, **options)
+    messages = [
+        (topic, rec.START, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1))
+        for topic in ("/a", "/b")
+    ]
+    two = rec.write_bag(tmp_path / "two.bag", messages)
+    with pytest.raises(SequenceError, match="2 topics with point clouds, name one of them: /a, /b"):
+        opened(two)
+    assert len(list(opened(two, points="/b"))) == 1
+
+
+def poses_of(rec: Any, store: Any) -> dict[str, list[Any]]:
+    """Two poses in a message of each type, at (0, 0, 0) and (1, 2, 3) turned half about z."""
+    t = store.types
+    q = (0.0, 0.0, 1.0, 0.0)
+    stamps = (rec.START, rec.START + 10**9)
+    where = (((0, 0, 0), (0, 0, 0, 1)), ((1, 2, 3), q))
+    poses = [rec.bare_pose(p, o, store) for p, o in where]
+    stamped = [rec.pose(s, p, o, store) for s, (p, o) in zip(stamps, where, strict=True)]
+    covariance = np.zeros(36)
+    with_covariance = [t["geometry_msgs/msg/PoseWithCovariance"](p, covariance) for p in poses]
+    zero = t["geometry_msgs/msg/Vector3"](0, 0, 0)
+    twist = t["geometry_msgs/msg/TwistWithCovariance"](
+        t["geometry_msgs/msg/Twist"](zero, zero), covariance
+    )
+    headers = [rec.header(s, "map", store) for s in stamps]
+    transforms = [
+        t["geometry_msgs/msg/TransformStamped"](
+            h,
+            "lidar",
+            t["geometry_msgs/msg/Transform"](
+                t["geometry_msgs/msg/Vector3"](*p), t["geometry_msgs/msg/Quaternion"](*o)
+            ),
+        )
+        for h, (p, o) in zip(headers, where, strict=True)
+    ]
+    return {
+        "PoseStamped": stamped,
+        "PoseWithCovarianceStamped": [
+            t["geometry_msgs/msg/PoseWithCovarianceStamped"](h, p)
+            for h, p in zip(headers, with_covariance, strict=True)
+        ],
+        "Odometry": [
+            t["nav_msgs/msg/Odometry"](h, "lidar", p, twist)
+            for h, p in zip(headers, with_covariance, strict=True)
+        ],
+        "Path": [t["nav_msgs/msg/Path"](headers[1], stamped[:n]) for n in (1, 2)],
+        "TransformStamped": transforms,
+        "TFMessage": [t["tf2_msgs/msg/TFMessage"]([x]) for x in transforms],
+    }
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "PoseStamped",
+        "PoseWithCovarianceStamped",
+        "Odometry",
+        "Path",
+        "TransformStamped",
+        "TFMessage",
+    ],
+)
+def test_poses_come_in_many_types(rec: Any, tmp_path: Path, kind: str, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    store = rec.store_of(path)
+    messages = [("/points", rec.START, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, store))]
+    messages += [("/truth", rec.START + i, m) for i, m in enumerate(poses_of(rec, store)[kind])]
+    reference = opened(rec.write_bag(path, messages), reference="/truth").reference()
+    assert reference.stamps.tolist() == [rec.START, rec.START + 10**9]
+    np.testing.assert_allclose(reference.T_world_sensor[1][:3, 3], [1, 2, 3])
+    np.testing.assert_allclose(np.diag(reference.T_world_sensor[1]), [-1, -1, 1, 1], atol=1e-12)
+
+
+def test_of_transforms_one_frame_is_taken(rec: Any, tmp_path: Path) -> None:
+    transforms = [m.transforms[0] for m in poses_of(rec, rec.ROS1)["TFMessage"]]
+    transforms[0].child_frame_id = "base"
+    messages = [
+        ("/points", rec.START, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)),
+        ("/tf", rec.START, rec.ROS1.types["tf2_msgs/msg/TFMessage"](transforms)),
+    ]
+    bag = rec.write_bag(tmp_path / "a.bag", messages)
+    with pytest.raises(SequenceError, match="name one of them as `child_frame`: base, lidar"):
+        opened(bag, reference="/tf").reference()
+    with pytest.raises(SequenceError, match="did you mean 'lidar'"):
+        opened(bag, reference="/tf", child_frame="lida").reference()
+    assert len(opened(bag, reference="/tf", child_frame="base").reference()) == 1
+
+
+def livox(rec: Any, store: Any, kind: str, points: np.ndarray) -> Any:
+    t = store.types
+    each = [
+        t[kind.replace("Msg", "Point")](i * 1000, *map(float, p), 10, 16, i % 6)
+        for i, p in enumerate(points)
+    ]
+    rsvd = np.zeros(3, np.uint8)
+    return t[kind](rec.header(rec.START, "x", store), rec.START, len(each), 1, rsvd, each)
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".sqlite3"])
+@pytest.mark.parametrize("kind", LIVOX_TYPES)
+@pytest.mark.parametrize("n", [0, 1, 2, 50])
+def test_livox_messages_are_read(rec: Any, tmp_path: Path, kind: str, suffix: str, n: int) -> None:
+    path = tmp_path / f"a{suffix}"
+    points = rec.scans(1, n)[0]
+    message = livox(rec, rec.store_of(path), kind, points)
+    (scan,) = opened(rec.write_bag(path, [("/livox/lidar", rec.START, message)]))
+    assert scan.stamp == rec.START
+    assert np.array_equal(scan.points, points)
+    np.testing.assert_allclose(scan.times, np.arange(n) * 1e-6, atol=1e-9)
+    assert np.array_equal(scan.rings, np.arange(n) % 6)
+
+
+def test_a_livox_message_cut_short_is_an_error(rec: Any) -> None:
+    from adaptune.recording import clouds as module
+    from adaptune.recording.clouds import PointCloudError
+    from adaptune.recording.scan import AUTO
+
+    kind = LIVOX_TYPES[0]
+    fields = {cdr: store.fielddefs for cdr, store in ((False, rec.ROS1), (True, rec.ROS2))}
+    for cdr, store in ((False, rec.ROS1), (True, rec.ROS2)):
+        message = livox(rec, store, kind, rec.scans(1, 5)[0])
+        data = bytes((store.serialize_cdr if cdr else store.serialize_ros1)(message, kind))
+        args = (fields[cdr][kind][1], fields[cdr][kind.replace("Msg", "Point")][1], cdr, AUTO)
+        assert len(module.decode_livox(data, *args)) == 5
+        for length in range(0, len(data), 7):
+            with pytest.raises(PointCloudError):
+                module.decode_livox(data[:length], *args)
+
+
+def bag_of_stamps(rec: Any, path: Path, stamps: list[float], delay: float = 0.0) -> Path:
+    """One scan each 0.1 s on the recorder's clock, stamped as said, in seconds."""
+    clouds = rec.scans(len(stamps))
+    messages = [
+        (
+            "/points",
+            rec.START + round((0.1 * i + delay) * 1e9),
+            rec.cloud(rec.velodyne(c), rec.START + round(s * 1e9), rec.ROS1),
+        )
+        for i, (s, c) in enumerate(zip(stamps, clouds, strict=True))
+    ]
+    return rec.write_bag(path, messages)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "kept", "told"),
+    [
+        ([0, 0.1, 0.1, 0.3], [0, 0.1, 0.3], "1 scans whose stamps do not come after"),
+        ([0, 0.1, 0.05, 0.3], [0, 0.1, 0.3], "1 scans whose stamps do not come after"),
+        ([0, 0.1, 900, 0.3, 0.4], [0, 0.1, 0.3, 0.4], "1 scans whose stamps leap ahead"),
+        ([900, 0.1, 0.2, 0.3], [0.1, 0.2, 0.3], "1 scans whose stamps leap ahead"),
+        ([0, 0.1, 0.2, 900], [0, 0.1, 0.2, 900], None),
+        ([0, 0.1, 30.2, 30.3], [0, 0.1, 30.2, 30.3], None),
+    ],
+)
+@pytest.mark.parametrize("cache", [False, True])
+def test_wrong_stamps_cost_the_fewest_scans_and_are_told(
+    rec: Any,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    *,
+    stamps: list[float],
+    kept: list[float],
+    told: str | None,
+    cache: bool,
+) -> None:
+    bag = bag_of_stamps(rec, tmp_path / "a.bag", stamps, delay=0.02)
+    for _ in range(2):
+        caplog.clear()
+        scans = list(opened(bag, cache=cache))
+        assert [round((s.stamp - rec.START) * 1e-9, 3) for s in scans] == kept
+        assert (told in caplog.text) if told else not caplog.records
+
+
+def test_unusable_poses_are_left_out_and_told(
+    rec: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    nan = float("nan")
+    given = [
+        (0, (0, 0, 0), (0, 0, 0, 1)),
+        (1, (nan, 0, 0), (0, 0, 0, 1)),
+        (2, (2, 0, 0), (0, 0, 0, 0)),
+        (3, (3, 0, 0), (0, 0, 0, 1)),
+        (3, (99, 0, 0), (0, 0, 0, 1)),
+        (4, (900, 0, 0), (0, 0, 0, 2)),
+    ]
+    messages = [
+        ("/poses", i, rec.pose(rec.START + s * 10**9, p, q, rec.ROS1))
+        for i, (s, p, q) in enumerate(given)
+    ]
+    messages.append(("/points", 0, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)))
+    bag = rec.write_bag(tmp_path / "a.bag", messages)
+    reference = opened(bag, reference="/poses").reference()
+    assert reference.T_world_sensor[:, 0, 3].tolist() == [0, 3, 900]
+    assert "2 poses on /poses that are not finite or have no rotation" in caplog.text
+    assert "jumps 1 times" in caplog.text
+
+
+def truncated(path: Path, share: float) -> Path:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    return path
+
+
+def without_index(path: Path) -> Path:
+    """As a ROS 1 recorder that was killed leaves a bag: index_pos is zero."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    data[at : at + 8] = bytes(8)
+    path.write_bytes(data)
+    return path
+
+
+def scrambled(path: Path) -> Path:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3 : len(data) // 3 + 400] = b"\xa5" * 400
+    path.write_bytes(data)
+    return path
+
+
+def file_of(folder: Path) -> Path:
+    return next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
+
+
+BROKEN = {
+    "no such file": lambda _, tmp: tmp / "none.bag",
+    "a text": lambda _, tmp: _text(tmp / "a.bag"),
+    "a bag of another kind": lambda _, tmp: _text(tmp / "a.pcap"),
+    "empty file": lambda _, tmp: _text(tmp / "a.bag", ""),
+    "empty folder": lambda _, tmp: _folder(tmp / "a"),
+    "cut short": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag"), 0.6),
+    "cut short, LZ4": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag", compression="LZ4"), 0.5),
+    "mcap cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.mcap")), 0.6),
+    "sqlite cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.sqlite3")), 0.5),
+    "no index": lambda rec, tmp: without_index(rec.drive(tmp / "a.bag")),
+    "scrambled": lambda rec, tmp: scrambled(rec.drive(tmp / "a.bag", compression="BZ2")),
+    "metadata damaged": lambda rec, tmp: _metadata(rec.drive(tmp / "a.mcap")),
+    "no message": lambda rec, tmp: rec.write_bag(
+        tmp / "a.bag", [], topics=[("/points", "sensor_msgs/msg/PointCloud2")]
+    ),
+    "no topic": lambda rec, tmp: rec.write_bag(tmp / "a.bag", []),
+    "wrong type": lambda rec, tmp: rec.write_bag(
+        tmp / "a.bag", [], topics=[("/points", "sensor_msgs/msg/Imu")]
+    ),
+    "ROS 1 and 2": lambda rec, tmp: [rec.drive(tmp / "a.bag"), rec.drive(tmp / "a.mcap")],
+}
+
+
+def _text(path: Path, text: str = "not a bag at all\n") -> Path:
+    path.write_text(text)
+    return path
+
+
+def _folder(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def _metadata(folder: Path) -> Path:
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [\n")
+    return folder
+
+
+@pytest.mark.parametrize("make", BROKEN.values(), ids=BROKEN)
+@pytest.mark.parametrize("cache", [False, True])
+def test_a_broken_bag_is_a_clear_error(
+    rec: Any, tmp_path: Path, make: Any, cache: bool, cache_folder: Path
+) -> None:
+    path = make(rec, tmp_path)
+    with pytest.raises(AdaptuneError) as caught:
+        list(opened(path, cache=cache))
+    message = str(caught.value)
+    assert str(path[0] if isinstance(path, list) else path) in message
+    assert "\n" not in message
+    assert not list(cache_folder.glob("*")), "half a cache was left"
+
+
+def test_a_damaged_message_is_named(rec: Any, tmp_path: Path) -> None:
+    good = rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)
+    bad = rec.cloud(
+        rec.velodyne(rec.scans(1)[0]), rec.START + 10**8, rec.ROS1, data=np.empty(9, np.uint8)
+    )
+    bag = rec.write_bag(tmp_path / "a.bag", [("/p", rec.START, good), ("/p", rec.START + 1, bad)])
+    with pytest.raises(SequenceError, match=r"a\.bag: message 2 on /p: 1 x 60 points of 22 bytes"):
+        list(opened(bag))
+
+
+def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec: Any, tmp_path: Path) -> None:
+    from rosbags.typesys import get_types_from_msg
+
+    rec.ROS1.register(get_types_from_msg("float32 a\nuint8[] b\n", "my_msgs/msg/Odd"))
+    odd = rec.ROS1.types["my_msgs/msg/Odd"](1.0, np.zeros(4, np.uint8))
+    cloud = rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)
+    bag = rec.write_bag(tmp_path / "a.bag", [("/odd", 5, odd), ("/points", rec.START, cloud)])
+    assert len(list(opened(bag))) == 1
+    with pytest.raises(SequenceError, match="/odd is my_msgs/msg/Odd, not point clouds"):
+        opened(bag, points="/odd")
+
+
+def test_the_botanic_garden_scan(recorded_data: Any) -> None:
+    (scan,) = opened(recorded_data("botanic_garden_scan.bag"))
+    assert len(scan) == 24_859
+    assert np.ptp(scan.times) == pytest.approx(0.10, abs=0.005)
+    assert len(np.unique(scan.rings)) == 16
+
+
+def test_the_hilti_scan(recorded_data: Any) -> None:
+    (scan,) = opened(recorded_data("hilti_2022_scan.bag"))
+    assert len(np.unique(scan.rings)) == 32
+    assert scan.times.min() == 0
+    assert scan.times.max() == pytest.approx(0.1, abs=0.01)
+
+
+def test_the_hall(recorded_data: Any) -> None:
+    scans = list(opened(recorded_data("hall.bag"), stop=2.1))
+    assert len(scans) == 5
+    assert all(30_000 < len(scan) < 40_000 for scan in scans)
+    assert scans[0].times is None
+
+
+def test_the_folder_of_a_copied_bag_does_not_matter(rec: Any, tmp_path: Path) -> None:
+    bag = rec.drive(tmp_path / "a.bag")
+    (tmp_path / "elsewhere").mkdir()
+    copy = shutil.copy2(bag, tmp_path / "elsewhere" / "b.bag")
+    first = list(opened(bag, cache=True))
+    assert same(first, list(opened(copy, cache=True)))
+    assert len(list((tmp_path / "cache").iterdir())) == 1

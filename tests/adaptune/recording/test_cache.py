@@ -1,0 +1,209 @@
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptune.recording import SequenceConfig, cache
+from adaptune.recording.bag import BagSource
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.scan import Scan
+
+
+def entries(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir()) if folder.exists() else []
+
+
+def test_the_second_opening_reads_no_bag_and_gives_the_same(
+    rec: Any, tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")), reference="/poses")
+    first = list(open_sequence(config))
+    assert len(entries(cache_folder)) == 1
+
+    def refuse(_: Any) -> None:
+        raise AssertionError("the bag was opened")
+
+    monkeypatch.setattr(BagSource, "open", refuse)
+    sequence = open_sequence(config)
+    second = list(sequence)
+    assert sequence.n_messages == 20
+    for a, b in zip(first, second, strict=True):
+        assert a.stamp == b.stamp
+        for one, other in ((a.points, b.points), (a.times, b.times), (a.rings, b.rings)):
+            assert np.array_equal(one, other)
+            assert one.dtype == other.dtype
+        assert b.points.base is not None, "the points were copied"
+        assert not b.points.flags.writeable
+
+
+def test_mistakes_are_found_in_cached_bags_too(rec: Any, tmp_path: Path) -> None:
+    bag = str(rec.drive(tmp_path / "a.bag"))
+    list(open_sequence(SequenceConfig(bag=bag)))
+    with pytest.raises(Exception, match="no topic /nothing"):
+        open_sequence(SequenceConfig(bag=bag, reference="/nothing"))
+
+
+def test_half_a_pass_keeps_nothing(rec: Any, tmp_path: Path, cache_folder: Path) -> None:
+    config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")))
+    scans = iter(open_sequence(config))
+    next(scans)
+    scans.close()  # type: ignore[attr-defined]
+    assert not entries(cache_folder)
+
+
+@pytest.mark.parametrize(
+    "change", [{"start": 0.5}, {"stride": 2}, {"stamp": "end"}, {"time_unit": "ms"}]
+)
+def test_other_settings_are_another_entry(
+    rec: Any, tmp_path: Path, cache_folder: Path, change: dict[str, Any]
+) -> None:
+    bag = str(rec.drive(tmp_path / "a.bag"))
+    plain = list(open_sequence(SequenceConfig(bag=bag)))
+    changed = list(open_sequence(SequenceConfig(bag=bag, **change)))
+    fresh = list(open_sequence(SequenceConfig(bag=bag, cache=False, **change)))
+    assert len(entries(cache_folder)) == 2
+    assert [s.stamp for s in changed] == [s.stamp for s in fresh]
+    assert any(
+        a.stamp != b.stamp or not np.array_equal(a.times, b.times)
+        for a, b in zip(plain, changed, strict=False)
+    )
+
+
+def test_a_changed_bag_is_decoded_anew(rec: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    assert len(list(open_sequence(SequenceConfig(bag=str(rec.drive(path, n=3)))))) == 3
+    path.unlink()
+    assert len(list(open_sequence(SequenceConfig(bag=str(rec.drive(path, n=4)))))) == 4
+
+
+def test_scans_without_times_rings_intensities_or_points_are_kept_as_they_are() -> None:
+    points = np.arange(6, dtype=np.float32).reshape(2, 3)
+    times, rings = np.array([0, 0.1], np.float32), np.array([1, 2], np.uint16)
+    scans = [
+        Scan(1, points),
+        Scan(2, points[:0]),
+        Scan(3, points + 1, times),
+        Scan(4, points + 2, None, rings),
+        Scan(5, points + 3, times + 1, rings + 1),
+        Scan(6, points[:0], times[:0], rings[:0]),
+        Scan(7, points + 4, intensities=times + 2),
+    ]
+    list(cache.tee(scans, "key", {"name": "a"}))
+    kept = cache.find("key")
+    assert kept is not None
+    assert kept.stamps.tolist() == [1, 2, 3, 4, 5, 6, 7]
+    for i, scan in enumerate(scans):
+        for name in ("points", "times", "rings", "intensities"):
+            a, b = getattr(scan, name), getattr(kept[i], name)
+            assert (a is None and b is None) or np.array_equal(a, b)
+
+
+def test_a_sequence_without_any_point_is_kept() -> None:
+    list(cache.tee([Scan(1, np.empty((0, 3), np.float32))], "key", {"name": "a"}))
+    kept = cache.find("key")
+    assert kept is not None
+    assert len(kept[0]) == 0
+
+
+def scans_of(megabytes: float, n: int = 4) -> list[Scan]:
+    size = round(megabytes * 1e6 / 12 / n)
+    return [Scan(i, np.ones((size, 3), np.float32)) for i in range(n)]
+
+
+def test_the_least_recently_used_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0.0045")
+    now = time.time()
+    for i, name in enumerate("abcd"):
+        list(cache.tee(scans_of(1), name, {"name": name}))
+        os.utime(cache.folder() / name / "about.json", (now - 100 + i, now - 100 + i))
+    assert cache.find("a") is not None, "which makes it the last used"
+    list(cache.tee(scans_of(1), "e", {"name": "e"}))
+    assert sorted(entry.name for entry in cache.list_cache()) == ["a", "c", "d", "e"]
+    assert sum(entry.size for entry in cache.list_cache()) <= cache.cap()
+
+
+def test_an_entry_that_is_removed_while_it_is_read_can_be_read_on() -> None:
+    list(cache.tee(scans_of(1), "a", {"name": "a"}))
+    kept = cache.find("a")
+    assert kept is not None
+    cache.clear_cache()
+    assert cache.find("a") is None
+    assert [len(scan) for scan in kept] == [len(scan) for scan in scans_of(1)]
+
+
+def test_what_is_larger_than_the_cap_is_passed_on_and_not_kept(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0.001")
+    assert len(list(cache.tee(scans_of(2), "a", {"name": "a"}))) == 4
+    assert not cache.list_cache()
+    assert "not kept" in caplog.text
+
+
+def test_listing_and_clearing(rec: Any, tmp_path: Path, cache_folder: Path) -> None:
+    assert cache.list_cache() == []
+    assert cache.clear_cache() == 0
+    bag = rec.drive(tmp_path / "a.bag")
+    list(open_sequence(SequenceConfig(bag=str(bag))))
+    (cache_folder / "notes.txt").write_text("not ours")
+    (entry,) = cache.list_cache()
+    assert entry.name == str(bag)
+    assert entry.n_scans == 20
+    assert cache.clear_cache() == entry.size
+    assert entries(cache_folder) == ["notes.txt"]
+
+
+def test_a_damaged_entry_is_made_anew(
+    rec: Any, tmp_path: Path, cache_folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")), cache=True)
+    whole = list(open_sequence(config))
+    (entry,) = cache_folder.iterdir()
+    for name in ("about.json", "index.npy", "points.npy"):
+        caplog.clear()
+        (entry / name).write_bytes(b"{")
+        again = list(open_sequence(config))
+        assert [s.stamp for s in again] == [s.stamp for s in whole]
+        assert "damaged" in caplog.text
+
+
+def _write_slowly(ready: Any) -> None:
+    def scans() -> Any:
+        yield from scans_of(1)
+        ready.set()
+        time.sleep(60)
+
+    list(cache.tee(scans(), "a", {"name": "a"}))
+
+
+def test_a_killed_writer_leaves_no_half_entry(cache_folder: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    ready = context.Event()
+    process = context.Process(target=_write_slowly, args=(ready,))
+    process.start()
+    assert ready.wait(20)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert cache.find("a") is None
+    assert cache.list_cache() == []
+    (left,) = cache_folder.iterdir()
+    for path in (left, *left.iterdir()):
+        os.utime(path, (0, 0))
+    list(cache.tee(scans_of(1), "b", {"name": "b"}))
+    assert entries(cache_folder) == ["b"]
+
+
+def test_two_writers_of_the_same_do_not_meet(cache_folder: Path) -> None:
+    one, two = (cache.tee(scans_of(1), "a", {"name": "a"}) for _ in range(2))
+    next(one)
+    assert len(list(two)) == 4
+    assert len(list(one)) == 3
+    assert entries(cache_folder) == ["a"]
+    assert json.loads((cache_folder / "a" / "about.json").read_text()) == {"name": "a"}

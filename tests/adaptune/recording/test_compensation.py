@@ -1,0 +1,260 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from adaptune import geometry
+from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import compensate, compensate_neighbours, compensate_rotation
+from adaptune.recording.scan import clock_offset
+from adaptune.trajectory import Trajectory
+
+RATE = np.array([0.3, -0.2, 1.5])
+VELOCITY = np.array([3.0, 0.5, -0.2])
+
+
+def moving_scan(velocity: np.ndarray, n: int = 500) -> tuple[Scan, np.ndarray]:
+    """A scan of a still world from a sensor in motion, and the world as seen from its start."""
+    rng = np.random.default_rng(0)
+    world = rng.normal(0, 20, (n, 3))
+    times = np.sort(rng.uniform(0, 0.1, n))
+    turned = Rotation.from_rotvec(times[:, None] * RATE)
+    points = turned.inv().apply(world - times[:, None] * velocity)
+    return Scan(10**18, points.astype(np.float32), times.astype(np.float32)), world
+
+
+def test_constant_velocity_is_undone() -> None:
+    scan, world = moving_scan(VELOCITY)
+    assert np.abs(scan.points - world).max() > 1
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(RATE * 0.2).as_matrix(), VELOCITY * 0.2
+    np.testing.assert_allclose(compensate(scan, T, 0.2).points, world, atol=1e-4)
+
+
+def gyro(begin: float, end: float, T_sensor_imu: np.ndarray) -> Imu:
+    seconds = np.arange(begin, end, 0.005)
+    rates = np.tile(RATE @ T_sensor_imu[:3, :3], (len(seconds), 1))
+    stamps = 10**18 + np.rint(seconds * 1e9).astype(np.int64)
+    return Imu(stamps, rates, np.zeros((len(seconds), 3)), T_sensor_imu)
+
+
+def test_the_gyroscopes_rotation_is_undone() -> None:
+    T = geometry.from_quaternions([[1, 2, 3]], [[0.5, 0.5, -0.5, 0.5]])[0]
+    scan, world = moving_scan(np.zeros(3))
+    np.testing.assert_allclose(
+        compensate_rotation(scan, gyro(-0.1, 0.2, T)).points, world, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("span", [(0.01, 0.2), (-0.1, 0.05)])
+def test_a_scan_of_which_the_gyroscope_tells_nothing_stays_as_it_is(
+    span: tuple[float, float],
+) -> None:
+    scan, _ = moving_scan(np.zeros(3))
+    assert compensate_rotation(scan, gyro(*span, np.eye(4))) is scan
+    timeless = Scan(1, scan.points)
+    assert compensate_rotation(timeless, gyro(-1, 1, np.eye(4))) is timeless
+    assert compensate(timeless, np.eye(4), 0.1) is timeless
+
+
+def room(rng: np.random.Generator, n: int = 1500) -> np.ndarray:
+    """Points on the walls, the floor and a few pillars, of shape (n, 3)."""
+    points = rng.uniform(-1, 1, (n, 3)) * (12, 8, 2)
+    side = rng.integers(0, 5, n)
+    points[side == 0, 0] = rng.choice([-12, 12], np.count_nonzero(side == 0))
+    points[side == 1, 1] = rng.choice([-8, 8], np.count_nonzero(side == 1))
+    points[side == 2, 2] = -2
+    pillars = np.flatnonzero(side > 2)
+    angle = rng.uniform(0, 2 * np.pi, len(pillars))
+    middle = np.array([(5, 3), (-6, 4), (-3, -5), (8, -4)])[rng.integers(0, 4, len(pillars))]
+    points[pillars, 0] = middle[:, 0] + 0.5 * np.cos(angle)
+    points[pillars, 1] = middle[:, 1] + 0.5 * np.sin(angle)
+    return points
+
+
+def drive_through(room_: np.ndarray, stamp: int, T: np.ndarray, twist: np.ndarray) -> Scan:
+    """A scan of 0.1 s that begins at a pose, in a motion of constant velocity in its own frame."""
+    times = np.linspace(0, 0.1, len(room_)).astype(np.float32)
+    seen = (room_ - T[:3, 3]) @ T[:3, :3] - times[:, None] * twist[:3]
+    points = Rotation.from_rotvec(times[:, None] * twist[3:]).inv().apply(seen)
+    return Scan(stamp, points.astype(np.float32), times)
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_the_velocity_since_the_scan_before_is_undone(backward: bool) -> None:
+    rng = np.random.default_rng(0)
+    twist = np.array([2.0, 0.3, 0.0, 0.0, 0.0, 0.8])
+    T, scans, worlds = np.eye(4), [], []
+    step = np.eye(4)
+    step[:3, :3], step[:3, 3] = Rotation.from_rotvec(twist[3:] * 0.1).as_matrix(), twist[:3] * 0.1
+    for i in range(4):
+        worlds.append(room(rng))
+        scans.append(drive_through(worlds[-1], 10**18 + i * 10**8, T, twist))
+        worlds[-1] = (worlds[-1] - T[:3, 3]) @ T[:3, :3]
+        T = T @ step
+    order = slice(None, None, -1 if backward else 1)
+    scans, worlds = scans[order], worlds[order]
+    compensated = list(compensate_neighbours(scans))
+    assert compensated[0] is scans[0]
+    for before, after, world in zip(scans[1:], compensated[1:], worlds[1:], strict=True):
+        assert np.abs(before.points - world).max() > 0.5
+        assert np.abs(after.points - world).max() < 0.15
+
+
+def test_the_motion_known_last_holds_for_a_second() -> None:
+    rng = np.random.default_rng(0)
+    twist = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    step = np.eye(4)
+    step[:3, 3] = twist[:3] * 0.1
+    first, second = (
+        drive_through(room(rng), 10**18 + i * 10**8, T, twist)
+        for i, T in enumerate((np.eye(4), step))
+    )
+    few = [
+        Scan(10**18 + stamp, np.ones((5, 3), np.float32), np.full(5, 0.1, np.float32))
+        for stamp in (2 * 10**8, 10**9, 15 * 10**8)
+    ]
+    *_, soon, late, too_late = compensate_neighbours([first, second, *few])
+    for scan in (soon, late):
+        np.testing.assert_allclose(scan.points - 1.0, np.tile([0.2, 0.0, 0.0], (5, 1)), atol=0.02)
+    assert too_late is few[-1]
+
+
+def test_scans_that_cannot_be_registered_stay_as_they_are() -> None:
+    rng = np.random.default_rng(0)
+    few = Scan(10**18, np.ones((5, 3), np.float32), np.zeros(5, np.float32))
+    whole = drive_through(room(rng), 10**18 + 10**8, np.eye(4), np.zeros(6))
+    late = drive_through(room(rng), 10**18 + 10**10, np.eye(4), np.zeros(6))
+    empty = Scan(10**18 + 2 * 10**10, np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    given = [few, whole, late, empty]
+    assert all(a is b for a, b in zip(compensate_neighbours(given), given, strict=True))
+
+
+def turning(seconds: np.ndarray) -> np.ndarray:
+    """Rate of turning about z, never the same twice."""
+    return np.sin(0.7 * seconds) + 0.6 * np.sin(1.9 * seconds + 1) + 0.3 * np.sin(4.3 * seconds)
+
+
+def imu_and_trajectory(offset: float, seconds: float = 60.0) -> tuple[Imu, Trajectory]:
+    """The same motion on two clocks: add `offset` to the trajectory's stamps to make them one."""
+    fine = np.arange(0, seconds, 0.005)
+    yaw = np.cumsum(turning(fine)) * 0.005
+    rates = np.zeros((len(fine), 3))
+    rates[:, 1] = turning(fine)
+    stamps = 10**18 + np.rint(fine * 1e9).astype(np.int64)
+    imu = Imu(stamps, rates, np.zeros_like(rates))
+    some = slice(2000, 8000, 20)
+    T = np.tile(np.eye(4), (len(yaw[some]), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("z", yaw[some][:, None]).as_matrix()
+    return imu, Trajectory(stamps[some] - round(offset * 1e9), T)
+
+
+def offset_of(trajectory: Trajectory, imu: Imu) -> float | None:
+    return clock_offset(trajectory, imu.stamps, np.linalg.norm(imu.angular_velocity, axis=1))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.37, -18.0, 1.6e9 - 0.123])
+def test_the_offset_of_clocks_is_found_by_turning(offset: float) -> None:
+    imu, trajectory = imu_and_trajectory(offset)
+    assert offset_of(trajectory, imu) == pytest.approx(offset, abs=0.03)
+
+
+def test_no_offset_is_proposed_where_the_motions_differ() -> None:
+    imu, trajectory = imu_and_trajectory(0.0)
+    rng = np.random.default_rng(0)
+    other = Imu(imu.stamps, rng.normal(0, 1, (len(imu), 3)), imu.acceleration)
+    assert offset_of(trajectory, other) is None
+    assert offset_of(Trajectory(trajectory.stamps[:2], trajectory.T_world_sensor[:2]), imu) is None
+
+
+def imu_bag(rec: Any, path: Path, offset: float) -> Path:
+    """Scans and an IMU on one clock, poses on another."""
+    imu, trajectory = imu_and_trajectory(offset)
+    types = rec.ROS1.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    nothing = np.zeros(9)
+    messages = [
+        ("/points", s, rec.cloud(rec.velodyne(rec.scans(1)[0]), s, rec.ROS1))
+        for s in range(10**18, 10**18 + 60 * 10**9, 10**10)
+    ]
+    for stamp, rate in zip(imu.stamps[::4].tolist(), imu.angular_velocity[::4], strict=True):
+        message = types["sensor_msgs/msg/Imu"](
+            rec.header(stamp, "imu", rec.ROS1),
+            types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1),
+            nothing,
+            vector(*rate.tolist()),
+            nothing,
+            vector(0.0, 0.0, 1.0),
+            nothing,
+        )
+        messages.append(("/imu", stamp, message))
+    q = geometry.to_quaternions(trajectory.T_world_sensor)
+    for stamp, o in zip(trajectory.stamps.tolist(), q.tolist(), strict=True):
+        messages.append(("/poses", 10**18, rec.pose(stamp, (0, 0, 0), o, rec.ROS1)))
+    return rec.write_bag(path, sorted(messages, key=lambda m: m[1]))
+
+
+@pytest.mark.parametrize("wrong", [0.0, 5000.0])
+def test_clocks_that_do_not_meet_are_an_error_with_a_proposal(
+    rec: Any, tmp_path: Path, wrong: float
+) -> None:
+    bag = str(imu_bag(rec, tmp_path / "a.bag", 1e6))
+    with pytest.raises(SequenceError, match=r"set `clock_offset`.*clock_offset: (\S+)\)") as caught:
+        open_sequence(SequenceConfig(bag=bag, reference="/poses", clock_offset=wrong)).reference()
+    proposed = float(str(caught.value).split("clock_offset: ")[-1].rstrip(")"))
+    assert proposed == pytest.approx(1e6, abs=0.03)
+    sequence = open_sequence(SequenceConfig(bag=bag, reference="/poses", clock_offset=proposed))
+    assert sequence.reference() is not None
+
+
+def test_scans_tell_the_offset_where_there_is_no_imu(rec: Any, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    seconds = np.arange(0, 12, 0.1)
+    yaw = np.cumsum(turning(seconds)) * 0.1
+    T = np.tile(np.eye(4), (len(yaw), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    stamps = 10**18 + np.rint(seconds * 1e9).astype(np.int64)
+    messages = []
+    for stamp, pose, q in zip(stamps.tolist(), T, geometry.to_quaternions(T).tolist(), strict=True):
+        points = (room(rng, 500) @ pose[:3, :3]).astype(np.float32)
+        messages.append(("/points", stamp, rec.cloud(rec.velodyne(points), stamp, rec.ROS1)))
+        messages.append(("/poses", stamp, rec.pose(stamp - 10**15, (0, 0, 0), q, rec.ROS1)))
+    bag = str(rec.write_bag(tmp_path / "a.bag", messages))
+    with pytest.raises(SequenceError, match=r"the scans show the same motion with") as caught:
+        open_sequence(SequenceConfig(bag=bag, reference="/poses")).reference()
+    proposed = float(str(caught.value).split("clock_offset: ")[-1].rstrip(")"))
+    assert proposed == pytest.approx(1e6, abs=0.1)
+
+
+@pytest.mark.parametrize("how", ["constant_velocity", "gyro"])
+def test_what_has_no_times_cannot_be_compensated(rec: Any, tmp_path: Path, how: Any) -> None:
+    raw = np.zeros(30, [(a, "<f4") for a in "xyz"])
+    raw["x"] = np.arange(1, 31)
+    bag = imu_bag(rec, tmp_path / "a.bag", 0.0)
+    plain = rec.write_bag(
+        tmp_path / "b.bag", [("/flat", 10**18, rec.cloud(raw, 10**18 + 5 * 10**9, rec.ROS1))]
+    )
+    sequence = open_sequence(
+        SequenceConfig(bag=[str(bag), str(plain)], points="/flat", imu={}, compensate=how)
+    )
+    with pytest.raises(SequenceError, match="have no times"):
+        list(sequence)
+
+
+def test_an_imu_comes_in_si_units_with_its_place(rec: Any, tmp_path: Path) -> None:
+    bag = str(imu_bag(rec, tmp_path / "a.bag", 0.0))
+    assert open_sequence(SequenceConfig(bag=bag)).imu() is None
+    extrinsic = [1, 2, 3, 0, 0, 0, 1]
+    imu = open_sequence(SequenceConfig(bag=bag, imu={"unit": "g", "extrinsic": extrinsic})).imu()
+    assert imu is not None
+    np.testing.assert_allclose(imu.acceleration[0], [0, 0, 9.80665])
+    np.testing.assert_allclose(imu.T_sensor_imu[:3, 3], [1, 2, 3])
+    turned = open_sequence(
+        SequenceConfig(bag=bag, imu={}, compensate="gyro", views=[{"transform": extrinsic}])
+    )
+    plain = list(open_sequence(SequenceConfig(bag=bag)))
+    assert not np.allclose(list(turned)[1].points, plain[1].points + np.array([1, 2, 3]), atol=1e-3)
+    assert turned.imu() is not None

@@ -1,0 +1,257 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from adaptune import files, geometry
+from adaptune.recording import SequenceConfig, SequenceError
+from adaptune.recording.folder import turn_up
+from adaptune.recording.opening import open_sequence
+from adaptune.trajectory import write_kitti
+
+
+def poses(n: int) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return geometry.from_quaternions(rng.normal(0, 3, (n, 3)), rng.normal(0, 1, (n, 4)))
+
+
+def kitti_odometry(rec: Any, folder: Path, n: int = 4) -> np.ndarray:
+    """Write a sequence, and tell where its LiDAR was as seen from its first camera's start."""
+    (folder / "velodyne").mkdir(parents=True)
+    for i, points in enumerate(rec.scans(n)):
+        np.column_stack([points, np.ones(len(points), np.float32)]).astype("<f4").tofile(
+            folder / "velodyne" / f"{i:06d}.bin"
+        )
+    (folder / "times.txt").write_text("".join(f"{i * 0.1:e}\n" for i in range(n)))
+    T_camera_sensor, T_world_camera = poses(2)[1], poses(n)
+    numbers = " ".join(map(repr, T_camera_sensor[:3].ravel().tolist()))
+    (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {numbers}\n")
+    (folder.parent.parent / "poses").mkdir()
+    write_kitti(folder.parent.parent / "poses" / f"{folder.name}.txt", T_world_camera)
+    return geometry.invert(T_camera_sensor) @ T_world_camera @ T_camera_sensor
+
+
+def test_a_kitti_sequence_is_what_the_bags_are(rec: Any, tmp_path: Path) -> None:
+    expected = kitti_odometry(rec, tmp_path / "sequences" / "00")
+    sequence = open_sequence(SequenceConfig(kitti=str(tmp_path / "sequences" / "00"), elevation=0))
+    bags = [
+        list(open_sequence(SequenceConfig(bag=str(rec.drive(tmp_path / f"a{suffix}", n=4)))))
+        for suffix in (".bag", ".sqlite3", ".mcap")
+    ]
+    scans = list(sequence)
+    assert len(scans) == sequence.n_messages == 4
+    for bag in bags:
+        for a, b in zip(scans, bag, strict=True):
+            assert np.array_equal(a.points, b.points)
+            assert a.stamp == b.stamp - rec.START
+    reference = sequence.reference()
+    assert reference is not None
+    np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-6)
+    assert reference.stamps.tolist() == [scan.stamp for scan in scans]
+
+
+def test_rays_are_turned_up_in_their_own_planes() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 10, (200, 3)).astype(np.float32)
+    axes = np.cross(points, [0, 0, 1])
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    expected = Rotation.from_rotvec(axes * np.deg2rad(2.0)).apply(points)
+    np.testing.assert_allclose(turn_up(points, 2.0), expected, atol=1e-5)
+    up = np.array([[0, 0, 1], [0, 0, -1], [0, 0, 0]], np.float32)
+    assert np.array_equal(turn_up(up, 2.0), up)
+
+
+def test_kittis_rays_are_corrected_unless_told_otherwise(rec: Any, tmp_path: Path) -> None:
+    kitti_odometry(rec, tmp_path / "sequences" / "00")
+    drive, _ = drive_360(rec, tmp_path)
+    write_drive(rec, tmp_path / "raw", "timestamps_start.txt")
+    points = rec.scans(1)[0]
+    for folder, elevation, degrees in [
+        (tmp_path / "sequences" / "00", None, 0.205),
+        (tmp_path / "sequences" / "00", 0.5, 0.5),
+        (tmp_path / "raw", None, 0.205),
+        (tmp_path / "raw", 0, 0.0),
+        (drive, None, 0.0),
+    ]:
+        sequence = open_sequence(SequenceConfig(kitti=str(folder), elevation=elevation))
+        np.testing.assert_allclose(next(iter(sequence)).points, turn_up(points, degrees), atol=1e-6)
+
+
+def drive_360(rec: Any, root: Path) -> tuple[Path, np.ndarray]:
+    name = "2013_05_28_drive_0000_sync"
+    drive = root / "data_3d_raw" / name
+    write_drive(rec, drive, "timestamps.txt")
+    T_world_body, T_body_camera, T_sensor_camera = poses(3), poses(5)[3], poses(5)[4]
+    (root / "calibration").mkdir()
+
+    def row(T: np.ndarray) -> str:
+        return " ".join(map(repr, T[:3].ravel().tolist()))
+
+    (root / "calibration" / "calib_cam_to_pose.txt").write_text(f"image_00: {row(T_body_camera)}\n")
+    (root / "calibration" / "calib_cam_to_velo.txt").write_text(row(T_sensor_camera))
+    (root / "data_poses" / name).mkdir(parents=True)
+    (root / "data_poses" / name / "poses.txt").write_text(
+        "".join(f"{i} {row(T)}\n" for i, T in zip((0, 1, 3), T_world_body, strict=True))
+    )
+    return drive, T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
+
+
+def write_drive(rec: Any, drive: Path, stamps: str) -> None:
+    data = drive / "velodyne_points" / "data"
+    data.mkdir(parents=True)
+    for i, points in enumerate(rec.scans(4)):
+        if i != 2:  # was lost
+            np.column_stack([points, points[:, 0]]).tofile(data / f"{i:010d}.bin")
+    lines = [f"2011-09-30 12:40:25.{i}00000001" if i != 2 else "" for i in range(4)]
+    (drive / "velodyne_points" / stamps).write_text("\n".join(lines) + "\n")
+
+
+def test_a_kitti_360_drive(rec: Any, tmp_path: Path) -> None:
+    drive, expected = drive_360(rec, tmp_path)
+    sequence = open_sequence(SequenceConfig(kitti=str(drive)))
+    stamps = [scan.stamp for scan in sequence]
+    assert stamps == [1317386425_000000001 + i * 10**8 for i in (0, 1, 3)]
+    reference = sequence.reference()
+    assert reference is not None
+    assert reference.stamps.tolist() == stamps
+    np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-12)
+
+
+def test_a_kitti_raw_drive(rec: Any, tmp_path: Path) -> None:
+    drive = tmp_path / "2011_09_30_drive_0027_sync"
+    write_drive(rec, drive, "timestamps_start.txt")
+    (tmp_path / "calib_imu_to_velo.txt").write_text(
+        "calib_time: 25-May-2012 16:47:16\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0 0.5\n"
+    )
+    (drive / "oxts" / "data").mkdir(parents=True)
+    # Northwards at 1 m/s, heading north: yaw counts from the east.
+    for i in range(4):
+        degrees = np.rad2deg(i * 0.1 / 6378137.0)
+        (drive / "oxts" / "data" / f"{i:010d}.txt").write_text(
+            f"{float(degrees)!r} 8.4 110.0 0 0 {np.pi / 2} 0 0 0\n"
+        )
+    lines = [f"2011-09-30 12:40:25.{i}00000001" for i in range(4)]
+    (drive / "oxts" / "timestamps.txt").write_text("\n".join(lines))
+    sequence = open_sequence(SequenceConfig(kitti=str(drive)))
+    assert len(list(sequence)) == 3
+    reference = sequence.reference()
+    assert reference is not None
+    # It drives ahead, along its own x.
+    expected = np.tile(np.eye(4), (4, 1, 1))
+    expected[:, 0, 3] = np.arange(4) * 0.1
+    np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".pcd", ".ply", ".bin", "structured"])
+def test_folders_of_files(rec: Any, tmp_path: Path, suffix: str) -> None:
+    for i, points in enumerate(rec.scans(11)):
+        path = tmp_path / f"scan_{i}{suffix}"
+        if suffix == ".npy":
+            np.save(path, points)
+        elif suffix == ".bin":
+            np.column_stack([points, points[:, 0]]).tofile(path)
+        elif suffix == "structured":
+            np.save(tmp_path / f"scan_{i}.npy", rec.velodyne(points))
+        else:
+            o3d = files.load()
+            cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
+            cloud.point["time"] = o3d.core.Tensor(rec.velodyne(points)["time"][:, None].copy())
+            o3d.t.io.write_point_cloud(str(path), cloud)
+    scans = list(open_sequence(SequenceConfig(folder=str(tmp_path), period=0.5)))
+    for i, (scan, points) in enumerate(zip(scans, rec.scans(11), strict=True)):
+        assert np.array_equal(scan.points, points)
+        assert scan.stamp == i * 500_000_000
+        if suffix in (".pcd", ".ply", "structured"):
+            assert np.array_equal(scan.times, rec.velodyne(points)["time"])
+
+
+@pytest.mark.parametrize(
+    ("names", "times", "stamps"),
+    [
+        (["1", "2"], None, [0, 10**8]),
+        (["1700000000.1", "1700000000.25"], None, [1700000000_1 * 10**8, 170000000025 * 10**7]),
+        (["1700000000100000000", "1700000000250000000"], None, [17000000001 * 10**8] * 1),
+        (["1", "2"], "5.000000001\n6\n", [5_000_000_001, 6 * 10**9]),
+    ],
+)
+def test_stamps_of_files(
+    rec: Any, tmp_path: Path, names: list[str], times: str | None, stamps: list[int]
+) -> None:
+    for name, points in zip(names, rec.scans(2), strict=True):
+        np.save(tmp_path / f"{name}.npy", points)
+    if times:
+        (tmp_path / "times.txt").write_text(times)
+    found = [scan.stamp for scan in open_sequence(SequenceConfig(folder=str(tmp_path)))]
+    assert found[: len(stamps)] == stamps
+
+
+def test_a_kitti_pose_file_goes_with_any_recording(rec: Any, tmp_path: Path) -> None:
+    expected = poses(6)
+    write_kitti(tmp_path / "gt.txt", expected)
+    bag = str(rec.drive(tmp_path / "a.bag", n=6))
+    reference = open_sequence(
+        SequenceConfig(bag=bag, reference=str(tmp_path / "gt.txt"))
+    ).reference()
+    assert reference is not None
+    np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-8)
+    write_kitti(tmp_path / "gt.txt", expected[:5])
+    with pytest.raises(SequenceError, match="5 poses without stamps do not go with 6 scans"):
+        open_sequence(SequenceConfig(bag=bag, reference=str(tmp_path / "gt.txt"))).reference()
+
+
+def broken(path: Path, name: str, content: bytes) -> Path:
+    (path / name).write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("key", "make", "message"),
+    [
+        ("folder", lambda p: p / "none", "there is no such folder"),
+        ("folder", lambda p: p, "holds no scan"),
+        ("folder", lambda p: broken(p, "1.bin", bytes(17)), "17 bytes are not a whole number"),
+        ("folder", lambda p: broken(p, "1.npy", b"\x93NUMPY\x01\x00"), "cannot be read as a scan"),
+        ("folder", lambda p: broken(p, "1.npy", b""), "cannot be read as a scan"),
+        ("folder", lambda p: broken(p, "1.pcd", b"VERSION .7\nFIELDS x y\n"), "damaged or holds"),
+        ("folder", lambda p: broken(p, "1.ply", b"ply\nformat ascii 1.0\n"), "damaged or holds"),
+        ("kitti", lambda p: p / "none", "there is no such folder"),
+        ("kitti", lambda p: p, "not a KITTI sequence"),
+    ],
+)
+def test_broken_folders_are_clear_errors(tmp_path: Path, key: str, make: Any, message: str) -> None:
+    with pytest.raises(SequenceError, match=message):
+        list(open_sequence(SequenceConfig(**{key: str(make(tmp_path))})))
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("times.txt", "0\n", "1 lines in times.txt for 4 scans"),
+        ("times.txt", "0\na\n2\n3\n", "a line is not a time"),
+        ("times.txt", None, "there is no such file"),
+        ("velodyne/x.bin", "", "numbers do not go with"),
+    ],
+)
+def test_broken_kitti_sequences_are_clear_errors(
+    rec: Any, tmp_path: Path, file: str, content: str | None, message: str
+) -> None:
+    folder = tmp_path / "sequences" / "00"
+    kitti_odometry(rec, folder)
+    if content is None:
+        (folder / file).unlink()
+    else:
+        (folder / file).write_text(content)
+    if file == "velodyne/x.bin":
+        (folder / "velodyne" / "000000.bin").unlink()
+    with pytest.raises(SequenceError, match=message):
+        open_sequence(SequenceConfig(kitti=str(folder)))
+
+
+def test_a_calibration_without_its_line_is_named(rec: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "sequences" / "00"
+    kitti_odometry(rec, folder)
+    (folder / "calib.txt").write_text("P0: 1 2\n")
+    with pytest.raises(SequenceError, match=r"calib\.txt: no line `Tr:` with 12 numbers"):
+        open_sequence(SequenceConfig(kitti=str(folder))).reference()

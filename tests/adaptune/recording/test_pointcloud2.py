@@ -1,0 +1,328 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from rosbags.typesys import Stores, get_typestore
+
+from adaptune.recording import Scan, clouds
+from adaptune.recording.clouds import PointCloudError
+from adaptune.recording.scan import AUTO, Timing
+
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = ["f4", "f8", "i2", "u1", "u2", "u4", "i4"]
+
+
+def raw_of(n: int, **fields: Any) -> np.ndarray:
+    """A structured array of x, y, z = (1, 2, 3) and further fields, each (type, values)."""
+    kinds = [(a, "<f4") for a in "xyz"] + [(name, kind) for name, (kind, _) in fields.items()]
+    raw = np.zeros(n, kinds)
+    raw["x"], raw["y"], raw["z"] = 1, 2, 3
+    for name, (_, values) in fields.items():
+        raw[name] = values
+    return raw
+
+
+def decode(message: Any, timing: Timing = AUTO) -> Scan:
+    """Decode a message of ROS 2 from what it is serialised to."""
+    data = _STORE.serialize_cdr(message, message.__msgtype__)
+    return clouds.decode_cloud(bytes(data), cdr=True, timing=timing)
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> np.dtype[Any]:
+    """Any order of fields, gaps, types and byte order."""
+    order = draw(st.sampled_from("<>"))
+    extra = draw(st.lists(st.sampled_from(["ring", "time", "intensity", "a", "b"]), unique=True))
+    names = draw(st.permutations(["x", "y", "z", *extra]))
+    kinds, offsets, at = [], [], 0
+    for name in names:
+        allowed = {"ring": ["u1", "u2", "i4"], "time": ["f4", "f8", "u4"]}.get(
+            name, ["f4", "f8"] if name in "xyz" else TYPES
+        )
+        at += draw(st.integers(0, 5))
+        kinds.append(order + draw(st.sampled_from(allowed)))
+        offsets.append(at)
+        at += np.dtype(kinds[-1]).itemsize
+    return np.dtype(
+        {
+            "names": names,
+            "formats": kinds,
+            "offsets": offsets,
+            "itemsize": at + draw(st.integers(0, 7)),
+        }
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    dtype=layouts(),
+    width=st.integers(0, 20),
+    height=st.integers(1, 3),
+    padding=st.integers(0, 9),
+    data=st.data(),
+)
+def test_any_layout_gives_the_points_written(
+    rec: Any, dtype: np.dtype[Any], width: int, *, height: int, padding: int, data: st.DataObject
+) -> None:
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    raw = np.zeros((height, width), dtype)
+    points = rng.uniform(1, 50, (height, width, 3)).astype(np.float32)
+    for i, axis in enumerate("xyz"):
+        raw[axis] = points[..., i]
+    n = height * width
+    if "time" in (dtype.names or ()):
+        scale = 1e9 if raw["time"].dtype.kind == "u" else 1
+        raw["time"] = (np.linspace(0, 0.1, n) * scale).reshape(height, width)
+    if "ring" in (dtype.names or ()):
+        raw["ring"] = (np.arange(n) % 100).reshape(height, width)
+    rows = [row.tobytes() + bytes(padding) for row in raw]
+    message = rec.cloud(
+        raw,
+        data=np.frombuffer(b"".join(rows), np.uint8),
+        row_step=width * dtype.itemsize + padding,
+    )
+
+    scan = decode(message)
+
+    assert np.array_equal(scan.points, points.reshape(-1, 3))
+    assert scan.points.dtype == np.float32
+    assert scan.points.flags.c_contiguous
+    if "time" in (dtype.names or ()):
+        assert scan.times is not None
+        np.testing.assert_allclose(scan.times, np.linspace(0, 0.1, n)[:n], atol=2e-9)
+    if "ring" in (dtype.names or ()):
+        assert scan.rings is not None
+        assert scan.rings.dtype == np.uint16
+        assert np.array_equal(scan.rings, np.arange(n) % 100)
+
+
+@given(
+    hnp.arrays(
+        np.float32,
+        st.tuples(st.integers(0, 30), st.just(3)),
+        elements=st.sampled_from([0.0, 1.0, -2.5, np.nan, np.inf, -np.inf]),
+    )
+)
+def test_points_that_are_not_measurements_are_dropped_with_all_that_is_theirs(
+    rec: Any, points: np.ndarray
+) -> None:
+    raw = rec.velodyne(points)
+    raw["intensity"] = np.where(np.arange(len(points)) % 5, np.arange(len(points)), np.nan)
+    keep = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    scan = decode(rec.cloud(raw))
+    assert np.array_equal(scan.points, points[keep])
+    assert scan.times is not None
+    assert scan.rings is not None
+    assert np.array_equal(scan.times, raw["time"][keep])
+    assert np.array_equal(scan.rings, raw["ring"][keep])
+    assert scan.intensities is not None
+    assert np.array_equal(scan.intensities, np.nan_to_num(raw["intensity"][keep]))
+
+
+@pytest.mark.parametrize(
+    ("field", "kind", "known"),
+    [("intensity", "<u1", True), ("reflectivity", "<u2", True), ("intensity", "(3,)<f4", False)],
+)
+def test_intensities_of_any_kind(rec: Any, field: str, kind: str, known: bool) -> None:
+    values = np.ones((4, 3) if "(" in kind else 4)
+    scan = decode(rec.cloud(raw_of(4, **{field: (kind, values)})))
+    assert (scan.intensities is not None) == known
+    if scan.intensities is not None:
+        assert scan.intensities.dtype == np.float32
+        assert scan.intensities.tolist() == [1.0] * 4
+
+
+def test_a_point_whose_time_is_not_finite_is_dropped(rec: Any) -> None:
+    scan = decode(rec.cloud(raw_of(3, time=("<f4", [0.0, np.nan, 0.1]))))
+    assert len(scan) == 2
+    np.testing.assert_allclose(scan.times, [0, 0.1])
+
+
+S = 1_700_000_000.25
+NS = 1_700_000_000_250_000_000
+DIALECTS = {
+    # name: (field, type, values, header's stamp, times expected, shift of the start in ns)
+    "velodyne": ("time", "<f4", [0.0, 0.05, 0.1], NS, [0, 0.05, 0.1], 0),
+    "velodyne, first rays lost": ("time", "<f4", [0.02, 0.05, 0.1], NS, [0.02, 0.05, 0.1], 0),
+    "velodyne, stamped at the end": ("time", "<f4", [-0.1, -0.05, 0], NS, [0, 0.05, 0.1], -100),
+    "ouster": ("t", "<u4", [0, 50_000_000, 100_000_000], NS, [0, 0.05, 0.1], 0),
+    "hesai": ("timestamp", "<f8", [S, S + 0.05, S + 0.1], NS, [0, 0.05, 0.1], 0),
+    "robosense, stamped at the end": (
+        "timestamp",
+        "<f8",
+        [S, S + 0.05, S + 0.1],
+        NS + 100_000_000,
+        [0, 0.05, 0.1],
+        -100,
+    ),
+    "hesai, clock years off": ("timestamp", "<f8", [1e9, 1e9 + 0.1, 1e9 + 0.2], NS, None, 0),
+    "livox": ("timestamp", "<f8", [NS, NS + 5e7, NS + 1e8], NS, [0, 0.05, 0.1], 0),
+    "ends of small integers": ("t", "<i1", [-128, 0, 127], NS, [0, 128e-9, 255e-9], 0),
+    "microseconds, absolute": ("timestamp", "<f8", [S * 1e6, S * 1e6 + 1e5], NS, [0, 0.1], 0),
+}
+
+
+@pytest.mark.parametrize(
+    ("field", "kind", "values", "stamp", "times", "shift"), DIALECTS.values(), ids=DIALECTS
+)
+def test_times_count_from_the_start_of_the_scan_in_every_dialect(
+    rec: Any, *, field: str, kind: str, values: list[float], stamp: int, times: Any, shift: float
+) -> None:
+    scan = decode(rec.cloud(raw_of(len(values), **{field: (kind, values)}), stamp))
+    expected = np.array(values) - values[0] if times is None else times
+    assert scan.times is not None
+    np.testing.assert_allclose(scan.times, expected, atol=1e-6)
+    assert abs(scan.stamp - (stamp + shift * 10**6)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("mark", "values", "shift"),
+    [
+        ("start", [0.0, 0.1], 0.0),
+        ("end", [0.0, 0.1], -0.1),
+        ("start", [-0.1, 0.0], 0.0),
+        ("end", [-0.1, -0.01], -0.1),
+        ("end", [S, S + 0.1], -0.1),
+        ("start", [S - 3, S - 2.9], 0.0),
+    ],
+)
+def test_what_the_stamp_marks_can_be_set(
+    rec: Any, mark: Any, values: list[float], shift: float
+) -> None:
+    raw = raw_of(2, timestamp=("<f8", values))
+    scan = decode(rec.cloud(raw, NS), Timing(mark))
+    assert abs(scan.stamp - (NS + shift * 1e9)) < 1000
+    np.testing.assert_allclose(scan.times, [0, values[1] - values[0]], atol=1e-6)
+
+
+def test_a_scan_stamped_at_its_end_without_times_starts_a_period_before(rec: Any) -> None:
+    assert decode(rec.cloud(raw_of(1), NS), Timing("end", period=0.2)).stamp == NS - 200_000_000
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind", "values"),
+    [("us", "<u4", [0, 100_000]), ("ms", "<f4", [0, 100]), ("ns", "<f4", [0, 1e8])],
+)
+def test_a_unit_can_be_set(rec: Any, unit: Any, kind: str, values: list[float]) -> None:
+    raw = raw_of(2, time=(kind, values))
+    scan = decode(rec.cloud(raw), Timing(unit=unit))
+    np.testing.assert_allclose(scan.times, [0, 0.1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"), [([0, 100.0], "<f4"), ([1e30, 2e30], "<f4"), ([500.0, 500.1], "<f4")]
+)
+def test_times_no_scan_takes_are_refused(rec: Any, values: list[float], kind: str) -> None:
+    with pytest.raises(PointCloudError, match="time_unit"):
+        decode(rec.cloud(raw_of(2, time=(kind, values))))
+
+
+def damaged(rec: Any, **changes: Any) -> Any:
+    return rec.cloud(rec.velodyne(rec.scans(1)[0]), **changes)
+
+
+def field(rec: Any, *given: Any) -> Any:
+    return rec.ROS2.types["sensor_msgs/msg/PointField"](*given)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (lambda _: {"fields": []}, "no field x, y, z; there is none at all"),
+        (lambda rec: {"fields": [field(rec, a, 0, 7, 1) for a in "xy"]}, "no field z; there is x"),
+        (lambda rec: {"fields": [field(rec, "x", 20, 7, 1)]}, "ends beyond"),
+        (lambda rec: {"fields": [field(rec, "x", 2**32 - 1, 7, 1)]}, "ends beyond"),
+        (lambda rec: {"fields": [field(rec, "x", 0, 7, 2**32 - 1)]}, "ends beyond"),
+        (lambda rec: {"fields": [field(rec, "x", 0, 99, 1)]}, "unknown datatype 99"),
+        (lambda rec: {"fields": [field(rec, "x", 0, 7, 1)] * 2}, "appears twice"),
+        (lambda rec: {"fields": [field(rec, a, 0, 7, 2) for a in "xyz"]}, "not one number"),
+        (lambda _: {"width": 2**32 - 1, "height": 2**32 - 1}, "need"),
+        (lambda _: {"point_step": 0}, "ends beyond"),
+        (lambda _: {"row_step": 2**32 - 1, "height": 2, "width": 30}, "need"),
+        (lambda _: {"data": np.empty(0, np.uint8)}, "there are 0"),
+    ],
+)
+def test_a_message_that_is_no_cloud_is_refused(rec: Any, changes: Any, message: str) -> None:
+    with pytest.raises(PointCloudError, match=message):
+        decode(damaged(rec, **changes(rec)))
+
+
+def test_a_count_of_zero_is_one(rec: Any) -> None:
+    fields = [field(rec, a, 4 * i, 7, 0) for i, a in enumerate("xyz")]
+    assert len(decode(damaged(rec, fields=fields))) == 60
+
+
+def test_no_points_are_a_scan(rec: Any) -> None:
+    scan = decode(rec.cloud(rec.velodyne(np.empty((0, 3)))))
+    assert len(scan) == 0
+    assert scan.points.shape == (0, 3)
+
+
+@pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd"])
+def test_a_message_is_the_same_however_it_is_serialised(rec: Any, frame: str) -> None:
+    raw = rec.velodyne(rec.scans(1)[0])
+    forms = []
+    for store, serialise in (
+        (rec.ROS1, rec.ROS1.serialize_ros1),
+        (rec.ROS2, rec.ROS2.serialize_cdr),
+        (rec.ROS2, lambda m, kind: rec.ROS2.serialize_cdr(m, kind, little_endian=False)),
+    ):
+        message = rec.cloud(raw, store=store, header=rec.header(rec.START, frame, store))
+        forms.append((bytes(serialise(message, message.__msgtype__)), store is rec.ROS2))
+    for data, cdr in forms:
+        cloud = clouds.parse(data, cdr)
+        assert cloud.stamp == rec.START
+        assert [name for name, *_ in cloud.fields] == list(raw.dtype.names or ())
+        assert np.array_equal(clouds.read_points(cloud), raw)
+
+
+@pytest.mark.parametrize("cdr", [False, True])
+def test_a_message_cut_short_or_too_long_is_refused(rec: Any, cdr: bool) -> None:
+    store = rec.ROS2 if cdr else rec.ROS1
+    message = rec.cloud(rec.velodyne(rec.scans(1, 3)[0]), store=store)
+    serialise = store.serialize_cdr if cdr else store.serialize_ros1
+    data = bytes(serialise(message, message.__msgtype__))
+    assert len(clouds.decode_cloud(data, cdr)) == 3
+    for damaged in [*(data[:n] for n in range(len(data))), data + bytes(4)]:
+        with pytest.raises(PointCloudError, match="not a whole PointCloud2"):
+            clouds.decode_cloud(damaged, cdr)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_any_change_of_a_message_gives_a_scan_or_an_error(rec: Any, data: st.DataObject) -> None:
+    u32 = st.one_of(st.integers(0, 100), st.integers(0, 2**32 - 1))
+    changes = data.draw(
+        st.fixed_dictionaries(
+            {},
+            optional={
+                "height": u32,
+                "width": u32,
+                "point_step": u32,
+                "row_step": u32,
+                "is_bigendian": st.booleans(),
+                "data": st.binary(max_size=2000).map(lambda b: np.frombuffer(b, np.uint8)),
+                "fields": st.lists(
+                    st.builds(
+                        lambda *given: field(rec, *given),
+                        st.sampled_from(["x", "y", "z", "time", "t", "ring", "", "é"]),
+                        u32,
+                        st.integers(0, 255),
+                        u32,
+                    ),
+                    max_size=7,
+                ),
+            },
+        )
+    )
+    try:
+        scan = decode(damaged(rec, **changes))
+    except PointCloudError:
+        return
+    assert np.isfinite(scan.points).all()
+    for values in (scan.times, scan.rings):
+        assert values is None or len(values) == len(scan)
+    assert scan.times is None or (np.isfinite(scan.times).all() and (scan.times >= 0).all())

@@ -1,0 +1,198 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
+from adaptune.recording.opening import open_sequence
+from adaptune.recording.views import WithImu
+
+
+@pytest.fixture(scope="module")
+def bag(rec: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rec.drive(tmp_path_factory.mktemp("drive") / "a.bag")
+
+
+def seen(bag: Path, *views: Any, **options: Any) -> Any:
+    return open_sequence(SequenceConfig(bag=str(bag), reference="/poses", views=views, **options))
+
+
+def tenths(rec: Any, sequence: Any) -> list[int]:
+    return [(scan.stamp - rec.START) // 10**8 for scan in sequence]
+
+
+def test_cut_keeps_parts(rec: Any, bag: Path) -> None:
+    assert tenths(rec, seen(bag, {"cut": [[0.2, 0.45], [1, 1.15]]})) == [2, 3, 4, 10, 11]
+    with pytest.raises(SequenceError, match="its views leave no scan; cut or drop less"):
+        list(seen(bag, {"cut": [[100, 200]]}))
+
+
+def test_views_share_the_clouds(bag: Path) -> None:
+    list(seen(bag))
+    base = [scan.points.base for scan in seen(bag)]
+    for view in ({"cut": [[0, 9]]}, {"speed": {"factor": 2}}, {"drop": {"share": 1e-9}}):
+        for scan in seen(bag, view):
+            assert scan.points.base is not None
+    assert base[0] is base[-1], "scans of an entry are views of one map"
+    for scan in seen(bag, {"reverse": True}):
+        assert not scan.points.flags.owndata
+
+
+def test_drop_loses_its_share_by_its_seed_alone(rec: Any, bag: Path) -> None:
+    lossy = {"drop": {"share": 0.5, "start": 0.5, "stop": 1.5, "seed": 3}}
+    kept = tenths(rec, seen(bag, lossy))
+    assert set(range(5)) | set(range(15, 20)) <= set(kept)
+    assert 10 < len(kept) < 20
+    assert tenths(rec, seen(bag, lossy)) == kept
+    other = {"drop": {"share": 0.5, "start": 0.5, "stop": 1.5, "seed": 4}}
+    assert tenths(rec, seen(bag, other)) != kept
+    cut = {"cut": [[0.7, 1.2]]}
+    assert tenths(rec, seen(bag, lossy, cut)) == [k for k in kept if 7 <= k < 12]
+
+
+def test_speed_changes_arrival_and_nothing_else(bag: Path) -> None:
+    plain = list(seen(bag))
+    fast = seen(bag, {"speed": {"factor": 2, "start": 0.5, "stop": 1.0}})
+    scans = list(fast)
+    assert [s.stamp for s in scans] == [s.stamp for s in plain]
+    stamps = np.array([s.stamp for s in scans])
+    arrival = (fast.played_at(stamps) - stamps[0]) / 1e8
+    expected = [*range(6), 5.5, 6, 6.5, 7, 7.5, *(np.arange(11, 20) - 2.5)]
+    np.testing.assert_allclose(arrival, expected)
+    assert np.array_equal(seen(bag).played_at(stamps), stamps)
+
+
+def test_reverse_mirrors_scans_times_and_poses(bag: Path) -> None:
+    plain, backward = list(seen(bag)), list(seen(bag, {"reverse": True}))
+    assert len(backward) == 20
+    assert all(np.diff([s.stamp for s in backward]) == 10**8)
+    assert backward[0].stamp == plain[0].stamp
+    for a, b in zip(plain, reversed(backward), strict=True):
+        assert np.array_equal(a.points, b.points)
+        np.testing.assert_allclose(b.times, a.times.max() - a.times, atol=1e-8)
+    # A point is where it was: the pose at the time of each point is the same.
+    trajectory, mirrored = seen(bag).reference(), seen(bag, {"reverse": True}).reference()
+    last = plain[3].stamp + round(float(plain[3].times[-1]) * 1e9)
+    there = trajectory.at(np.array([last]))
+    here = mirrored.at(np.array([backward[-4].stamp]))
+    np.testing.assert_allclose(here, there, atol=1e-9)
+    twice = list(seen(bag, {"reverse": True}, {"reverse": True}))
+    assert [s.stamp for s in twice] == [s.stamp for s in plain]
+    cut = seen(bag, {"cut": [[0, 0.5]]}, {"reverse": True})
+    assert np.array_equal(next(iter(cut)).points, plain[4].points)
+
+
+def test_reverse_needs_the_cache_for_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SequenceError, match="leave `cache` on"):
+        list(seen(bag, {"reverse": True}, cache=False))
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0.000001")
+    with pytest.raises(SequenceError, match="ADAPTUNE_CACHE_GB"):
+        list(seen(bag, {"reverse": True}))
+
+
+def test_folders_are_reversed_without_a_cache(rec: Any, tmp_path: Path) -> None:
+    for i, points in enumerate(rec.scans(3)):
+        np.save(tmp_path / f"{i}.npy", points)
+    sequence = open_sequence(SequenceConfig(folder=str(tmp_path), views=[{"reverse": True}]))
+    for scan, points in zip(sequence, rec.scans(3)[::-1], strict=True):
+        assert np.array_equal(scan.points, points)
+
+
+def test_rings_are_thinned(rec: Any, bag: Path) -> None:
+    """All that is told of a point goes with it."""
+    for plain, thin in zip(seen(bag), seen(bag, {"rings": 4}), strict=True):
+        which = plain.rings % 4 == 0
+        assert np.array_equal(thin.points, plain.points[which])
+        assert np.array_equal(thin.times, plain.times[which])
+        assert np.array_equal(thin.intensities, plain.intensities[which])
+    without = rec.velodyne(rec.scans(1)[0])[["x", "y", "z"]]
+    path = rec.write_bag(bag.parent / "b.bag", [("/p", 1, rec.cloud(without, rec.START, rec.ROS1))])
+    with pytest.raises(SequenceError, match="have no ring"):
+        list(open_sequence(SequenceConfig(bag=str(path), views=[{"rings": 2}])))
+
+
+def test_noise_moves_points_along_their_rays(bag: Path) -> None:
+    view = {"noise": {"sigma": 0.1, "seed": 1}}
+    errors = []
+    for plain, noisy, again in zip(seen(bag), seen(bag, view), seen(bag, view), strict=True):
+        assert np.array_equal(noisy.points, again.points)
+        ranges = np.linalg.norm(plain.points, axis=1)
+        errors.append(np.linalg.norm(noisy.points, axis=1) - ranges)
+        rays = plain.points / ranges[:, None]
+        assert np.abs(np.cross(noisy.points, rays)).max() < 1e-4
+    assert np.std(np.concatenate(errors)) == pytest.approx(0.1, rel=0.1)
+    assert not np.allclose(errors[0], errors[1])
+
+
+def test_a_transform_leaves_the_world_where_it_is(bag: Path) -> None:
+    view = {"transform": [1, 2, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]}
+    plain, moved = seen(bag), seen(bag, view)
+    T, T_moved = plain.reference().T_world_sensor, moved.reference().T_world_sensor
+    for i, (a, b) in enumerate(zip(plain, moved, strict=True)):
+        assert not np.allclose(a.points, b.points)
+        world = a.points @ T[2 * i, :3, :3].T + T[2 * i, :3, 3]
+        again = b.points @ T_moved[2 * i, :3, :3].T + T_moved[2 * i, :3, 3]
+        np.testing.assert_allclose(again, world, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        {},
+        {"cut": []},
+        {"cut": [[2, 1]]},
+        {"cut": [[-1, 1]]},
+        {"drop": {"share": 1.5}},
+        {"drop": {"share": 0.5, "start": 2, "stop": 1}},
+        {"speed": {"factor": 0}},
+        {"rings": 1},
+        {"reverse": False},
+        {"noise": {"sigma": -1}},
+        {"transform": [1, 2, 3]},
+        {"rings": 2, "reverse": True},
+        {"blur": 1},
+    ],
+)
+def test_views_that_make_no_sense_are_refused(bag: Path, view: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        SequenceConfig(bag=str(bag), views=[view])
+
+
+class Inertial:
+    """Scans of 0.1 s, one of them lost, and an IMU of 100 Hz."""
+
+    name, n_messages = "inertial", 4
+
+    def __init__(self, begin: float, end: float) -> None:
+        stamps = np.arange(round(begin * 1e9), round(end * 1e9), 10**7)
+        zeros = np.zeros((len(stamps), 3))
+        self.imu = lambda: Imu(stamps, zeros, zeros) if len(stamps) else None
+        self.reference = self.played_at = None
+
+    def __iter__(self) -> Any:
+        points, times = np.zeros((2, 3), np.float32), np.array([0.0, 0.095], np.float32)
+        for tenth in (0, 1, 3, 4):
+            yield Scan(tenth * 10**8, points.copy(), times.copy())
+
+
+def hundredths(begin: float, end: float) -> list[list[int]]:
+    measured = [scan.imu for scan in WithImu(Inertial(begin, end))]
+    return [(imu.stamps // 10**7).tolist() for imu in measured]
+
+
+def test_scans_bring_along_what_the_imu_measured_since_the_one_before() -> None:
+    # To the first measurement at the scan's end or after it; the first begins with the one before.
+    expected = [[*range(11)], [*range(11, 21)], [*range(21, 41)], [*range(41, 51)]]
+    assert hundredths(0.0, 9.0) == expected
+    assert hundredths(-1.0, 9.0) == expected
+    assert hundredths(0.15, 0.45) == [[15], [*range(16, 21)], [*range(21, 41)], [*range(41, 45)]]
+
+
+def test_an_imu_that_is_not_there_or_of_another_time() -> None:
+    with pytest.raises(SequenceError, match="inertial: holds no measurements of an IMU; name"):
+        hundredths(0.0, 0.0)
+    for begin in (-9.0, 20.0):
+        with pytest.raises(SequenceError, match="record both on the same clock, or leave"):
+            hundredths(begin, begin + 5.0)
