@@ -1,8 +1,7 @@
-"""The limits that keep files and functions small, and names unique."""
+"""The limits that keep files and functions small."""
 
 import ast
 import subprocess
-from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,8 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("adaptune", "offline", "online")
 SOURCES = (*PACKAGES, "benchmarks", "docker")
-SHARED_NAMES = {"__init__", "base", "config"}
-MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_NESTING = 450, 60, 8, 4
+MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_NESTING = 800, 60, 8, 4
 MAX_OPTIONS = 12
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -106,27 +104,6 @@ def test_files_are_short(folder: str) -> None:
 @pytest.mark.parametrize("folder", SOURCES)
 def test_functions_are_short_and_flat(folder: str) -> None:
     report(breach for file in tracked(folder) for breach in breaches(file))
-
-
-def test_no_two_modules_share_a_name() -> None:
-    places = defaultdict(set)
-    for file in map(Path, tracked(*PACKAGES)):
-        if file.stem == "__init__":
-            places[file.parent.name].add(str(file.parent))
-        elif file.stem not in SHARED_NAMES and file.stem != file.parent.name:
-            places[file.stem].add(str(file))
-    report(" and ".join(sorted(files)) for files in places.values() if len(files) > 1)
-
-
-def test_no_two_classes_share_a_name() -> None:
-    places = defaultdict(set)
-    for file in tracked(*PACKAGES):
-        for node in ast.walk(parse(file)):
-            if isinstance(node, ast.ClassDef) and not is_private(node.name):
-                places[node.name].add(f"{file}:{node.lineno}")
-    report(
-        f"{name}: {' and '.join(sorted(where))}" for name, where in places.items() if len(where) > 1
-    )
 
 
 def is_module(name: str) -> bool:

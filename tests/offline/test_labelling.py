@@ -1,7 +1,7 @@
 """Reading the labelled data set of a study."""
 
 import numpy as np
-import offline.labelling
+import offline.labelled
 import pytest
 
 from adaptune.archive import Archive
@@ -15,7 +15,7 @@ from offline.labelled import labelled_data
 def test_motions_are_read_of_the_best_sets_and_of_the_baseline(
     study_file, trained_folder, monkeypatch, pool
 ):
-    monkeypatch.setattr(offline.labelling, "POOL", pool)
+    monkeypatch.setattr(offline.labelled, "POOL", pool)
     study = load_study(study_file, [], trained_folder)
     model = ErrorModel.load(study.model_path)
     data = labelled_data(

@@ -72,7 +72,7 @@ def test_clouds_that_trials_prepare_are_kept_apart_too(monkeypatch):
             assert inside == [True]
             return super().prepare(scan)
 
-    monkeypatch.setattr("offline.prepared.apart", apart)
+    monkeypatch.setattr("offline.trial.apart", apart)
     shared = SharedScans(Read(), 1e6)
     one = Watched("a")
     passes(shared, one)
@@ -104,7 +104,7 @@ def test_preparations_that_a_pass_does_not_use_make_room():
 
 def test_it_knows_what_preparing_costs(monkeypatch):
     clock = iter(np.arange(0.0, 1e3, 0.004))
-    monkeypatch.setattr("offline.prepared.time.process_time", lambda: next(clock))
+    monkeypatch.setattr("offline.trial.time.process_time", lambda: next(clock))
     shared, one = SharedScans(Read(), 1e6), Preparer("a")
     passes(shared, one)
     assert shared.milliseconds(one) == pytest.approx(4.0)
