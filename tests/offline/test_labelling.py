@@ -1,9 +1,9 @@
 """Reading the labelled data set of a study."""
 
 import numpy as np
-import offline.labelled
 import pytest
 
+import offline.labelled
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
 from adaptune.model.rules import mean_errors
