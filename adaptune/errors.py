@@ -7,7 +7,7 @@ import traceback
 import types
 import typing
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -53,6 +53,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return f"there is {', '.join(map(repr, names))}" if names else "there is none"
 
 
+@cache
 def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
     """Import modules of a package that one of adaptune's extras installs; an error without it."""
     try:

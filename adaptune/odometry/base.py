@@ -3,7 +3,6 @@
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from functools import cache
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -342,7 +341,6 @@ class Odometry(ABC):
         return parameters
 
 
-@cache
 def prepared_bytes(prepared: Any) -> int:
     """Memory that a prepared scan takes, roughly, in bytes."""
     if isinstance(prepared, Scan):
