@@ -250,6 +250,8 @@ def _plain(message: str) -> str:
 
 RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
 """Keys of earlier versions, and their present names."""
+DELETED = {"offline.search": "is gone: a search is always for single sets; leave it out"}
+"""Keys of earlier versions that are gone, and what became of them."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -320,8 +322,11 @@ def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:
 
 
 def _unknown(model: type[BaseModel], path: Key, key: Key) -> str:
-    if new := RENAMED.get(".".join(map(str, key + path))):
-        return f"is now called {new}"
+    old = ".".join(map(str, key + path))
+    if old in RENAMED:
+        return f"is now called {RENAMED[old]}"
+    if old in DELETED:
+        return DELETED[old]
     return f"{UNKNOWN}; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
 
 

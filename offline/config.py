@@ -89,7 +89,6 @@ class OfflineConfig(StrictModel):
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
     preset: Literal["paper"] | None = None
-    search: Literal["set", "bank"] | None = None
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:
@@ -152,7 +151,7 @@ class OfflineConfig(StrictModel):
         yield from (mistake.below(key) for mistake in below)
 
     def _search_mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
-        """Find samplers that cannot search among several odometries, or for a bank."""
+        """Find samplers that cannot search among several odometries."""
         n = 1 if space is None else len(space.baselines)
         grid = "grid" in self.sampler_settings
         if n > 1 and (self.sampler not in (*FORGETFUL, "sobol", "random") or grid):
@@ -161,22 +160,11 @@ class OfflineConfig(StrictModel):
         if self.trials is not None and self.trials < n:
             message = f"{n} odometries need {n} trials at least, to try the parameters of each"
             yield Mistake(("trials",), message)
-        if self.search != "bank":
-            return
-        if self.sampler not in FORGETFUL:
-            yield Mistake(("search",), f"a search for a bank needs {' or '.join(FORGETFUL)}")
-        elif len(self.objective) > 1:
-            yield Mistake(("search",), "a search for a bank minimises one objective; give one")
-
-    def seeks_bank(self, space: ParameterSpace) -> bool:
-        """Whether the search is for sets that add to a bank."""
-        able = self.sampler in FORGETFUL and len(self.objective) == 1
-        return able and (self.search == "bank" or (not self.search and len(space.baselines) > 1))
 
 
 _LASTING = (
     *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
-    *("objective", "limits", "runs", "repeats", "baseline_runs", "augment", "pruning", "search"),
+    *("objective", "limits", "runs", "repeats", "baseline_runs", "augment", "pruning"),
 )
 """Settings that may not change when a study is resumed."""
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
-from itertools import count, islice, zip_longest
+from itertools import count, islice
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -19,9 +19,8 @@ from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.config import OfflineConfig, OfflineStudyConfig
 from offline.objective import Verdict, best_by_trials, judge, sampler_results, weighted
-from offline.portfolio import Portfolio
 from offline.samplers import make_sampler
-from offline.samplers.samplers import Sampler, key
+from offline.samplers.samplers import Sampler
 
 # Pruning: which trials of a batch continue on more sequences, and which stop.
 #
@@ -284,7 +283,6 @@ class Search:
         finished: Finished,
         known: Mapping[int, ParameterSet],
         slot: int = 0,
-        portfolio: Portfolio | None = None,
     ):
         self.sequences = list(sequences)
         self.verdicts: list[Verdict] = []
@@ -297,7 +295,6 @@ class Search:
         self._limit = max_trials(config)
         self._finished = finished
         self._known, self._slot = known, slot
-        self._portfolio = portfolio
         self._alive: list[int] = []
         self._sets: dict[int, ParameterSet] = {}
 
@@ -336,7 +333,7 @@ class Search:
         if first and self._config.pruning != "none":
             self.order = self._hardest_first()
         if len(self._sets) < len(self.numbers):
-            proposed = self._proposed()
+            proposed = self._sampler.propose(sampler_results(self.verdicts))
             new = [s for s in proposed if s not in self._sets.values()]
             unknown = [n for n in self.numbers if n not in self._sets]
             self._sets |= zip(unknown, new, strict=False)
@@ -346,21 +343,6 @@ class Search:
             return False
         self._alive = list(self.numbers)
         return True
-
-    def _proposed(self) -> list[ParameterSet]:
-        """The next batch: sets that promise little error, and sets that promise to add to a bank.
-
-        The first points serve both.
-        """
-        results = sampler_results(self.verdicts)
-        if self._portfolio is None or len(results) < self._config.initial:
-            return self._sampler.propose(results)
-        worth = self._portfolio(self._closed)
-        valued = [one._replace(value=loss) for one, loss in zip(results, worth, strict=True)]
-        of_bank, alone = self._sampler.propose(valued), self._sampler.propose(results)
-        every = [s for pair in zip_longest(of_bank, alone) for s in pair if s is not None]
-        distinct = list({key(s): s for s in every}.values())
-        return distinct[: self._config.batch]
 
     def missing(self, m: int) -> dict[str, list[int]]:
         """Trials of the batch still to be run, for each of the first `m` sequences."""
@@ -460,17 +442,12 @@ def make_stages(
     study: OfflineStudyConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
 ) -> list[Stage]:
     """Make the searches of a study over some sequences, in their order."""
-    config, size = study.offline, study.online.switching.size
-
-    def portfolio(of: Sequence[str]) -> Portfolio | None:
-        seeks = config.seeks_bank(space)
-        return Portfolio(archive, of, study.sub_trajectory, size) if seeks else None
-
+    config = study.offline
     finished, known = {name: archive.finished(name) for name in names}, archive.sets()
     stages = []
     if config.sets != "own":
         sampler = partial(make_sampler, space, config)
-        shared = Search(sampler, config, names, finished, known, portfolio=portfolio(names))
+        shared = Search(sampler, config, names, finished, known)
         stages.append(Stage([shared], alone=False))
     if config.sets != "shared":
         slots, own = archive.slots(names), []
@@ -478,8 +455,7 @@ def make_stages(
             seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
             seed = {"seed": int(seeds.generate_state(1)[0])}
             sampler = partial(make_sampler, space, config.model_copy(update=seed))
-            of = (slots[name], portfolio([name]))
-            own.append(Search(sampler, config, [name], finished, known, *of))
+            own.append(Search(sampler, config, [name], finished, known, slots[name]))
         stages.append(Stage(own, alone=True))
     return stages
 

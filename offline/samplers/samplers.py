@@ -512,10 +512,7 @@ def _seeds(config: OfflineConfig, n: int) -> list[int]:
 
 
 def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:
-    """The sets of a batch, those of each odometry evenly along it; trial `first` says who begins.
-
-    So the first half of a batch, which a search for a bank takes, has sets of all.
-    """
+    """The sets of a batch, those of each odometry evenly; trial `first` says who begins."""
     labels = list(sets)
     order = [*labels[first % len(labels) :], *labels[: first % len(labels)]]
     placed = [(k / len(sets[label]), own) for label in order for k, own in enumerate(sets[label])]

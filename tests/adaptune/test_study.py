@@ -4,7 +4,7 @@ import sys
 import pytest
 from needs import needs_evalio
 
-from adaptune.errors import RENAMED, ConfigurationError, import_extra
+from adaptune.errors import DELETED, RENAMED, ConfigurationError, import_extra
 from offline.config import load_study
 
 
@@ -302,16 +302,12 @@ def test_reports_all_mistakes_at_once_with_their_lines(study_file):
     assert [int(line.split("line ")[1].split(":")[0]) for line in lines] == [6, 9, 12, 14]
 
 
-@pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_a_renamed_key_names_the_new_one(study_file, old, new):
-    *sections, key = old.split(".")
-    file = study_file.with_name("renamed.yaml")
-    nested = "".join(f"{'  ' * i}{section}:\n" for i, section in enumerate(sections))
-    text = study_file.read_text()
-    file.write_text(f"{text}{nested}{'  ' * len(sections)}{key}: 3\n")
-    line = len(text.splitlines()) + len(sections) + 1
-    assert failure(file) == f"{file}, line {line}: {old}: is now called {new}"
-    assert failure(study_file, f"{old}=3") == f"-o: {old}: is now called {new}"
+@pytest.mark.parametrize(
+    ("old", "words"),
+    [*((old, f"is now called {new}") for old, new in RENAMED.items()), *DELETED.items()],
+)
+def test_an_old_key_is_told_what_became_of_it(study_file, old, words):
+    assert failure(study_file, f"{old}=3") == f"-o: {old}: {words}"
 
 
 @pytest.mark.parametrize(

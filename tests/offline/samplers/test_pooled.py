@@ -102,22 +102,11 @@ def test_where_one_has_nothing_left_the_others_go_on():
         ({"sampler": "annealing"}, "sampler"),
         ({"sampler": "random", "sampler_settings": {"grid": {}}}, "sampler"),
         ({"trials": 2}, "trials"),
-        ({"sampler": "sobol", "search": "bank"}, "search"),
-        ({"search": "bank", "objective": ["rte", "ape"]}, "search"),
     ],
 )
 def test_what_several_odometries_cannot_be_searched_with(settings, key):
     found = list(OfflineConfig(**settings)._search_mistakes(SPACE))
     assert [mistake.key for mistake in found] == [(key,)]
-
-
-def test_several_odometries_are_searched_for_a_bank():
-    alone = SPACE.spaces["gicp"]
-    assert OfflineConfig().seeks_bank(SPACE)
-    assert not OfflineConfig().seeks_bank(alone)
-    assert OfflineConfig(search="bank").seeks_bank(alone)
-    assert not OfflineConfig(search="set").seeks_bank(SPACE)
-    assert not OfflineConfig(sampler="sobol").seeks_bank(SPACE)
 
 
 @given(
