@@ -122,7 +122,7 @@ class Selector:
     ):
         model.check_descriptors(descriptors)
         if members is None:
-            drives_bank = rule == "paired" and (model.bank_adapts or model.bank_rests)
+            drives_bank = rule == "adaptive" and (model.bank_adapts or model.bank_rests)
             members = model.bank if drives_bank else ()
         self.members = tuple(members)
         self.fixed = self.members[0] if self.members else model.fixed
@@ -130,7 +130,7 @@ class Selector:
         self._dwell = dwell * 1e9
         self._measures = measures
         self._pca = model.pca()
-        weighs = bool(self.members) and rule == "paired"
+        weighs = bool(self.members) and rule == "adaptive"
         reserve = model.reserve if weighs else []
         self._reserve = frozenset(reserve).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]

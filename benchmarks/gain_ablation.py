@@ -78,7 +78,7 @@ def less(data: LabelledData) -> None:
 
     def maker(name: str, take: Take, every: int = 1) -> Maker:
         def make(others: LabelledData) -> Rule:
-            settings = choose(others, 0).one_set if name == "paired" else PairedSettings()
+            settings = choose(others, 0).one_set if name == "adaptive" else PairedSettings()
             of_less = {"n_frames": max(1, settings.n_frames // every)}
             return OfLess(make_rule(name, settings.model_copy(update=of_less)), take)
 
@@ -154,7 +154,7 @@ def makers() -> dict[str, Maker]:
         "threshold": 0.0,
     }
     return {
-        "paired": maker(),
+        "adaptive": maker(),
         "without caution": maker(caution=0.0),
         "two standard errors": maker(caution=2.0),
         "without smoothing": maker(width=1e-3),

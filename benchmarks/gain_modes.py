@@ -51,9 +51,9 @@ def by_kind(data: LabelledData, size: int) -> None:
         ]
         every += left_out
         print(f"without {kind}, {len(left_out)} sequences: ", end="")
-        print_summary(Validation(left_out), ["paired"])
+        print_summary(Validation(left_out), ["adaptive"])
     print("all of them: ", end="")
-    print_summary(Validation(every), ["paired"])
+    print_summary(Validation(every), ["adaptive"])
 
 
 def own_errors(data: LabelledData) -> None:
@@ -146,7 +146,7 @@ def by_descriptor(data: LabelledData, paths: list[Path], described: list[Path], 
             sequences.append(changed)
         print(f"by {' and '.join(names)}: ", end="")
         validation = leave_one_out(data._replace(sequences=sequences), {}, bank=size)
-        print_summary(validation, ["paired"])
+        print_summary(validation, ["adaptive"])
 
 
 def curve(data: LabelledData) -> None:

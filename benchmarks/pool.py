@@ -63,7 +63,7 @@ def left_out(data: LabelledData) -> None:
         free = leave_one_out(fixed_set, {}, bank=0)
         pairs = zip(validation.left_out, free.left_out, strict=True)
         ratio = np.array([a.errors[PAIRED].mean() / b.errors["fixed"].mean() for a, b in pairs])
-        print(f"within the budget, paired / fixed without it: {_words(ratio)}")
+        print(f"within the budget, adaptive / fixed without it: {_words(ratio)}")
 
 
 def print_left_out(validation: Validation) -> None:
@@ -83,7 +83,7 @@ def print_left_out(validation: Validation) -> None:
             for kind in dict.fromkeys(kinds)
         }
         print(
-            f"paired / {rival:13} {_words(ratio)}, 95 % {found.low:.2f}-{found.high:.2f}; "
+            f"adaptive / {rival:13} {_words(ratio)}, 95 % {found.low:.2f}-{found.high:.2f}; "
             + ", ".join(f"{kind} {value:.2f}" for kind, value in by_kind.items())
         )
     each = zip(validation.left_out, means[PAIRED] / means[BEST_DEFAULT], strict=True)

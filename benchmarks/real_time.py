@@ -138,7 +138,7 @@ def model_of(scans: list[Scan], n_sets: int = 16, copies: int = 20) -> ErrorMode
 
 def in_real_time(scans: list[Scan]) -> None:
     """Replay at the sensor's rate with a selector."""
-    make = partial(Selector, model_of(scans), "paired", ())
+    make = partial(Selector, model_of(scans), "adaptive", ())
     with closing(SelectorProcess(make, 1.0)) as selector:
         found = replay_in_real_time(scans, GICP(), HealthCheck(), RealTimeConfig(), selector)
     print(f"real time, {len(scans)} scans: {kept_up(found)}", flush=True)

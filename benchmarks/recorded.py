@@ -47,7 +47,7 @@ from online.run import run_replays, run_untrained
 from online.statistics import ComparisonRow, Reference, compare_modes
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
-MODES = ("baseline", "fixed", "paired", "untrained")
+MODES = ("baseline", "fixed", "adaptive", "untrained")
 """What is compared besides the modes on demand."""
 CARS = ("town", "road", "city", "street")
 # An HDL-64E turns on while the car drives: a scan is distorted by up to two metres. KISS-ICP
@@ -107,7 +107,7 @@ def definition(
         "offline": {"sampler": "sobol", "trials": n_sets, "seed": seed, "workers": 1},
         # All modes but `paper`, with a bank, though the benchmark is bound to one core.
         "online": {
-            "rules": ["paired"],
+            "rules": ["adaptive"],
             "switching": {"mechanism": "bank"},
             "also": list(also),
         },
@@ -149,7 +149,7 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
     rows: list[ComparisonRow] = []
     for name in study.config.test:
         folder = study.folder / "replays" / name
-        # What `paired` does already is not replayed again.
+        # What `adaptive` does already is not replayed again.
         also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
         replays = {mode: [StoredReplay.read(folder / mode)] for mode in (*MODES, *also)}
         reference = Reference.read(

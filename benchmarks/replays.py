@@ -106,7 +106,7 @@ def bank_of(
         vectors=data.vectors(chosen.members),
         bank_settings=chosen.bank,
     )
-    selector = Selector(of_bank, "paired", chosen.members)
+    selector = Selector(of_bank, "adaptive", chosen.members)
     return chosen, (lambda: Bank(factory, members, WarmUp()), selector)
 
 
@@ -135,7 +135,7 @@ def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, W
         "fixed": lambda: alone(model.fixed),
         "fixed, geometric": lambda: alone(geometric(data)),
         "paper": lambda: live("paper"),
-        "paired": lambda: live("paired"),
+        "adaptive": lambda: live("adaptive"),
         "bank of 2": lambda: bank(2),
         "bank of 3": lambda: bank(3),
         "bank of 4": lambda: bank(4),

@@ -5,7 +5,7 @@
 Random numbers take the places of scans and errors: 14,136 frames in six sequences, 10 components
 of the descriptor and 2 parameters; 256 sets a sequence (3.6 million pairs), and the same 1536 sets
 for all (21.7 million). One thread on one core. Limits: `paper` 1 ms in the median and 5 ms for
-99 %, `paired` 5 ms in the median; 300 times faster than 256 iterations of TPE on scikit-learn's
+99 %, `adaptive` 5 ms in the median; 300 times faster than 256 iterations of TPE on scikit-learn's
 KNeighborsRegressor over the same 3.6 million rows, and 50 times faster than one call of it on the
 same candidates; file 100 MB, load 1 s, fit 10 s. Where other programs share the core, CPU time
 says more than the time by the clock.
@@ -202,7 +202,7 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
     """Draw the cost of a selection against the number of training frames."""
     rng = np.random.default_rng(2)
     sizes = [1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000]
-    medians: dict[str, list[float]] = {"paper": [], "paired": []}
+    medians: dict[str, list[float]] = {"paper": [], "adaptive": []}
     for n in sizes:
         data = TrainingData(
             np.cumsum(rng.normal(0.0, 0.05, (n, N_COMPONENTS)), axis=0),
@@ -212,7 +212,7 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
             0,
         )
         asked = data.features[rng.integers(0, n, 100)] + 0.1
-        for name, rule in (("paper", NearestNeighbours()), ("paired", PairedExpectedRatio())):
+        for name, rule in (("paper", NearestNeighbours()), ("adaptive", PairedExpectedRatio())):
             rule.fit(data)
             costs(rule.select, asked[:5])
             medians[name].append(float(np.median(costs(rule.select, asked)[1])))
@@ -238,7 +238,7 @@ def main(png: Path | None) -> None:
         print("\n1536 sets, the same for all sequences")
         model = measure_file(kitti_size(0, own_sets=False), Path(folder))
         measure_selection(model, "paper", NearestNeighbours(), "limits: median 1, 99 % 5")
-        measure_selection(model, "paired", PairedExpectedRatio(), "limit: median 5")
+        measure_selection(model, "adaptive", PairedExpectedRatio(), "limit: median 5")
         bank = BankRule(BankSettings(n_frames=BANK_FRAMES))
         measure_selection(model, "bank", bank, "limit: median 5", model.bank)
     if png is not None:

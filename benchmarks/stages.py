@@ -134,8 +134,8 @@ def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
             settings.iterations,
         )
 
-    result = replayed(Selector(model, "paired", ()))
-    keeps_fixed = KeepsFixed(model, "paired")
+    result = replayed(Selector(model, "adaptive", ()))
+    keeps_fixed = KeepsFixed(model, "adaptive")
     stamps = result.trajectory.stamps
     duration = (stamps[-1] - stamps[0]) * 1e-9
     print(

@@ -29,7 +29,7 @@ class Known(NamedTuple):
     parameters : dict
         The fixed set.
     way : str, optional
-        How `paired` adapts: `BANK` or `ONE_SET`; None if it drives the fixed set.
+        How `adaptive` adapts: `BANK` or `ONE_SET`; None if it drives the fixed set.
     members : list of int
         Trial numbers of the bank's members, if there is a bank, driven or not.
     expected : dict

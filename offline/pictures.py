@@ -127,9 +127,9 @@ def _draw_sequences(axes: Any, found: LeftOutResults) -> None:
 
 
 def _draw_familiarity(axes: Any, found: LeftOutResults) -> None:
-    """Gain of `paired` over familiarity."""
-    label = "paired, each stretch"
-    axes.plot(found.familiarity, found.gain, label=label, **POINTS["paired"] | {"ls": ""})
+    """Gain of `adaptive` over familiarity."""
+    label = "adaptive, each stretch"
+    axes.plot(found.familiarity, found.gain, label=label, **POINTS["adaptive"] | {"ls": ""})
     axes.set_xlabel("familiarity [-] (0: unlike all training)")
     axes.set_title("where scans are known and new")
 
@@ -142,9 +142,9 @@ def _draw_sizes(axes: Any, found: LeftOutResults) -> None:
     known = "best of so many sets, if known"
     axes.plot(sizes, found.portfolio, "s--", color="#999999", label=known)
     most = max(1.0, float(found.portfolio.max()))
-    fewer, number = "paired, trained on so many", ["sets"]
+    fewer, number = "adaptive, trained on so many", ["sets"]
     for rows, column, counted, look, label in (
-        (found.banks, "instances", "members", POINTS["paired"], "bank of so many members"),
+        (found.banks, "instances", "members", POINTS["adaptive"], "bank of so many members"),
         (found.learning, "stretches", "training stretches", _FEWER, fewer),
     ):
         if rows:

@@ -147,7 +147,7 @@ def _rivalry(study: OfflineStudy, data: LabelledData) -> list[str]:
 def _verdicts(study: OfflineStudy, online: Driven, validation: Validation) -> list[str]:
     """What `adaptune online` will drive, then the estimate for it, then for what else it drives."""
     said = [online.words]
-    if "paired" in study.rules:
+    if "adaptive" in study.rules:
         said += [validation.verdict(PAIRED), *validation.against_rivals()]
     said.append(baseline_in_words(validation))
     if "paper" not in study.rules:

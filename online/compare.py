@@ -650,7 +650,7 @@ def _against(
     row: ComparisonRow, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]
 ) -> ComparisonRow:
     """Compare a mode that adapts with controls and rivals, too, on the same frames."""
-    if row.mode not in ("paired", UNTRAINED):
+    if row.mode not in ("adaptive", UNTRAINED):
         return row
     others = [other.mode for other in rows if other.mode in (*CONTROLS, *RIVALS)]
     return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})

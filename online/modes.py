@@ -112,8 +112,8 @@ def random_seed(sequence: str, repeat: int = 1) -> tuple[int, int, int]:
 BASELINE, UNTRAINED = "baseline", "untrained"
 LEARNED, EVEN, RANDOM = "bank_learned", "even", "random"
 BANKS = ("bank", LEARNED, EVEN)
-"""The modes on demand that drive the study's bank, whatever `paired` drives."""
-MEASURING = ("paired", "bank")
+"""The modes on demand that drive the study's bank, whatever `adaptive` drives."""
+MEASURING = ("adaptive", "bank")
 """Those with live evidence."""
 SINGLES = ("one_set", RANDOM)
 """Those that drive one set at a time."""
@@ -188,12 +188,12 @@ class ReplaySetup:
 
     def twin(self, mode: str, model: ErrorModel) -> str:
         """The mode whose replay is also that of a mode on demand: usually itself."""
-        if "paired" in self.rules:
-            way = self._mechanism("paired", model)
+        if "adaptive" in self.rules:
+            way = self._mechanism("adaptive", model)
             if mode == "bank" and way == "bank" and model.bank_adapts:
-                return "paired"
+                return "adaptive"
             if mode == "one_set" and way != "bank" and model.paired.adapt:
-                return "paired"
+                return "adaptive"
         return mode
 
     def obstacle(self, mode: str, model: ErrorModel) -> str:
@@ -376,7 +376,7 @@ class ReplaySetup:
             return RandomSelector(model.sets, candidates, model.fixed, seed)
         descriptors, dwell, rule = self.descriptors, self.dwell, mode
         if mode not in self.rules:
-            model, rule = _adapting(model), "paired"
+            model, rule = _adapting(model), "adaptive"
         if self._mechanism(mode, model) != "bank":
             return Selector(model, rule, (), self.switch_cost, descriptors, dwell)
         members, measures = list(self.members(mode, model)), mode != LEARNED

@@ -37,7 +37,7 @@ CLOUD_PERIOD = 1.0
 """Seconds from one cloud to the next."""
 MAX_POINTS = 20_000
 """Points of a cloud."""
-_PLACING = ("paired", "bank", "one_set", "untrained", "paper", "fixed")
+_PLACING = ("adaptive", "bank", "one_set", "untrained", "paper", "fixed")
 """Modes whose poses place the clouds, the first that was replayed."""
 _ERRORS = {
     "predicted_error": "predicted_error_percent",

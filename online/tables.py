@@ -34,7 +34,7 @@ _DRIVEN = {
     "best_default": "of several odometries, the one that does best with its own parameters",
     "equal_cost": "the best set in training that costs no more than what is driven",
     "fixed": "the one set that is best in training",
-    "paired": "what adapts with the least expected loss in training, or the fixed set",
+    "adaptive": "what adapts with the least expected loss in training, or the fixed set",
     "untrained": "a bank without a model: sets around the baseline, weighed while driving",
     "one_set": "one set at a time, chosen by how sets compare with the fixed one",
     "bank": "several sets side by side; their mean motion, weighed by training and while driving",

@@ -41,8 +41,8 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
         tuned = [*_of_baseline(last["baseline"], rows), *_cost_of_tuning(last)]
     if not adaptive:
         return [*tuned, _advice(last)]
-    # `paired` comes first; without a model there is the untrained bank.
-    main = next((row for row in adaptive if row.mode == "paired"), adaptive[-1])
+    # `adaptive` comes first; without a model there is the untrained bank.
+    main = next((row for row in adaptive if row.mode == "adaptive"), adaptive[-1])
     if _is_yardstick(main):
         what = f"`{main.mode}` kept the {_YARDSTICKS[main.yardstick]} {_where(rows)}."
         said = [f"Nothing was adapted, nothing gained: {what}"]
@@ -242,13 +242,13 @@ def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]
 
 
 def _preferred(row: ComparisonRow) -> float:
-    return _ratio(row).value * (1.0 - NEARLY * (row.mode == "paired"))
+    return _ratio(row).value * (1.0 - NEARLY * (row.mode == "adaptive"))
 
 
 def _advice(last: Mapping[str, ComparisonRow]) -> str:
     """What to do: drive what is surely better than the yardstick, the best of it.
 
-    The best of several is so by chance, too: `paired` is kept if it is nearly as good.
+    The best of several is so by chance, too: `adaptive` is kept if it is nearly as good.
     """
     drivable = {m: r for m, r in last.items() if m not in (*ORACLES, *CONTROLS) and r.ratio}
     better = [row for row in drivable.values() if _surely(_ratio(row)) == "less"]

@@ -104,7 +104,7 @@ def test_recorded_prints_every_mode_and_resumes(
     module = benchmark("recorded")
     shutil.copytree(trained_folder, tmp_path / "gicp-small-10-3")
     text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
-    online = {"rules": ["paired"], "switching": {"mechanism": "bank"}}
+    online = {"rules": ["adaptive"], "switching": {"mechanism": "bank"}}
     given = {**files.Document(text).data, "online": online}
     monkeypatch.setattr(module, "DIRECTIONS", {"small": None, "other": None})
     monkeypatch.setattr(module, "definition", lambda *_, **__: given)

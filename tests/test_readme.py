@@ -44,7 +44,7 @@ def test_the_example_is_what_adaptune_online_does(folder, monkeypatch, bank):
     last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
     assert last in example
     exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})
-    replayed = read_tum(study.folder / "replays/home/paired/trajectory.tum")
+    replayed = read_tum(study.folder / "replays/home/adaptive/trajectory.tum")
     np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
-    weights = (study.folder / "replays/home/paired/selections.csv").read_text()
+    weights = (study.folder / "replays/home/adaptive/selections.csv").read_text()
     assert (":" in weights) is bank

@@ -62,7 +62,7 @@ Pin = Annotated[
 Mode = Annotated[
     str | None,
     typer.Option(
-        help="On a robot, what to drive: baseline, fixed, paired or paper.",
+        help="On a robot, what to drive: baseline, fixed, adaptive or paper.",
         show_default="the first of online.rules",
     ),
 ]

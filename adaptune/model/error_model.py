@@ -601,10 +601,10 @@ def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
     """What is selected along the way."""
     paired, bank = model.paired, model.bank_settings
     if not paired.adapt:
-        yield Text("One set at a time: no less expected loss; `paired` does not use it.")
+        yield Text("One set at a time: no less expected loss; `adaptive` does not use it.")
     else:
         n = "all" if paired.n_sets is None else str(paired.n_sets)
-        yield Text(f"One set at a time: `paired` chooses among {n} sets.")
+        yield Text(f"One set at a time: `adaptive` chooses among {n} sets.")
     if not model.bank:
         return
     if not bank.adapt:

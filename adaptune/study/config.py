@@ -6,7 +6,14 @@ import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 from adaptune.errors import Key, Mistake, StrictModel, nearest
 from adaptune.odometry.remote import Limits
@@ -207,6 +214,15 @@ class RosConfig(StrictModel):
     router: str = "127.0.0.1:7447"
 
 
+def _rule_name(name: Any) -> Any:
+    if name == "paired":
+        raise ValueError("paired is now called adaptive")
+    return name
+
+
+Rule = Annotated[Literal["adaptive", "paper"], BeforeValidator(_rule_name)]
+"""Selects parameters in a replay."""
+
 Also = Literal["one_set", "bank", "bank_learned", "even", "random", "untrained"]
 ALSO: tuple[Also, ...] = get_args(Also)
 """Modes that are replayed only on demand, to compare with."""
@@ -224,7 +240,7 @@ class OnlineConfig(StrictModel):
     period: float = Field(1.0, ge=0.01, le=3600)
     dwell: float = Field(0.0, ge=0, le=3600)
     pin: dict[str, Value] = Field(default_factory=dict)
-    rules: tuple[Literal["paired", "paper"], ...] = ("paired", "paper")
+    rules: tuple[Rule, ...] = ("adaptive", "paper")
     also: tuple[Also, ...] = ()
     repeats: int = Field(1, ge=1, le=20)
     switching: SwitchingConfig = SwitchingConfig()

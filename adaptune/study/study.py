@@ -311,7 +311,7 @@ def whole_definition(
     return dict(given) if other else own | dict(given)
 
 
-# What `adaptune online` drives with a model, in the mode `paired`.
+# What `adaptune online` drives with a model, in the mode `adaptive`.
 
 
 PER_STRETCH = 4
@@ -340,7 +340,7 @@ class ModeError(AdaptuneError):
 class Driven(NamedTuple):
     """What is driven, and by what."""
 
-    mechanism: Mechanism | None  # of `paired`; None if the fixed set is its plan
+    mechanism: Mechanism | None  # of `adaptive`; None if the fixed set is its plan
     words: str  # a sentence
     paper: Mechanism | None = None  # of `paper`, if the study names it
 
@@ -369,14 +369,16 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         mechanism_of(mode, model, study.mechanism, study.odometry.description.live)
         if mode in study.rules
         else None
-        for mode in ("paired", "paper")
+        for mode in ("adaptive", "paper")
     )
     if mechanism is None:
-        return Driven(None, "`online` will drive `paper`, and not `paired` (online.rules).", paper)
+        return Driven(
+            None, "`online` will drive `paper`, and not `adaptive` (online.rules).", paper
+        )
     if mechanism == "bank" and model.bank_adapts:
         trials = always_at_work(study.config.online.switching, model)
         members = ", ".join(named(model, trial) for trial in trials)
-        words = f"`online` will drive the bank of trials {members} as `paired`"
+        words = f"`online` will drive the bank of trials {members} as `adaptive`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
             words += f", at {cost:.1f} ms of CPU time a scan"
         if BANK in model.expected:
@@ -387,12 +389,12 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         return Driven("bank", words, paper)
     if model.paired.adapt:
         how = "changed live" if mechanism == "live" else "by hand-over"
-        words = f"`online` will drive one set at a time as `paired`, {how}"
+        words = f"`online` will drive one set at a time as `adaptive`, {how}"
         if ONE_SET in model.expected:
             words += f", because it has the least expected loss: {_expected(model, ONE_SET)}"
         return Driven(mechanism, f"{words}.", paper)
     why = _why_fixed(study, model, mechanism)
-    return Driven(None, f"{fixed} as `paired`, because {why}", paper)
+    return Driven(None, f"{fixed} as `adaptive`, because {why}", paper)
 
 
 def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism) -> str:
@@ -484,7 +486,7 @@ def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool)
     live
         Whether the odometry changes its parameters between scans.
     """
-    if mechanism == "bank" and (mode != "paired" or model.bank_adapts or model.bank_rests):
+    if mechanism == "bank" and (mode != "adaptive" or model.bank_adapts or model.bank_rests):
         return "bank"
     return "live" if mechanism != "hand_over" and live else "hand_over"
 

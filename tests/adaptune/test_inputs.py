@@ -142,7 +142,7 @@ def test_a_class_that_was_edited(load, tmp_path):
     study = load(*overrides)
     note(study)
     study.model_path.write_bytes(b"")
-    for mode in ("baseline", "paired"):
+    for mode in ("baseline", "adaptive"):
         replay = study.folder / "replays/three" / mode / "replay.json"
         replay.parent.mkdir(parents=True)
         replay.write_text("{}")

@@ -98,7 +98,8 @@ def failure(file, *overrides):
         ("descriptor.window=1" + "0" * 400, "descriptor.window: give a number of at most 3600"),
         ("online.period=1e-300", "online.period: give a number of at least 0.01, not 1e-300"),
         ("online.period=1e300", "online.period: give a number of at most 3600, not 1e+300"),
-        ("online.rules=[best]", "online.rules.0: give 'paired' or 'paper', not 'best'"),
+        ("online.rules=[paired]", "online.rules.0: paired is now called adaptive"),
+        ("online.rules=[best]", "online.rules.0: give 'adaptive' or 'paper', not 'best'"),
         (
             "online.switching.sets=[true, 3]",
             "online.switching.sets.0: give a whole number or keys with values, not true",

@@ -40,7 +40,7 @@ def _few_settings(monkeypatch):
 
 def test_rules_gain_where_places_tell_the_sets_apart():
     validation = leave_one_out(labelled(two_kinds(np.random.default_rng(0))))
-    for rule in ("paired", "paper"):
+    for rule in ("adaptive", "paper"):
         np.testing.assert_allclose(validation.ratios[rule], [0.5] * 4 + [0.4] * 4, rtol=0.05)
         said = validation.verdict(rule)
         assert said.startswith(f"`{rule}`: expected gain 5")
@@ -108,9 +108,9 @@ def test_the_oracle_is_never_worse_than_anything():
 
 
 def test_a_rule_that_never_adapted_has_no_estimate():
-    errors = {m: np.ones(9) for m in ("fixed", "paired")}
-    kept = [LeftOut(str(i), errors, {"paired": 0.0}, *[np.ones(6)] * 2) for i in range(6)]
-    assert Validation(kept).verdict("paired").startswith("`paired` kept the fixed set")
+    errors = {m: np.ones(9) for m in ("fixed", "adaptive")}
+    kept = [LeftOut(str(i), errors, {"adaptive": 0.0}, *[np.ones(6)] * 2) for i in range(6)]
+    assert Validation(kept).verdict("adaptive").startswith("`adaptive` kept the fixed set")
 
 
 def test_intervals_over_time():
@@ -128,7 +128,7 @@ def test_a_sequence_left_out_is_judged_on_the_sets_it_has_seen():
     validation = leave_one_out(labelled(sequences))
     for mode, ratios in validation.ratios.items():
         assert np.isfinite(ratios).all(), mode
-    np.testing.assert_allclose(validation.ratios["paired"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
+    np.testing.assert_allclose(validation.ratios["adaptive"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
 
 
 def test_what_several_sets_would_be_worth():
@@ -185,11 +185,11 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     assert all(np.isnan(one.familiarity).all() for one in validation.left_out)
     ends = ["ms a scan", "cores", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
-    assert rows[0]["paired"] == pytest.approx(validation.ratios["paired"][0])
+    assert rows[0]["adaptive"] == pytest.approx(validation.ratios["adaptive"][0])
     # Four sub-trajectories tell nothing; a dozen would.
-    assert rows[0]["paired, 95 %"] is None
-    summary = validation.summary("paired")
-    assert rows[4]["paired, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert rows[0]["adaptive, 95 %"] is None
+    summary = validation.summary("adaptive")
+    assert rows[4]["adaptive, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
     assert [row["stretches"] for row in learning] == [1]
     n_sets = len(ErrorModel.load(study.model_path).sets)
@@ -218,14 +218,14 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     rng = np.random.default_rng(6)
     sequences = [with_motions(f"s{i}", rng, 120) for i in range(7)]
     validation = leave_one_out(labelled(sequences), {}, bank=3)
-    assert validation.modes == ["paired"]
-    assert validation.summary("paired")["geometric"] < 0.7
-    assert "expected gain" in validation.verdict("paired")
-    assert "of the weight on other sets than fixed" in validation.verdict("paired")
-    assert all(0.2 < left_out.adapted["paired"] < 1.0 for left_out in validation.left_out)
+    assert validation.modes == ["adaptive"]
+    assert validation.summary("adaptive")["geometric"] < 0.7
+    assert "expected gain" in validation.verdict("adaptive")
+    assert "of the weight on other sets than fixed" in validation.verdict("adaptive")
+    assert all(0.2 < left_out.adapted["adaptive"] < 1.0 for left_out in validation.left_out)
     banks = bank_curve(labelled(sequences))
     assert [row["instances"] for row in banks] == [2, 3, 4, 5]
-    assert banks[1] == {"instances": 3} | validation.summary("paired")
+    assert banks[1] == {"instances": 3} | validation.summary("adaptive")
     assert not leave_one_out(labelled(sequences), {}, bank=0).modes
 
 
@@ -235,7 +235,7 @@ def test_a_bank_learns_from_few_stretches():
     rows = learning_curve(labelled(sequences), bank=2)
     assert [row["stretches"] for row in rows] == [3, 5]
     all_of_them = leave_one_out(labelled(sequences), {}, bank=2)
-    assert rows[1] == {"stretches": 5} | all_of_them.summary("paired")
+    assert rows[1] == {"stretches": 5} | all_of_them.summary("adaptive")
 
 
 def judged(data, study, monkeypatch, given=()):
@@ -258,18 +258,18 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     assert model.bank_adapts
     assert set(model.expected) == {"bank", "one set"}
     bank = ", ".join(map(str, model.bank))
-    said = f"`online` will drive the bank of trials {bank} as `paired`, because it has the least "
+    said = f"`online` will drive the bank of trials {bank} as `adaptive`, because it has the least "
     assert found.verdicts[0].startswith(said)
     assert found.verdicts[0] == driven(study, model).words
-    expected = "`paired`, with the bank where that is best: expected gain "
+    expected = "`adaptive`, with the bank where that is best: expected gain "
     assert found.verdicts[1].startswith(expected)
     assert found.validation.bank
-    assert found.validation.modes == ["paired", "one set", "paper"]
-    assert {"paired", "one set"} <= set(found.rows[0])
+    assert found.validation.modes == ["adaptive", "one set", "paper"]
+    assert {"adaptive", "one set"} <= set(found.rows[0])
     # The same model without a bank: one set at a time, or the fixed set alone.
     given = [("paired", PairedSettings()), ("bank_settings", NO_BANK)]
     _, found = judged(six, study, monkeypatch, given)
-    said = "`online` will drive one set at a time as `paired`, changed live, because it has the "
+    said = "`online` will drive one set at a time as `adaptive`, changed live, because it has the "
     assert found.verdicts[0].startswith(said)
     fixed = replace(model, paired=DO_NOT_ADAPT, bank_settings=NO_BANK)
     said = driven(study, fixed).words
@@ -279,7 +279,7 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     # Where it cannot be judged it says what is driven.
     alone = labelled(six.sequences[:1])
     for mechanism, what in (
-        ("bank", r"the bank of trials .* as `paired`\. It relies on what it measures"),
+        ("bank", r"the bank of trials .* as `adaptive`\. It relies on what it measures"),
         ("live", "the fixed set"),
     ):
         given = [f"online.switching.mechanism={mechanism}", "online.switching.size=3"]
@@ -312,9 +312,11 @@ def test_stretches_of_one_recording_are_left_out():
     data = labelled([one])
     validation = leave_one_out(data, {}, bank=2)
     assert [s.name for s in validation.left_out] == ["one"]
-    assert len(validation.logs["paired"]) == len(validation.recordings) == 10
-    assert validation.summary("paired")["geometric"] < 0.9
-    assert "elsewhere along this recording (10 stretches of one rec" in validation.verdict("paired")
+    assert len(validation.logs["adaptive"]) == len(validation.recordings) == 10
+    assert validation.summary("adaptive")["geometric"] < 0.9
+    assert "elsewhere along this recording (10 stretches of one rec" in validation.verdict(
+        "adaptive"
+    )
     (left_out,) = validation.left_out
     np.testing.assert_array_equal(left_out.stretches, one.cuts)
     # The fixed set is another one in each stretch; the errors are those of the whole recording.

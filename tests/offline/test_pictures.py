@@ -66,7 +66,7 @@ def test_modes_with_equal_errors_are_all_seen(tmp_path):
     modes = [
         "baseline",
         "fixed",
-        "paired",
+        "adaptive",
         "paper",
         "one set",
         "oracle, sequence",
@@ -87,32 +87,32 @@ def test_modes_with_equal_errors_are_all_seen(tmp_path):
 
 def test_curves_are_explained_where_they_are_drawn(tmp_path):
     path = tmp_path / "validation.png"
-    found = results(["fixed", "paired"], familiarity=np.full(50, np.nan))
+    found = results(["fixed", "adaptive"], familiarity=np.full(50, np.nan))
     found = found._replace(banks=rows("instances", (2, 3)), learning=rows("stretches", (3, 5)))
     draw_validation(path, "study", found)
     said = texts(path)
     assert "number of sets, or members, or training stretches [-]" in said
-    assert {"bank of so many members", "paired, trained on so many"} <= set(said)
+    assert {"bank of so many members", "adaptive, trained on so many"} <= set(said)
     assert not [text for text in said if "familiarity" in text]
 
 
 def test_familiarity_is_not_drawn_where_nothing_adapts(tmp_path):
     path = tmp_path / "validation.png"
     for gain, drawn in ((np.full(50, 1.0), 0), (np.full(50, 0.9), 1)):
-        draw_validation(path, "study", results(["fixed", "paired"], gain=gain))
+        draw_validation(path, "study", results(["fixed", "adaptive"], gain=gain))
         assert texts(path).count("where scans are known and new") == drawn
 
 
 def test_wide_intervals_do_not_shrink_the_rest(tmp_path):
     wide = [row | {"low": 1e-6, "high": 1e6} for row in rows("stretches", (1, 2))]
-    draw_validation(tmp_path / "v.png", "study", results(["fixed", "paired"], learning=wide))
+    draw_validation(tmp_path / "v.png", "study", results(["fixed", "adaptive"], learning=wide))
     assert max(float(t) for t in texts(tmp_path / "v.png") if t.replace(".", "").isdigit()) < 100
 
 
 @pytest.mark.parametrize("n", [2, 40])
 def test_every_sequence_is_named(tmp_path, n):
     names = [f"a_long_name_of_a_drive_{i}" for i in range(n)]
-    found = results(["fixed", "paired"], ratios={"paired": np.linspace(0.5, 2.0, n)})
+    found = results(["fixed", "adaptive"], ratios={"adaptive": np.linspace(0.5, 2.0, n)})
     draw_validation(tmp_path / "v.png", "study", found._replace(sequences=names))
     assert set(names) <= set(texts(tmp_path / "v.png"))
 
@@ -130,7 +130,7 @@ def points():
         for n in (2, 3, 4)
     ]
     modes = (("baseline", 6.0, 2.1), ("best_default", 38.0, 1.6), ("equal_cost", 45.0, 0.95))
-    modes = (*modes, ("fixed", 40.0, 1.0), ("paired", 60.0, 0.52))
+    modes = (*modes, ("fixed", 40.0, 1.0), ("adaptive", 60.0, 0.52))
     return [*sets, *banks, *(Point(mode, mode, cost, ratio) for mode, cost, ratio in modes)]
 
 
@@ -138,13 +138,13 @@ def test_error_against_cost_is_drawn(tmp_path):
     path = tmp_path / "costs.png"
     draw_frontier(path, "six", points(), 70.0)
     said = texts(path)
-    labels = ["gicp", "kiss_icp", "front of the sets", "budget", *MARKED, "paired"]
+    labels = ["gicp", "kiss_icp", "front of the sets", "budget", *MARKED, "adaptive"]
     labels += ["best_default", "equal_cost", f"{CANCELLING}: 2, 3, ...", f"{THRIFTY}: 2, 3, ..."]
     for text in ("CPU time a scan [ms]", "six: error against cost", *labels):
         assert said.count(text) == 1, text
     assert {"1", "10", "50"} <= set(said)
     assert is_white(path)
-    for mode in ("baseline", "best_default", "equal_cost", "fixed", "paired"):
+    for mode in ("baseline", "best_default", "equal_cost", "fixed", "adaptive"):
         assert share_of(path, POINTS[mode]["color"]) > 0.01, mode
 
 
@@ -154,7 +154,7 @@ def test_what_there_is_not_is_not_in_the_legend(tmp_path):
     draw_frontier(path, "six", [*few, Point("gicp", "99", 5.0, 80.0)], None)
     said = texts(path)
     assert {"gicp", "fixed"} <= set(said)
-    assert not {"budget", "paired", "bank: 2, 3, ..."} & set(said)
+    assert not {"budget", "adaptive", "bank: 2, 3, ..."} & set(said)
     assert "50" not in said  # a set that fails
     draw_frontier(path, "six", [p for p in points() if p.what in POINTS], None)
     assert "gicp" not in texts(path)

@@ -116,7 +116,7 @@ def test_error_against_cost(validation, tmp_path):
     assert modes[PAIRED].ratio == pytest.approx(np.exp(np.log(found.ratios[PAIRED]).mean()))
     draw_frontier(tmp_path / "costs.png", "test", points, 30.0)
     text = (tmp_path / "costs.svg").read_text()
-    assert all(label in text for label in ("gicp", "ndt", "paired", "budget", "CPU time"))
+    assert all(label in text for label in ("gicp", "ndt", "adaptive", "budget", "CPU time"))
 
 
 def test_a_bank_stays_within_the_budget():

@@ -111,7 +111,7 @@ def test_validation_is_read_or_missed(study):
     assert charts_of_validation(study) == ([], ["No validation: run `adaptune validate`."])
     study.folder.mkdir()
     row = {"recording": "one", "fixed [%]": 0.5}
-    rows = [row | {"stretch": i, "paired": 0.8 + 0.01 * i} for i in range(4)]
+    rows = [row | {"stretch": i, "adaptive": 0.8 + 0.01 * i} for i in range(4)]
     (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
     charts, notes = charts_of_validation(study)
     assert [chart.key for chart in charts] == ["stretches"]

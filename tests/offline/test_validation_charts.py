@@ -15,7 +15,7 @@ def stretches(n_recordings=2, n=6):
             "stretch": i,
             "fixed [%]": 0.5,
             "one set": 1.0,
-            "paired": float(np.exp(rng.normal(-0.2, 0.1))),
+            "adaptive": float(np.exp(rng.normal(-0.2, 0.1))),
         }
         for r in range(n_recordings)
         for i in range(n)
@@ -30,12 +30,12 @@ def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
     ranks = np.concatenate([p.x for p in points])
     ratios = np.concatenate([p.y for p in points])
     np.testing.assert_array_equal(np.argsort(ranks), np.argsort(ratios))
-    of = figures(np.log([r["paired"] for r in rows]), [r["recording"] for r in rows])
+    of = figures(np.log([r["adaptive"] for r in rows]), [r["recording"] for r in rows])
     (band,) = (d for d in panel.drawn if isinstance(d, Band))
     assert (band.low[0], band.high[0]) == (of.low, of.high)
     mean = next(d for d in panel.drawn if isinstance(d, Line))
     assert mean.y[0] == pytest.approx(np.exp(np.log(ratios).mean()))
-    assert panel.title == f"paired: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
+    assert panel.title == f"adaptive: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
 
 
 def test_many_recordings_are_not_named():

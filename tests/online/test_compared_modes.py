@@ -19,7 +19,7 @@ from online.record import StoredReplayError, read_repeats, repeat_folder
 from online.run import run_replays, run_untrained
 
 EVERY = [
-    *("baseline", "fixed", "paired", "untrained", "one_set", "bank", "bank_learned"),
+    *("baseline", "fixed", "adaptive", "untrained", "one_set", "bank", "bank_learned"),
     *("even", "random", "paper"),
 ]
 
@@ -32,7 +32,7 @@ def load(study_file, trained_folder, tmp_path_factory):
     model, off = ErrorModel.load(path), {"adapt": False}
     errors = model.errors.copy()
     errors[:, model.sets.column(model.bank[1])] *= 0.1
-    settings = {"paired": PairedSettings(**off), "bank_settings": BankSettings(**off)}
+    settings = {"adaptive": PairedSettings(**off), "bank_settings": BankSettings(**off)}
     replace(model, errors=errors, **settings).save(path)
     return lambda *overrides, at=folder: load_study(study_file, overrides, at)
 
@@ -72,7 +72,7 @@ def test_all_are_compared_in_the_order_of_their_lines(replayed):
 def test_they_do_what_their_names_say(replayed):
     model = ErrorModel.load(replayed.model_path)
     # The study keeps the fixed set; these modes adapt all the same.
-    assert {int(row["trial"]) for row in selections(replayed, "paired")} == {model.fixed}
+    assert {int(row["trial"]) for row in selections(replayed, "adaptive")} == {model.fixed}
     chosen = {int(row["trial"]) for row in selections(replayed, "one_set")}
     assert model.bank[1] in chosen
     assert about(replayed, "one_set")["switching"]["mechanism"] == "live"
@@ -112,14 +112,14 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert run_replays(study, study.model_path) == 4
     compared = compare(plain)
     rows = {row.mode: row for row in compared.rows}
-    # Now `paired` is one set at a time, too. Programs find both, readers one.
-    assert rows["one_set"].rte == rows["paired"].rte
-    assert {row.mode: row.twin for row in compared.rows if row.twin} == {"one_set": "paired"}
+    # Now `adaptive` is one set at a time, too. Programs find both, readers one.
+    assert rows["one_set"].rte == rows["adaptive"].rte
+    assert {row.mode: row.twin for row in compared.rows if row.twin} == {"one_set": "adaptive"}
     (same,) = compared_modes(plain).words(plain)
-    assert same == "`one_set` is what `paired` drives here: it has the same numbers, shown once."
+    assert same == "`one_set` is what `adaptive` drives here: it has the same numbers, shown once."
     assert [said for said in compared.words if "`one_set`" in said] == [same]
     with (folder := plain.folder / "comparison").joinpath("comparison.csv").open() as file:
-        assert {row["mode"]: row["twin"] for row in csv.DictReader(file)}["one_set"] == "paired"
+        assert {row["mode"]: row["twin"] for row in csv.DictReader(file)}["one_set"] == "adaptive"
     assert "| one_set |" not in (folder / "tables.md").read_text("utf-8")
 
 
@@ -130,7 +130,7 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     run_replays(both, both.model_path)
     shutil.rmtree(both.folder / "replays/four/paper")
     shutil.rmtree(both.folder / "replays/three/baseline")
-    assert {row.mode for row in compare(both).rows} == {"fixed", "paired", "even"}
+    assert {row.mode for row in compare(both).rows} == {"fixed", "adaptive", "even"}
     said = compared_modes(both).words(both)
     assert said == [
         "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
@@ -183,11 +183,11 @@ def test_every_mode_is_repeated_and_random_sets_differ(own):
     first, *others = (selections(study, f"random{of}") for of in ("", "/repeat_2", "/repeat_3"))
     for other in others:
         assert [row["trial"] for row in other] != [row["trial"] for row in first]
-    paired = read_repeats(kept / "paired")
-    assert [replay.summary.about.repeat for replay in paired] == [1, 2, 3]
-    for replay in paired[1:]:
+    adaptive = read_repeats(kept / "adaptive")
+    assert [replay.summary.about.repeat for replay in adaptive] == [1, 2, 3]
+    for replay in adaptive[1:]:
         np.testing.assert_array_equal(
-            replay.trajectory.T_world_sensor, paired[0].trajectory.T_world_sensor
+            replay.trajectory.T_world_sensor, adaptive[0].trajectory.T_world_sensor
         )
     assert [len(read_repeats(kept / mode)) for mode in ("random", "even")] == [3, 1]
     # What is left of an interrupted run is made again, and nothing else.
@@ -200,9 +200,9 @@ def test_every_mode_is_repeated_and_random_sets_differ(own):
     assert "fixed on three 2" in said
     assert "random" not in said
     # Repeats of something else do not count.
-    other = own("online.period=2", "online.rules=[paired]")
+    other = own("online.period=2", "online.rules=[adaptive]")
     run_replays(other, other.model_path)
-    assert len(read_repeats(kept / "paired")) == 1
+    assert len(read_repeats(kept / "adaptive")) == 1
     with pytest.raises(StoredReplayError, match="there is no replay"):
         read_repeats(kept / "nothing")
 

@@ -21,7 +21,7 @@ from online.run import ReplayError, run_replays, warn_of_scant_evidence
 from online.statistics import ComparisonRow, Reference
 from online.verdict import remarks
 
-MODES = ["baseline", "fixed", "paired", "paper"]
+MODES = ["baseline", "fixed", "adaptive", "paper"]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
     about = {m: json.loads((folder / m / "replay.json").read_text())["about"] for m in MODES}
     assert about["baseline"]["parameters"] == replayed.odometry.space.baseline
     assert about["fixed"]["parameters"] == model.sets[model.fixed]
-    for mode in ("paired", "paper"):
+    for mode in ("adaptive", "paper"):
         with (folder / mode / "selections.csv").open() as file:
             rows = list(csv.DictReader(file))
         assert len(rows) == 4  # 40 scans at 10 Hz
@@ -115,17 +115,17 @@ def test_an_odometry_that_is_not_live_adapts_too(own, study_file, mechanism):
     one_set = replace(model, paired=PairedSettings(), bank_settings=BankSettings(adapt=False))
     one_set.save(path)
     assert run_replays(study, path) == 4
-    row = next(row for row in compare(study).rows if row.mode == "paired")
+    row = next(row for row in compare(study).rows if row.mode == "adaptive")
     assert row.rte < 3.0
-    folder = study.folder / "replays/three/paired"
+    folder = study.folder / "replays/three/adaptive"
     about = {
         mode: json.loads((folder.with_name(mode) / "replay.json").read_text())["about"]["switching"]
-        for mode in ("paired", "paper")
+        for mode in ("adaptive", "paper")
     }
     assert about["paper"]["mechanism"] == mechanism
     assert about["paper"]["warm_up"]["seconds"] == 0.5
-    assert about["paired"]["mechanism"] == ("live" if mechanism == "bank" else mechanism)
-    assert about["paired"]["switch_cost"] == 0.0
+    assert about["adaptive"]["mechanism"] == ("live" if mechanism == "bank" else mechanism)
+    assert about["adaptive"]["switch_cost"] == 0.0
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
     members = model.bank if mechanism == "bank" else model.sets
@@ -146,7 +146,7 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     study = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     run_replays(study, path)
     folder = study.folder / "replays/three"
-    with (folder / "paired/selections.csv").open() as file:
+    with (folder / "adaptive/selections.csv").open() as file:
         for row in csv.DictReader(file):
             pairs = [pair.split(":") for pair in row["weights"].split()]
             weights = {int(trial): float(weight) for trial, weight in pairs}
@@ -157,7 +157,7 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     # The published rule chooses among its members.
     with (folder / "paper/selections.csv").open() as file:
         assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.bank)
-    assert next(row.rte for row in compare(study).rows if row.mode == "paired") < 3.0
+    assert next(row.rte for row in compare(study).rows if row.mode == "adaptive") < 3.0
     said = set(texts(study.folder / "comparison/three.png"))
     assert {f"trial {n}" for n in model.bank} | {"weight [%]"} <= said
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
@@ -291,11 +291,13 @@ def read_tum_of(study, study_file):
     ],
 )
 def test_a_damaged_replay_is_named(replayed, file, text):
-    path = replayed.folder / "replays/three/paired" / file
+    path = replayed.folder / "replays/three/adaptive" / file
     before = path.read_text()
     path.write_text(text)
     try:
-        what = rf"{file}: is damaged .*; remove .*paired and run `adaptune online` with this study"
+        what = (
+            rf"{file}: is damaged .*; remove .*adaptive and run `adaptune online` with this study"
+        )
         with pytest.raises(StoredReplayError, match=what) as caught:
             compare(replayed)
         assert "https://" not in str(caught.value)
@@ -366,7 +368,7 @@ def test_what_was_possible_in_hindsight_is_not_known_without_the_oracle(replayed
 
 
 def test_restarts_and_speed_are_those_of_the_stored_replay(own):
-    folder = own.folder / "replays/three/paired"
+    folder = own.folder / "replays/three/adaptive"
     lines = (folder / "frames.csv").read_text().splitlines()
     head = lines[0].split(",")
     rows = [dict(zip(head, line.split(","), strict=True)) for line in lines[1:]]
@@ -380,10 +382,10 @@ def test_restarts_and_speed_are_those_of_the_stored_replay(own):
     summary |= {"restarts": 2, "unhealthy": {"max_speed": 2}, "replay_s": 1000.0}
     (folder / "replay.json").write_text(json.dumps(summary))
     found = compare(own).rows
-    row = next(row for row in found if row.mode == "paired")
+    row = next(row for row in found if row.mode == "adaptive")
     assert row.x_real_time == pytest.approx(3.9 / 0.4, abs=0.01)
     assert remarks(found)[-1] == (
-        "On three the health check restarted paired 2 times, first at 0.5 s (max_speed)."
+        "On three the health check restarted adaptive 2 times, first at 0.5 s (max_speed)."
     )
     trajectory = folder / "trajectory.tum"
     whole = trajectory.read_text()

@@ -14,14 +14,14 @@ ROWS = [
     row("one", "baseline", 1.4),
     row("one", "fixed", 1.0, 1.0, 1.0),
     row("one", "new_mode", 0.7),
-    row("one", "paired", 0.8, 0.7, 0.9),
+    row("one", "adaptive", 0.8, 0.7, 0.9),
     row("two", "baseline", 1.2),
     row("two", "fixed", 1.0),
-    row("two", "paired", 0.9),
+    row("two", "adaptive", 0.9),
     row("two", "new_mode", None),
     row("all", "baseline", 1.3),
-    row("all", "paired", 0.85, 0.8, 0.95),
-    row("all", "bank", 0.85) | {"twin": "paired"},
+    row("all", "adaptive", 0.85, 0.8, 0.95),
+    row("all", "bank", 0.85) | {"twin": "adaptive"},
     row("all", "oracle, sequence", 0.6),
 ]
 
@@ -33,7 +33,7 @@ def drawn(rows, kind):
 
 def test_modes_stand_below_each_other_from_the_least_error():
     (panel,) = comparison_chart(ROWS).panels
-    assert panel.y.names == ("baseline", "paired", "oracle, sequence")  # from below
+    assert panel.y.names == ("baseline", "adaptive", "oracle, sequence")  # from below
     points = drawn(ROWS, Points)
     assert list(points) == ["geometric mean over all sequences", "one", "two"]
     means = points["geometric mean over all sequences"]
@@ -45,12 +45,12 @@ def test_modes_stand_below_each_other_from_the_least_error():
     one = points["one"]
     assert list(one.x) == [1.4, 0.8]
     assert np.ceil(one.y).tolist() == [0.0, 1.0]
-    assert one.texts == ["baseline, one", "paired, one"]
+    assert one.texts == ["baseline, one", "adaptive, one"]
 
 
 def test_many_sequences_have_one_look():
-    few, many = ([row(f"s{i}", "paired", 0.8) for i in range(n)] for n in (6, 7))
-    last = [row("all", "paired", 0.8)]
+    few, many = ([row(f"s{i}", "adaptive", 0.8) for i in range(n)] for n in (6, 7))
+    last = [row("all", "adaptive", 0.8)]
     assert len(drawn(few + last, Points)) == 7
     points = drawn(many + last, Points)
     assert len(points) == 2
@@ -59,7 +59,7 @@ def test_many_sequences_have_one_look():
 
 
 def test_of_one_sequence_there_is_nothing_below():
-    rows = [row("one", "fixed", 1.0), row("one", "paired", 0.8), row("one", "paper", 2.0)]
+    rows = [row("one", "fixed", 1.0), row("one", "adaptive", 0.8), row("one", "paper", 2.0)]
     (points,) = drawn(rows, Points).values()
     assert (points.name, list(points.x)) == ("one", [2.0, 0.8])
     assert not drawn(rows, Line)
@@ -73,6 +73,6 @@ def test_the_baseline_may_be_what_others_are_compared_with():
     assert "baseline" in comparison_chart(rows).title
 
 
-@pytest.mark.parametrize("rows", [[], [row("one", "paired", None)]])
+@pytest.mark.parametrize("rows", [[], [row("one", "adaptive", None)]])
 def test_without_ratios_there_is_no_chart(rows):
     assert comparison_chart(rows) is None

@@ -17,7 +17,7 @@ def rows_of(sequence, rte, **more):
             sequence, mode, factor * rte, factor, 0, 0, 0,
             standard=StandardErrors(factor * 2.0, factor * 0.1, SHORT, 0.3), **more,
         )
-        for mode, factor in {"baseline": 2.0, "fixed": 1.0, "paired": 0.5}.items()
+        for mode, factor in {"baseline": 2.0, "fixed": 1.0, "adaptive": 0.5}.items()
     ]  # fmt: skip
 
 
@@ -27,7 +27,7 @@ ROWS = rows_of("a", 1.0) + rows_of("b", 3.0) + rows_of(ALL, 2.0)
 def test_one_table_of_the_modes_one_of_the_sequences_one_of_standard_errors():
     modes, sequences, standard = tables(ROWS, 25.0)
     assert modes.title == "RTE over 25 m on 2 sequences"
-    assert [row["mode"] for row in modes.rows] == ["baseline", "fixed", "paired"]
+    assert [row["mode"] for row in modes.rows] == ["baseline", "fixed", "adaptive"]
     assert [row["RTE [%]"] for row in modes.rows] == [4.0, 2.0, 1.0]
     # Nothing was restarted, and nothing estimated.
     assert not {"restarts", "estimated [%]", "reference", "95 %"} & modes.rows[0].keys()
@@ -41,7 +41,7 @@ def test_one_table_of_the_modes_one_of_the_sequences_one_of_standard_errors():
 
 
 def test_what_is_the_same_as_another_mode_is_shown_once():
-    twins = [replace(r, mode="bank", twin="paired") for r in ROWS if r.mode == "paired"]
+    twins = [replace(r, mode="bank", twin="adaptive") for r in ROWS if r.mode == "adaptive"]
     assert tables([*ROWS[:-3], *twins[:2], *ROWS[-3:], twins[2]], 25.0) == tables(ROWS, 25.0)
     assert side_by_side({"a": [*ROWS, twins[2]]}) == side_by_side({"a": ROWS})
 
@@ -71,7 +71,7 @@ def test_references_are_told_where_they_differ():
 
 def test_every_mode_that_may_be_shown_is_put_in_words():
     shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*LINES, *ORACLES)]
-    twin = ComparisonRow("a", "of another", 1.0, 1.0, 0, 0, 0, twin="paired")
+    twin = ComparisonRow("a", "of another", 1.0, 1.0, 0, 0, 0, twin="adaptive")
     made = modes_in_words([*shown, twin])
     assert [row["mode"] for row in made.rows] == [*LINES, *ORACLES]
 
@@ -93,11 +93,11 @@ def test_studies_stand_side_by_side():
     other = [replace(row, rte=None if row.rte is None else 2 * row.rte) for row in ROWS]
     errors, changes = side_by_side({"gicp": ROWS, "ndt": other})
     assert [row["sequence"] for row in errors.rows] == ["a", "b", "average"]
-    assert errors.rows[2]["gicp: paired"] == 1.0
-    assert errors.rows[2]["ndt: paired"] == 2.0
+    assert errors.rows[2]["gicp: adaptive"] == 1.0
+    assert errors.rows[2]["ndt: adaptive"] == 2.0
     assert errors.least == "row"
     assert changes.rows[2] == {
-        "study": "gicp", "mode": "paired",
+        "study": "gicp", "mode": "adaptive",
         "RTE [%]": 1.0, "RTE change [%]": "-75.0",
         "RPE [m]": 0.05, "RPE change [%]": "-75.0",
         "APE [m]": 1.0, "APE change [%]": "-75.0",

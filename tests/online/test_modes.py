@@ -21,7 +21,7 @@ def setup(budget=None):
     factory = OdometryFactory("gicp", {}, gicp.space, Limits())
     return ReplaySetup(
         factory,
-        ("paired", "paper"),
+        ("adaptive", "paper"),
         SwitchingConfig(mechanism="live"),
         "live",
         factory.description.warm_up,
@@ -35,9 +35,9 @@ def setup(budget=None):
 
 def test_rivals_are_driven_where_the_model_has_some():
     model = random_model()
-    assert setup().modes(model) == ("baseline", "fixed", "paired", "paper")
+    assert setup().modes(model) == ("baseline", "fixed", "adaptive", "paper")
     one = replace(model, rivals={"equal_cost": 6})
-    assert setup().modes(one) == ("baseline", "equal_cost", "fixed", "paired", "paper")
+    assert setup().modes(one) == ("baseline", "equal_cost", "fixed", "adaptive", "paper")
     both = replace(model, rivals={"equal_cost": 6, "best_default": 2})
     assert setup().modes(both)[:4] == ("baseline", "best_default", "equal_cost", "fixed")
     # One that is the fixed set is not replayed again.
@@ -46,7 +46,7 @@ def test_rivals_are_driven_where_the_model_has_some():
     assert setup().parameters("equal_cost", both) == both.sets[6]
     assert setup().parameters("best_default", both) == both.sets[2]
     assert setup().parameters("fixed", both) == both.sets[4]
-    assert setup().parameters("paired", both) is None
+    assert setup().parameters("adaptive", both) is None
     identity = setup().identity("equal_cost", both, "digest")
     assert identity["parameters"] == both.sets[6]
     # Another model with the same rival replays the same.
@@ -93,24 +93,24 @@ def test_a_mode_on_demand_that_is_another_one_is_not_replayed_again():
     model = random_model()
     asked = replace(setup(), also=("one_set", "bank", "even", "random"))
     demand = ("bank", "even", "random")
-    # One set at a time is what `paired` drives.
-    assert asked.modes(model) == ("baseline", "fixed", "paired", *demand, "paper")
+    # One set at a time is what `adaptive` drives.
+    assert asked.modes(model) == ("baseline", "fixed", "adaptive", *demand, "paper")
     fixed = replace(model, paired=PairedSettings(adapt=False))
     assert asked.modes(fixed)[3:5] == ("one_set", "bank")
     with_bank = replace(asked, mechanism="bank")
     assert with_bank.modes(model)[3:6] == ("one_set", "even", "random")
-    assert with_bank.twin("bank", model) == "paired"
+    assert with_bank.twin("bank", model) == "adaptive"
     unpaying = replace(fixed, bank_settings=BankSettings(adapt=False))
     assert with_bank.modes(unpaying)[3:5] == ("one_set", "bank")
     # The bank that is driven may rest, the one on demand does not.
-    assert with_bank.identity("paired", unpaying)["switching"]["mechanism"] == "bank"
-    # Controls have no reserve, and `paired` has one.
+    assert with_bank.identity("adaptive", unpaying)["switching"]["mechanism"] == "bank"
+    # Controls have no reserve, and `adaptive` has one.
     bank, vectors = [*model.bank, 0], np.zeros((len(model.errors), 3, 3), np.float32)
     reserve = replace(model, bank=bank, vectors=vectors, bank_settings=BankSettings(reserve=1))
     few = replace(with_bank, switching=SwitchingConfig(size=2))
-    assert list(few.members("paired", reserve)) == reserve.bank
+    assert list(few.members("adaptive", reserve)) == reserve.bank
     assert list(few.members("even", reserve)) == reserve.bank[:-1]
-    # Without `paired`, nothing is.
+    # Without `adaptive`, nothing is.
     alone = replace(asked, rules=("paper",))
     assert alone.modes(model) == ("baseline", "fixed", "one_set", *demand, "paper")
     assert all(alone.identity(mode, model, "of it")["model"] == "of it" for mode in demand)

@@ -25,7 +25,7 @@ TWO_CORES = "online.switching.cores=2"
 def study(study_file, trained_folder, tmp_path_factory):
     """With a bank, and replays in real time."""
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("real_time") / "run")
-    overrides = ["online.rules=[paired]", TWO_CORES, "online.real_time.queue=0", RATE, WAITS]
+    overrides = ["online.rules=[adaptive]", TWO_CORES, "online.real_time.queue=0", RATE, WAITS]
     study = load_study(study_file, overrides, folder)
     model = ErrorModel.load(study.model_path)
     replace(model, bank_settings=BankSettings()).save(study.model_path)
@@ -41,13 +41,13 @@ def summary(study, mode):
 
 
 def test_it_is_recorded_how_a_replay_kept_up(study):
-    for mode in ("baseline", "fixed", "paired"):
+    for mode in ("baseline", "fixed", "adaptive"):
         found = summary(study, mode)
         kept = found["real_time"]
         assert found["about"]["real_time"] == {"rate": 5.0, "deadline": 5.0, "queue": 0}
         assert (kept["rate"], kept["dropped_scans"], kept["missed_selections"]) == (5.0, 0, 0)
         assert 0.0 < kept["pose_ms_p50"] <= kept["pose_ms_p99"]
-        assert (kept["selection_ms_p50"] > 0.0) == (mode == "paired")
+        assert (kept["selection_ms_p50"] > 0.0) == (mode == "adaptive")
         # Forty scans in 0.8 s.
         assert 0.7 < found["replay_s"] < 60.0
         with (study.folder / f"replays/three/{mode}/frames.csv").open() as file:
@@ -56,27 +56,27 @@ def test_it_is_recorded_how_a_replay_kept_up(study):
 
 
 def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
-    in_real_time = StoredReplay.read(study.folder / "replays/three/paired")
-    overrides = ["online.rules=[paired]", TWO_CORES]
+    in_real_time = StoredReplay.read(study.folder / "replays/three/adaptive")
+    overrides = ["online.rules=[adaptive]", TWO_CORES]
     lockstep = load_study(study_file, overrides, study.folder.parent / "lockstep")
     shutil.copytree(study.folder, lockstep.folder)
     assert run_replays(lockstep, lockstep.model_path) == 3  # those in real time are others
-    found = StoredReplay.read(lockstep.folder / "replays/three/paired")
+    found = StoredReplay.read(lockstep.folder / "replays/three/adaptive")
     np.testing.assert_allclose(
         in_real_time.trajectory.T_world_sensor, found.trajectory.T_world_sensor, atol=1e-9
     )
     assert list(in_real_time.choice_stamps) == list(found.choice_stamps)
     np.testing.assert_allclose(in_real_time.estimated, found.estimated, atol=1e-9)
     assert found.summary.real_time is None
-    mixed = lockstep.folder / "replays/three/paired"
-    shutil.copytree(study.folder / "replays/three/paired", mixed, dirs_exist_ok=True)
+    mixed = lockstep.folder / "replays/three/adaptive"
+    shutil.copytree(study.folder / "replays/three/adaptive", mixed, dirs_exist_ok=True)
     with pytest.raises(StoredReplayError, match="some were made in real time"):
         compare(lockstep)
 
 
 def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
     """Also by a study that does not say that they were, and where scans were dropped."""
-    asks = load_study(study_file, ["online.rules=[paired]", TWO_CORES], study.folder)
+    asks = load_study(study_file, ["online.rules=[adaptive]", TWO_CORES], study.folder)
     assert "Replayed at 5 times the recorded rate: nothing came too late." in remarks(
         compare(asks).rows
     )
@@ -89,19 +89,19 @@ def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
         # One of the last twenty scans.
         (fixed / name).write_text("".join(lines[:-20] + lines[-19:]))
     rows = compare(asks).rows
-    assert [row.mode for row in rows] == ["baseline", "fixed", "paired"]
+    assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive"]
     assert {row.real_time["rate"] for row in rows} == {5.0}
     (found,) = [text for text in remarks(rows) if "too late" in text]
     assert "On three `fixed` was too late for 1 scan and 2 selections, at 5 times the" in found
     behind = rows[-1].real_time | {"late_members_scans": 16, "removed_members": 1}
     rows[-1] = replace(rows[-1], real_time=behind)
-    late = "On three members of the bank of `paired` were late at 16 scans in all, and 1 removed."
+    late = "On three members of the bank of `adaptive` were late at 16 scans in all, and 1 removed."
     assert late in remarks(rows)
 
 
 def test_the_command_takes_a_rate(study_file, trained_folder, tmp_path):
     folder = shutil.copytree(trained_folder, tmp_path / "run")
-    given = [study_file, "--folder", folder, "-o", "online.rules=[paired]"]
+    given = [study_file, "--folder", folder, "-o", "online.rules=[adaptive]"]
     first, again = (call("online", *given, "--rate", "20") for _ in range(2))
     assert "3 of 3 replays made" in first.output
     assert json.loads((folder / "replays/three/fixed/replay.json").read_text())["real_time"]

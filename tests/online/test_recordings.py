@@ -79,7 +79,7 @@ def study(study_file, tmp_path):
     for mode, made, kept in (
         ("baseline", replay_of(along_x(0.02)), {"max_correspondence_distance": 2.0}),
         ("fixed", replay_of(along_x(0.01)), FIXED),
-        ("paired", replay_of(along_x(0.005), list(selections()), in_time), None),
+        ("adaptive", replay_of(along_x(0.005), list(selections()), in_time), None),
     ):
         about = ReplayIdentity(mode=mode, parameters=kept, model=None, switching=None, **shared)
         write_replay(folder / mode, made, about, None)
@@ -121,13 +121,20 @@ def test_an_mcap_holds_what_foxglove_shows(study):
     (file,) = record_replays(study, "three", ["mcap"])
     assert file == study.folder / "recordings/three/three.mcap"
     found = messages(file.parent)
-    assert [len(found[name]) for name in ("/points", "/tf", "/paired/odometry")] == [4, N, N]
-    for mode, drift in (("baseline", 0.02), ("fixed", 0.01), ("paired", 0.005), ("reference", 0.0)):
+    assert [len(found[name]) for name in ("/points", "/tf", "/adaptive/odometry")] == [4, N, N]
+    for mode, drift in (
+        ("baseline", 0.02),
+        ("fixed", 0.01),
+        ("adaptive", 0.005),
+        ("reference", 0.0),
+    ):
         ((stamp, path),) = found[f"/{mode}/path"]
         assert (stamp, path.header.frame_id) == (STAMPS[0], "odom")
         xyz = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses]
         np.testing.assert_allclose(xyz, along_x(drift).T_world_sensor[:, :3, 3], atol=1e-8)
-    for (stamp, sent), (at, odometry) in zip(found["/tf"], found["/paired/odometry"], strict=True):
+    for (stamp, sent), (at, odometry) in zip(
+        found["/tf"], found["/adaptive/odometry"], strict=True
+    ):
         (moved,) = sent.transforms
         assert (moved.header.frame_id, moved.child_frame_id) == ("odom", "sensor")
         assert stamp == at == moved.header.stamp.sec * 10**9 + moved.header.stamp.nanosec
@@ -144,25 +151,25 @@ def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
     record_replays(study, "three", ["mcap"])
     found = messages(study.folder / "recordings/three")
     made, end = STAMPS[::10].tolist(), int(STAMPS[-1])
-    assert numbers(found, "/paired/predicted_error") == (made, [0.7] * 4)
-    assert numbers(found, "/paired/predicted_fixed_error") == (made, [0.9] * 4)
+    assert numbers(found, "/adaptive/predicted_error") == (made, [0.7] * 4)
+    assert numbers(found, "/adaptive/predicted_fixed_error") == (made, [0.9] * 4)
     # What is not known yet is left out.
-    assert numbers(found, "/paired/estimated_error") == (made[1:], [2.0, 3.0, 4.0])
-    assert numbers(found, "/paired/estimated_error_high") == (made[1:], [3.0] * 3)
+    assert numbers(found, "/adaptive/estimated_error") == (made[1:], [2.0, 3.0, 4.0])
+    assert numbers(found, "/adaptive/estimated_error_high") == (made[1:], [3.0] * 3)
     # A choice stays until the end.
-    name = "/paired/parameters/max_correspondence_distance"
+    name = "/adaptive/parameters/max_correspondence_distance"
     assert numbers(found, name) == ([*made, end], [1.0, 2.0, 3.0, 4.0, 4.0])
-    assert numbers(found, "/paired/weights/2") == ([*made, end], [0.75] * 5)
-    assert numbers(found, "/paired/lost")[1] == [0.0, 0.0, 1.0, 0.0, 0.0]
-    assert numbers(found, "/paired/parameters/kernel")[1] == ["none", "huber"] * 2
+    assert numbers(found, "/adaptive/weights/2") == ([*made, end], [0.75] * 5)
+    assert numbers(found, "/adaptive/lost")[1] == [0.0, 0.0, 1.0, 0.0, 0.0]
+    assert numbers(found, "/adaptive/parameters/kernel")[1] == ["none", "huber"] * 2
     assert numbers(found, "/fixed/parameters/kernel") == (made[:1], ["huber"])
-    assert numbers(found, "/paired/selection")[1][2] == "trial 2: 75%, trial 5: 25% (lost)"
+    assert numbers(found, "/adaptive/selection")[1][2] == "trial 2: 75%, trial 5: 25% (lost)"
     assert numbers(found, "/fixed/selection")[1] == [
         "max_correspondence_distance 2.5, kernel huber"
     ]
-    assert numbers(found, "/paired/selection_ms")[1] == [4.0, 8.0, 12.0, 16.0]
-    assert numbers(found, "/paired/register_ms")[1] == pytest.approx(2.0 * np.arange(N))
-    assert numbers(found, "/paired/late_ms")[1] == [20.0] * N
+    assert numbers(found, "/adaptive/selection_ms")[1] == [4.0, 8.0, 12.0, 16.0]
+    assert numbers(found, "/adaptive/register_ms")[1] == pytest.approx(2.0 * np.arange(N))
+    assert numbers(found, "/adaptive/late_ms")[1] == [20.0] * N
     assert "/fixed/late_ms" not in found
     assert np.flatnonzero(numbers(found, "/fixed/restarted")[1]).tolist() == [7]
     stamps, errors = numbers(found, "/baseline/true_error")
@@ -172,8 +179,8 @@ def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
 
 
 def test_topics_have_names_that_ros_allows():
-    assert topic("paired", "parameters", "ndt.max-range") == "/paired/parameters/ndt_max_range"
-    assert topic("paired", "errors", "true_error") == "/paired/true_error"
+    assert topic("adaptive", "parameters", "ndt.max-range") == "/adaptive/parameters/ndt_max_range"
+    assert topic("adaptive", "errors", "true_error") == "/adaptive/true_error"
 
 
 def chunks(path):
@@ -201,27 +208,27 @@ def test_a_rerun_file_holds_all_of_it(study):
     assert file == study.folder / "recordings/three.rrd"
     found = chunks(file)
     assert not any(name in ("log_time", "log_tick") for _, name, _ in found)
-    at = "/errors/paired/estimated_error"
+    at = "/errors/adaptive/estimated_error"
     assert found[at, "Scalars:scalars", False] == [[2.0], [3.0], [4.0]]
     stamps = [int(time.value) for time in as_arrow(found[at, "stamp", False])]
     assert stamps == STAMPS[10::10].tolist()
-    assert found[at, "SeriesLines:names", True] == [["paired estimated_error"]]
-    assert found["/words/paired/kernel", "TextLog:text", False] == [["none"], ["huber"]] * 2
+    assert found[at, "SeriesLines:names", True] == [["adaptive estimated_error"]]
+    assert found["/words/adaptive/kernel", "TextLog:text", False] == [["none"], ["huber"]] * 2
     for entity, n in {
-        "/parameters/paired/max_correspondence_distance": 5,
-        "/weights/paired/5": 5,
-        "/milliseconds/paired/late_ms": N,
+        "/parameters/adaptive/max_correspondence_distance": 5,
+        "/weights/adaptive/5": 5,
+        "/milliseconds/adaptive/late_ms": N,
         "/health/fixed/restarted": N,
-        "/errors/paired/predicted_fixed_error": 4,
+        "/errors/adaptive/predicted_fixed_error": 4,
     }.items():
         assert len(found[entity, "Scalars:scalars", False]) == n, entity
-    for mode in ("baseline", "fixed", "paired", "reference"):
+    for mode in ("baseline", "fixed", "adaptive", "reference"):
         ((path,),) = found[f"/world/{mode}", "LineStrips3D:strips", True]
         assert len(path) == N
     scans = {scan.stamp: scan for scan in study.sequences.open("three")}
     placed = found["/world/scan", "Points3D:positions", False]
     for stamp, points in zip(STAMPS[::10], placed, strict=True):
-        moved = scans[stamp].points + gather(study, "three").modes["paired"].trajectory.at(
+        moved = scans[stamp].points + gather(study, "three").modes["adaptive"].trajectory.at(
             np.array([stamp])
         )[0, :3, 3].astype(np.float32)
         np.testing.assert_allclose(points, moved, atol=1e-5)
@@ -248,8 +255,8 @@ def test_recordings_are_the_same_again_and_replays_stay(study):
 def test_parquet_equals_csv(study):
     files = record_replays(study, "three", ["parquet"])
     assert [file.name for file in files[-2:]] == [
-        "three_paired_selections.parquet",
-        "three_paired_frames.parquet",
+        "three_adaptive_selections.parquet",
+        "three_adaptive_frames.parquet",
     ]
     for file in files:
         _, mode, name = file.stem.split("_")
@@ -377,7 +384,7 @@ def test_replays_of_something_else_are_refused(study, study_file):
     other = load_study(study_file, ["sequences.three.reference=none"], study.folder)
     with pytest.raises(StoredReplayError, match="was judged by another reference; run"):
         gather(other, "three")
-    path = study.folder / "replays/three/paired/selections.csv"
+    path = study.folder / "replays/three/adaptive/selections.csv"
     path.write_text(path.read_text().replace("0.7000", "many"))
     with pytest.raises(StoredReplayError, match=r"selections\.csv: is damaged"):
         gather(study, "three")

@@ -219,12 +219,12 @@ class Losing(Chooser):
 def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, caplog):
     selector = Losing([True, True, False, True])
     result = replay(
-        scans(np.arange(36) / 10), InProcess(Scripted()), HEALTH, selector, what="a, paired"
+        scans(np.arange(36) / 10), InProcess(Scripted()), HEALTH, selector, what="a, adaptive"
     )
     assert caplog.messages == [
-        "a, paired: the odometry is lost at 0.0 s",
-        "a, paired: the odometry goes on at 2.0 s",
-        "a, paired: the odometry is lost at 3.0 s",
+        "a, adaptive: the odometry is lost at 0.0 s",
+        "a, adaptive: the odometry goes on at 2.0 s",
+        "a, adaptive: the odometry is lost at 3.0 s",
     ]
     write_replay(tmp_path, result, ABOUT, None)
     summary = json.loads((tmp_path / "replay.json").read_text())

@@ -42,8 +42,8 @@ def test_what_a_mode_measured_of_itself_has_a_panel():
     lost = np.array([True, False, True])
     behind = np.where(SECONDS > 5.0, 0.7, np.nan)
     made = bank(estimated=estimated, lost=lost, errors_behind=behind)
-    _, own = error_chart(sequence(fixed=kept(), paired=made)).panels
-    assert "paired" in own.title
+    _, own = error_chart(sequence(fixed=kept(), adaptive=made)).panels
+    assert "adaptive" in own.title
     (spans,) = of_kind(own, Spans)
     assert list(spans.edges) == [0.0, 8.0, 9.0, SECONDS[-1]]
     assert spans.names == ("lost", "", "lost")
@@ -52,13 +52,13 @@ def test_what_a_mode_measured_of_itself_has_a_panel():
     assert [line.name for line in of_kind(own, Line)] == ["true", "measured while driving"]
     # Without a reference, that is all there is.
     blind = {"errors": np.full(len(SECONDS), np.nan)}
-    (alone,) = error_chart(sequence(paired=bank(estimated=estimated, lost=lost, **blind))).panels
+    (alone,) = error_chart(sequence(adaptive=bank(estimated=estimated, lost=lost, **blind))).panels
     assert alone.title == own.title
     assert error_chart(sequence(fixed=replay(**blind))) is None
 
 
 def test_choices_last_until_the_next_one():
-    chart = choice_chart(sequence(fixed=kept(), paper=replay(), paired=bank()))
+    chart = choice_chart(sequence(fixed=kept(), paper=replay(), adaptive=bank()))
     distance, kernel, weights = chart.panels
     _, steps = of_kind(distance, Line)
     assert steps.steps
@@ -75,8 +75,8 @@ def test_choices_last_until_the_next_one():
 
 def test_weights_that_never_change_are_not_drawn():
     even = replay(weights={"trial 4": [0.5] * 3, "trial 17": [0.5] * 3})
-    assert choice_chart(sequence(paired=even)) is None
-    assert map_chart(sequence(paired=even)) is None
+    assert choice_chart(sequence(adaptive=even)) is None
+    assert map_chart(sequence(adaptive=even)) is None
 
 
 def test_sets_of_several_odometries_leave_gaps():
@@ -89,7 +89,7 @@ def test_sets_of_several_odometries_leave_gaps():
 
 
 def test_the_map_shows_what_was_applied_where():
-    chart = map_chart(sequence(fixed=kept(), paper=replay(), paired=bank()))
+    chart = map_chart(sequence(fixed=kept(), paper=replay(), adaptive=bank()))
     parameter, weight = chart.panels
     assert parameter.title == "paper: distance"
     places = of_kind(parameter, Points)[0]

@@ -80,7 +80,7 @@ def test_sets_of_several_odometries_leave_gaps(tmp_path):
     other = track(
         choices={"odometry": ["gicp"] * 2, "max_distance": [0.7] * 2, "kernel": ["-"] * 2}
     )
-    said = drawn(tmp_path, {"baseline": other, "fixed": other, "paired": mixed})[1]
+    said = drawn(tmp_path, {"baseline": other, "fixed": other, "adaptive": mixed})[1]
     assert {"gicp", "ndt", "huber", "-", "odometry"} <= set(said)
     # Not all modes have one.
     assert "resolution" not in said
@@ -92,9 +92,9 @@ def test_a_bank_has_its_weights_drawn_and_no_parameters(tmp_path):
         choices={"max_distance": [77.0, 77.0], "kernel": ["alone", "alone"]},
         weights={"trial 4": [0.5, 0.2], "trial 17 (ndt)": [0.5, 0.8]},
     )
-    path, said = drawn(tmp_path, {"baseline": track(), "fixed": track(), "paired": of_bank})
+    path, said = drawn(tmp_path, {"baseline": track(), "fixed": track(), "adaptive": of_bank})
     assert {"weight [%]", "trial 4", "trial 17 (ndt)"} <= set(said)
-    assert "paired applies a bank: weights of its members" in said
+    assert "adaptive applies a bank: weights of its members" in said
     assert share_of(path, OTHERS[0]) > 1.0
     assert share_of(path, OTHERS[1]) > 1.0
     assert not {"alone", "70", "77"} & set(said)  # of the heaviest member only
@@ -178,7 +178,7 @@ def test_an_odometry_without_parameters_or_reference_is_drawn(tmp_path):
 
 
 def test_few_modes_on_demand_are_drawn_and_many_are_not():
-    usual = ["baseline", "fixed", "paired", "untrained", "paper"]
+    usual = ["baseline", "fixed", "adaptive", "untrained", "paper"]
     few = ["bank", "even", "random"]
     assert len(few) == FEW
     assert drawn_modes([*usual, *few]) == [*usual, *few]

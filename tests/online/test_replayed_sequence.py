@@ -30,7 +30,7 @@ def study(study_file, trained_folder, tmp_path_factory):
 
 def test_replays_are_read_with_what_was_measured(study):
     replayed = read_replays(study, "three")
-    assert list(replayed.modes) == ["baseline", "fixed", "paired", "paper"]
+    assert list(replayed.modes) == ["baseline", "fixed", "adaptive", "paper"]
     assert replayed.scenes is None
     for mode, of in replayed.modes.items():
         n, m = len(of.track.seconds), len(of.track.choice_seconds)
@@ -38,7 +38,7 @@ def test_replays_are_read_with_what_was_measured(study):
         assert of.scan_ms.shape == (n,)
         assert of.familiarity.shape == (m,)
         assert len(of.selection_ms) == (m if of.adapts else 0)
-        assert of.adapts == (mode in ("paired", "paper"))
+        assert of.adapts == (mode in ("adaptive", "paper"))
         # The reference goes straight on; the odometry nearly so.
         assert abs(of.places[:, 1]).max() < 1e-6
         np.testing.assert_allclose(of.places, of.track.xy, atol=0.5)
@@ -77,7 +77,7 @@ def test_a_replay_that_is_too_short_is_told_and_not_drawn(study, study_file, tmp
         lines = (folder / name).read_text("utf-8").splitlines(keepends=True)
         (folder / name).write_text("".join(lines[:n]), "utf-8")
     replayed = read_replays(own, "three")
-    assert list(replayed.modes) == ["baseline", "fixed", "paired"]
+    assert list(replayed.modes) == ["baseline", "fixed", "adaptive"]
     (said,) = replayed.refused
     assert said in compare(own).words
     assert said in charts_of_replays(own, "three").notes
@@ -89,7 +89,7 @@ def test_modes_that_are_too_many_to_draw_are_named(study, monkeypatch):
     (said,) = (
         said for said in charts_of_replays(study, "three").notes if said.startswith("No lines")
     )
-    assert said.startswith("No lines of `paired`, `paper` along three: nobody could read charts")
+    assert said.startswith("No lines of `adaptive`, `paper` along three: nobody could read charts")
 
 
 def test_scenes_of_a_part_of_a_course_are_those_of_that_part(tmp_path):

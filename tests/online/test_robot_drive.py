@@ -68,7 +68,7 @@ def drive(study, mode, played, n, model=True):
     return robot.run(link, look), link, held
 
 
-@pytest.mark.parametrize("mode", ["baseline", "fixed", "paired", "untrained"])
+@pytest.mark.parametrize("mode", ["baseline", "fixed", "adaptive", "untrained"])
 def test_it_drives_as_a_replay_in_lockstep(make, mode):
     study = make()
     found, link, _ = drive(study, mode, clouds(), len(SCANS), model=mode != "untrained")
@@ -101,7 +101,7 @@ def test_it_drives_as_a_replay_in_lockstep(make, mode):
 
 
 def test_the_covariance_grows_with_the_distance(make):
-    _, link, _ = drive(make(), "paired", clouds(), len(SCANS))
+    _, link, _ = drive(make(), "adaptive", clouds(), len(SCANS))
     variances = [one.pose.covariance.reshape(6, 6) for one in link.published["adaptune/odometry"]]
     assert not variances[0].any()
     x, yaw = np.array([(of[0, 0], of[5, 5]) for of in variances]).T
@@ -113,7 +113,7 @@ def test_the_covariance_grows_with_the_distance(make):
 def test_where_the_clock_goes_back_another_drive_begins(make):
     study = make()
     played = [*clouds(10**11), *clouds()]
-    found, _, _ = drive(study, "paired", played, 2 * len(SCANS))
+    found, _, _ = drive(study, "adaptive", played, 2 * len(SCANS))
     folders = sorted((study.folder / "drives").iterdir())
     first, second = (read_tum(folder / "trajectory.tum") for folder in folders)
     assert found.folder == folders[1]
@@ -156,7 +156,7 @@ def test_a_node_is_steered(make):
 
     study = make(STEER)
     model = ErrorModel.load(study.model_path)
-    found, link, held = drive(study, "paired", played(), len(SCANS))
+    found, link, held = drive(study, "adaptive", played(), len(SCANS))
     # It begins with the fixed set, and holds what was selected last.
     chosen = [json.loads(one.data) for one in link.published["adaptune/selection"]]
     assert len(chosen) == 3
@@ -177,7 +177,7 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
         RobotDrive(make("online.ros.like=tree"), "baseline", None)
     other = make("odometry.settings.min_range=0.9")
     with pytest.raises(AdaptuneError, match="min_range"):
-        RobotDrive(other, "paired", other.model_path)
+        RobotDrive(other, "adaptive", other.model_path)
     monkeypatch.setattr(robot_drive, "_PUBLISHED", 0.0)
     study = make("online.ros.points=null", "sequences.one.points=null")
     link = local_link.LocalLink()

@@ -20,13 +20,13 @@ def test_ratios_are_of_the_same_stretches_of_time():
 def test_familiarity_is_shown_of_those_that_know_it():
     known = bank()._replace(familiarity=np.array([0.2, np.nan, 0.9]))
     over_time, against = familiarity_chart(
-        sequence(fixed=kept(), paper=replay(), paired=known)
+        sequence(fixed=kept(), paper=replay(), adaptive=known)
     ).panels
-    assert [d.name for d in over_time.drawn if isinstance(d, Line)] == ["paired"]
+    assert [d.name for d in over_time.drawn if isinstance(d, Line)] == ["adaptive"]
     (points,) = (d for d in against.drawn if isinstance(d, Points))
     np.testing.assert_array_equal(points.x, [0.2, np.nan, 0.9])
     # Without the fixed set there are no ratios.
-    assert len(familiarity_chart(sequence(paired=known)).panels) == 1
+    assert len(familiarity_chart(sequence(adaptive=known)).panels) == 1
     assert familiarity_chart(sequence(paper=replay())) is None
 
 

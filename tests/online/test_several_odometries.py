@@ -33,7 +33,9 @@ def load(study_file, tmp_path_factory):
     folder = tmp_path_factory.mktemp("several")
     rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
     path = folder / "several.yaml"
-    path.write_text(ODOMETRIES + rest + "online: {rules: [paired], switching: {mechanism: bank}}\n")
+    path.write_text(
+        ODOMETRIES + rest + "online: {rules: [adaptive], switching: {mechanism: bank}}\n"
+    )
     return lambda *overrides: load_study(path, list(overrides), folder / "study")
 
 
@@ -83,21 +85,21 @@ def test_it_is_validated_against_its_rivals(trained):
     study, _ = trained
     found = validate(study)
     (last,) = [row for row in found.rows if row["left out"] == "ms a scan"]
-    assert last["paired"] > 0.0
+    assert last["adaptive"] > 0.0
     assert BEST_DEFAULT in last
     assert EQUAL_COST in last
     assert any("the best odometry with its own parameters" in said for said in found.verdicts)
     points = json.loads((study.folder / "costs.json").read_text())
-    assert {point["what"] for point in points} >= {"gicp", "vgicp", CANCELLING, "paired", "fixed"}
+    assert {point["what"] for point in points} >= {"gicp", "vgicp", CANCELLING, "adaptive", "fixed"}
     assert (study.folder / "costs.png").exists()
 
 
 def test_it_is_replayed_and_compared(trained):
     study, training = trained
     rivals, fixed = training.model.rivals, training.model.fixed
-    modes = ["baseline", "best_default", "equal_cost", "fixed", "paired"]
+    modes = ["baseline", "best_default", "equal_cost", "fixed", "adaptive"]
     assert set(rivals) == set(modes[1:3])
-    replayed = {"baseline", "fixed", "paired"} | {m for m, t in rivals.items() if t != fixed}
+    replayed = {"baseline", "fixed", "adaptive"} | {m for m, t in rivals.items() if t != fixed}
     assert run_replays(study, study.model_path) == len(replayed)
     rows = compare(study).rows
     # A rival that is the fixed set has its replay.

@@ -32,7 +32,7 @@ def replayed(study_file, trained_folder, tmp_path_factory):
         "{bag: three.bag, points: /points, reference: /truth}",
         "{bag: three.bag, points: /points, reference: three.tum}",
     )
-    (folder / "small.yaml").write_text(text + "online: {rules: [paired]}\n")
+    (folder / "small.yaml").write_text(text + "online: {rules: [adaptive]}\n")
     run(load_at(folder))
     return folder
 
@@ -143,7 +143,7 @@ def test_a_model_of_other_training_sequences(load):
 
 def test_replays_with_two_models_are_not_compared(load):
     study = load()
-    path = study.folder / "replays/three/paired/replay.json"
+    path = study.folder / "replays/three/adaptive/replay.json"
     stored = json.loads(path.read_text())
     stored |= {"model_file": "/gone/model.safetensors"}
     stored["about"]["model"] = "another"
@@ -154,18 +154,18 @@ def test_replays_with_two_models_are_not_compared(load):
     shutil.copytree(path.parent, twice)
     stored["about"] |= {"mode": "paper", "model": "a third"}
     (twice / "replay.json").write_text(json.dumps(stored))
-    both = load("online.rules=[paired, paper]")
+    both = load("online.rules=[adaptive, paper]")
     with pytest.raises(StoredReplayError, match=r"different models .*run `adaptune online` again"):
         compare(both)
 
 
 def test_what_is_refused_is_told_and_not_drawn(load):
     study = load()
-    assert current_modes(study, "three") == (("baseline", "fixed", "paired"), ())
+    assert current_modes(study, "three") == (("baseline", "fixed", "adaptive"), ())
     assert current_modes(study, "one") == ((), ())
     # What is left of a mode that the study does not have any more is not looked at.
     folder = study.folder / "replays/three"
-    shutil.copytree(folder / "paired", folder / "paper")
+    shutil.copytree(folder / "adaptive", folder / "paper")
     assert "paper" not in current_modes(study, "three").modes
     other = load("online.switching.mechanism=hand_over", "online.switching.warm_up=3")
     modes, refused = current_modes(other, "three")
@@ -177,7 +177,7 @@ def test_what_is_refused_is_told_and_not_drawn(load):
     assert refused[0] in notes
     lines = {line.name for panel in charts[0].panels for line in panel.drawn}
     assert {"baseline", "fixed"} <= lines
-    assert "paired" not in lines
+    assert "adaptive" not in lines
 
 
 def test_all_that_is_refused_for_one_reason_is_told_at_once(load):
@@ -186,7 +186,7 @@ def test_all_that_is_refused_for_one_reason_is_told_at_once(load):
     charts, (said,) = charts_of_replays(study, "three")
     assert not charts
     assert said == (
-        f"{study.folder / 'replays/three'}: baseline, fixed, paired were replayed with another "
+        f"{study.folder / 'replays/three'}: baseline, fixed, adaptive were replayed with another "
         f"recording; run `adaptune online` with this study."
     )
 
@@ -201,7 +201,7 @@ def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load)
     with pytest.raises(StoredReplayError, match="different models"):
         compare(study)
     modes, (said,) = current_modes(study, "three")
-    assert modes == ("baseline", "fixed", "paired")
+    assert modes == ("baseline", "fixed", "adaptive")
     assert "three/even: was replayed with another model; run `adaptune online`" in said
     study.model_path.unlink()
     with pytest.raises(StoredReplayError, match="different models"):
@@ -210,7 +210,7 @@ def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load)
 
 def test_replays_of_another_rate_or_reference_are_not_drawn(load):
     study = load()
-    path = study.folder / "replays/three/paired/replay.json"
+    path = study.folder / "replays/three/adaptive/replay.json"
     before = path.read_text()
     stored = json.loads(before)
     stored["about"]["real_time"] = {"rate": 1.0}

@@ -58,14 +58,16 @@ def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_p
         monkeypatch.setattr(ErrorModel, "load", lambda _: made)
         return switch_cost.switch_cost_in_words(study)
 
-    assert said().startswith(f"`online` will drive the fixed set (trial {model.fixed}) as `paired`")
+    assert said().startswith(
+        f"`online` will drive the fixed set (trial {model.fixed}) as `adaptive`"
+    )
     assert said().endswith("That has no switch cost.")
     members = ", ".join(map(str, model.bank))
     bank = said(bank_adapts=True)
-    assert bank.startswith(f"`online` will drive the bank of trials {members} as `paired`")
+    assert bank.startswith(f"`online` will drive the bank of trials {members} as `adaptive`")
     assert bank.endswith("no switch cost.")
     alone = said(adapts=True)
-    assert alone.startswith("`online` will drive one set at a time as `paired`, changed live")
+    assert alone.startswith("`online` will drive one set at a time as `adaptive`, changed live")
     assert alone.endswith(". Then a switch costs 25.0% of the RTE.")
     handed = load_study(study_file, ["online.switching.mechanism=hand_over"], folder)
     assert said(study=handed).endswith(
@@ -73,7 +75,7 @@ def test_what_is_not_driven_has_no_switch_cost(study_file, trained_folder, tmp_p
     )
     only = load_study(study_file, ["online.rules=[paper]"], folder)
     assert said(study=only).startswith(
-        "`online` will drive `paper`, and not `paired` (online.rules)."
+        "`online` will drive `paper`, and not `adaptive` (online.rules)."
     )
     study.model_path.unlink()
     assert "If `online` will drive one set at a time, a switch costs 25.0%" in said()

@@ -150,10 +150,10 @@ def test_it_is_compared_with_the_trained_modes_too(load, trained_folder):
     one_set = replace(model, paired=PairedSettings(), bank_settings=BankSettings(adapt=False))
     one_set.save(study.model_path)
     run_replays(study, study.model_path)
-    assert {row.mode for row in compare(study).rows} == {"baseline", "fixed", "paired", "paper"}
+    assert {row.mode for row in compare(study).rows} == {"baseline", "fixed", "adaptive", "paper"}
     assert run_untrained(study) == 1  # the baseline is the same
     rows = compare(study).rows
-    assert [row.mode for row in rows] == ["baseline", "fixed", "paired", "untrained", "paper"]
+    assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive", "untrained", "paper"]
     assert {row.yardstick for row in rows} == {"fixed"}
     other = load("online.switching.size=3")
     with pytest.raises(StoredReplayError, match=r"another switching; run `adaptune online --untr"):
@@ -185,7 +185,7 @@ def test_a_bank_of_what_cannot_be_in_one_is_refused(study_file, tmp_path, load):
     assert done.exit_code == 2
     assert "--untrained uses no model; leave out --model some.safetensors" in done.stderr
     setup = ReplaySetup.of(load())
-    for mode in ("fixed", "paired"):
+    for mode in ("fixed", "adaptive"):
         with pytest.raises(ModeError, match=f"{mode}: needs an error model"):
             setup.start(mode)
     assert setup.start("baseline").selector is None

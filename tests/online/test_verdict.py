@@ -25,44 +25,47 @@ def every(n=12, **ratios):
 @pytest.mark.parametrize(
     ("ratio", "first", "last"),
     [
-        (0.7, "Adapting gained 30 % on 12 test sequences: `paired` has 0.70 times the fixed set's "
-              "error (95 % interval 0.68 to 0.72).", "What to do: drive `paired`."),
+        (0.7, "Adapting gained 30 % on 12 test sequences: `adaptive` has 0.70 times the fixed "
+              "set's error (95 % interval 0.68 to 0.72).", "What to do: drive `adaptive`."),
         (1.3, "Adapting lost 30 % on 12 test sequences", "What to do: drive the fixed set; no"),
         (1.004, "Adapting changed nothing that counts on 12", "What to do: drive the fixed set; n"),
     ],
 )  # fmt: skip
 def test_the_first_sentence_says_what_was_gained_and_the_last_what_to_do(ratio, first, last):
-    said = verdict(every(paired=ratio))
+    said = verdict(every(adaptive=ratio))
     assert said[0].startswith(first)
     assert said[-1].startswith(last)
 
 
 def test_a_ratio_near_1_with_a_wide_interval_is_open():
-    wide = [replace(row, ratio_interval=(0.6, 1.7)) for row in rows_of(paired=0.98)]
-    said = verdict([*every(paired=0.98)[:-3], *wide])
+    wide = [replace(row, ratio_interval=(0.6, 1.7)) for row in rows_of(adaptive=0.98)]
+    said = verdict([*every(adaptive=0.98)[:-3], *wide])
     assert said[-1].startswith("What to do: replay more test sequences; until they decide, drive")
     assert said[0].startswith("Whether adapting gains is open, on 12 test sequences")
     assert any(s.startswith("Whether tuning gains is open, on 12 test sequences") for s in said)
 
 
 def test_with_few_sequences_the_interval_speaks_of_these_alone():
-    few = [row for i in range(3) for row in rows_of(f"s{i}", paired=0.7)] + rows_of(paired=0.7)
+    few = [row for i in range(3) for row in rows_of(f"s{i}", adaptive=0.7)] + rows_of(adaptive=0.7)
     assert verdict(few)[0].endswith("The interval speaks of these recordings alone.")
-    assert verdict(rows_of("a", paired=0.7))[0].endswith("these recordings alone.")
-    assert "alone" not in verdict(every(paired=0.7))[0]
+    assert verdict(rows_of("a", adaptive=0.7))[0].endswith("these recordings alone.")
+    assert "alone" not in verdict(every(adaptive=0.7))[0]
     # Twelve parts of two recordings are two.
-    of_two = [replace(row, recordings=2) for row in every(paired=0.7)]
+    of_two = [replace(row, recordings=2) for row in every(adaptive=0.7)]
     assert verdict(of_two)[0].endswith("these recordings alone.")
 
 
 @pytest.mark.parametrize(
     ("ratios", "advice"),
     [
-        ({"baseline": 0.7, "paired": 1.3}, "What to do: drive `baseline`."),
-        ({"equal_cost": 0.6, "paired": 0.8}, "What to do: drive the best set that costs no more."),
-        ({"even": 0.5, "paired": 0.8}, "What to do: drive `paired`."),
-        ({"bank_learned": 0.78, "paired": 0.8}, "What to do: drive `paired`."),
-        ({"bank_learned": 0.7, "paired": 0.8}, "What to do: drive `bank_learned`."),
+        ({"baseline": 0.7, "adaptive": 1.3}, "What to do: drive `baseline`."),
+        (
+            {"equal_cost": 0.6, "adaptive": 0.8},
+            "What to do: drive the best set that costs no more.",
+        ),
+        ({"even": 0.5, "adaptive": 0.8}, "What to do: drive `adaptive`."),
+        ({"bank_learned": 0.78, "adaptive": 0.8}, "What to do: drive `adaptive`."),
+        ({"bank_learned": 0.7, "adaptive": 0.8}, "What to do: drive `bank_learned`."),
         ({"baseline": 1.4}, "What to do: drive the fixed set; nothing is surely better."),
     ],
 )
@@ -86,13 +89,13 @@ def test_what_tuning_costs_is_told_if_it_costs_something(fixed, counts):
 
 @pytest.mark.parametrize("ratio", [0.4, 1.0, 1.6])
 def test_without_an_interval_nothing_is_claimed(ratio):
-    few = every(3, paired=ratio, paper=1.3 * ratio, even=1.1)
+    few = every(3, adaptive=ratio, paper=1.3 * ratio, even=1.1)
     against = {"even": Ratio(0.9)}
     said = verdict([replace(row, ratio_interval=None, against=against) for row in few])
     unknown = "nothing can be said of how sure"
     assert said[0] == (
-        f"Whether adapting gains is not known, on 3 test sequences: `paired` has {ratio:.2f} times "
-        f"the fixed set's error (no interval); {unknown} that is."
+        f"Whether adapting gains is not known, on 3 test sequences: `adaptive` has {ratio:.2f} "
+        f"times the fixed set's error (no interval); {unknown} that is."
     )
     assert any(s.startswith("Whether choosing adds to that is not known") for s in said)
     assert (
@@ -108,7 +111,7 @@ def test_without_an_interval_nothing_is_claimed(ratio):
 
 
 def test_modes_without_an_interval_are_not_told_as_sure_where_nothing_was_adapted():
-    rows = rows_of("a", paired=1.0, bank=0.8)
+    rows = rows_of("a", adaptive=1.0, bank=0.8)
     kept = [replace(row, switches=0, ratio_interval=None) for row in rows[:-1]]
     assert verdict([*kept, replace(rows[-1], ratio_interval=None)])[-1].startswith(
         "What to do: replay 6 test recordings or more, or longer ones"
@@ -118,26 +121,26 @@ def test_modes_without_an_interval_are_not_told_as_sure_where_nothing_was_adapte
 
 
 def test_a_mode_that_surely_does_not_differ_is_told_from_one_that_may():
-    said = verdict(every(paired=0.7, paper=1.004))
+    said = verdict(every(adaptive=0.7, paper=1.004))
     assert any(s.startswith("`paper` changed nothing that counts: 1.00 times") for s in said)
     wide = [
         replace(row, ratio_interval=(0.6, 1.7)) if row.mode == "paper" else row
-        for row in every(paired=0.7, paper=1.004)
+        for row in every(adaptive=0.7, paper=1.004)
     ]
     assert any(s.startswith("`paper` does not surely differ: 1.00 times") for s in verdict(wide))
 
 
 def test_what_kept_the_fixed_set_did_not_adapt():
-    rows = [replace(row, switches=0, ratio_interval=None) for row in every(paired=1.0)]
+    rows = [replace(row, switches=0, ratio_interval=None) for row in every(adaptive=1.0)]
     said = verdict(rows)
     assert said[0] == (
-        "Nothing was adapted, nothing gained: `paired` kept the fixed set on 12 test sequences."
+        "Nothing was adapted, nothing gained: `adaptive` kept the fixed set on 12 test sequences."
     )
     assert said[-1].startswith("What to do: ")
 
 
 def test_losses_costs_controls_and_rivals_are_told():
-    rows = every(paired=0.7, paper=1.4, equal_cost=0.875, random=1.8, even=1.02)
+    rows = every(adaptive=0.7, paper=1.4, equal_cost=0.875, random=1.8, even=1.02)
     sure = {
         "better": 11,
         "worse": 1,
@@ -149,8 +152,10 @@ def test_losses_costs_controls_and_rivals_are_told():
         "stretches": 24,
         "against": {"even": Ratio(0.69, (0.6, 0.8)), "equal_cost": Ratio(0.8, (0.7, 0.9))},
     }
-    rows = [replace(r, **sure) if (r.sequence, r.mode) == (ALL, "paired") else r for r in rows]
-    rows = [replace(r, ratio=1.2) if (r.sequence, r.mode) == ("s3", "paired") else r for r in rows]
+    rows = [replace(r, **sure) if (r.sequence, r.mode) == (ALL, "adaptive") else r for r in rows]
+    rows = [
+        replace(r, ratio=1.2) if (r.sequence, r.mode) == ("s3", "adaptive") else r for r in rows
+    ]
     said = verdict(rows)
     for sentence in (
         "By more than 1 %, it has less error on 11 of 12 sequences, and more on 1 (s3); surely "
@@ -158,12 +163,12 @@ def test_losses_costs_controls_and_rivals_are_told():
         "In the worst tenth of 24 stretches it has 1.25 times the fixed set's error.",
         "It gains 40 % of what the best set of each sequence would gain in hindsight.",
         "It takes 20.0 ms of CPU time a scan: 4.0 times what the fixed set takes.",
-        "`paired` has 0.80 times the error of the best set that costs no more (95 % interval 0.70 "
-        "to 0.90).",
-        "Choosing added to that: `paired` has 0.69 times the error of `even` (95 % interval 0.60 "
+        "`adaptive` has 0.80 times the error of the best set that costs no more (95 % interval "
+        "0.70 to 0.90).",
+        "Choosing added to that: `adaptive` has 0.69 times the error of `even` (95 % interval 0.60 "
         "to 0.80).",
         "`paper` is worse: 1.40 times the fixed set's error (95 % interval 1.36 to 1.44).",
-        "What to do: drive `paired`, and look at where it is worse (pictures).",
+        "What to do: drive `adaptive`, and look at where it is worse (pictures).",
     ):
         assert sentence in said
     assert any(
@@ -175,7 +180,7 @@ def test_losses_costs_controls_and_rivals_are_told():
 
 def test_on_how_many_sequences_it_can_be_sure_is_told():
     sure = {"better": 12, "worse": 0, "surely_better": 10, "surely_worse": 0}
-    rows = [replace(r, **sure) if r.sequence == ALL else r for r in every(paired=0.7)]
+    rows = [replace(r, **sure) if r.sequence == ALL else r for r in every(adaptive=0.7)]
     short = ("s0", "s1")
     rows = [replace(r, ratio_interval=None) if r.sequence in short else r for r in rows]
     told = "and more on none; surely better on 10, surely worse on 0, of 10 long enough to tell."
@@ -183,17 +188,18 @@ def test_on_how_many_sequences_it_can_be_sure_is_told():
 
 
 def test_a_rival_is_compared_once_in_error_and_cost_also_where_the_fixed_set_is_kept():
-    for paired, switches in ((0.8, 3), (1.0, 0)):
-        against = {"best_default": Ratio(paired / 1.25, (0.5, 0.9))}
-        costs = {"paired": 20.0, "best_default": 30.0}
+    for adaptive, switches in ((0.8, 3), (1.0, 0)):
+        against = {"best_default": Ratio(adaptive / 1.25, (0.5, 0.9))}
+        costs = {"adaptive": 20.0, "best_default": 30.0}
         rows = [
             replace(r, cpu_ms=costs.get(r.mode), against=against, switches=switches)
-            for r in every(paired=paired, best_default=1.25)
+            for r in every(adaptive=adaptive, best_default=1.25)
         ]
         found = [said for said in remarks(rows) if "the best odometry with its own" in said]
         assert found == [
-            f"`paired` has {paired / 1.25:.2f} times the error of the best odometry with its own "
-            f"parameters (95 % interval 0.50 to 0.90), at 20.0 ms of CPU time a scan against 30.0."
+            f"`adaptive` has {adaptive / 1.25:.2f} times the error of the best odometry with its "
+            f"own parameters (95 % interval 0.50 to 0.90), at 20.0 ms of CPU time a scan against "
+            f"30.0."
         ]
 
 
@@ -211,24 +217,24 @@ def test_without_a_model_the_untrained_bank_is_compared_with_the_baseline():
 
 
 def test_nothing_is_said_where_nothing_is_known():
-    rows = [replace(row, rte=None, ratio=None) for row in rows_of("a", paired=0.5)]
+    rows = [replace(row, rte=None, ratio=None) for row in rows_of("a", adaptive=0.5)]
     assert verdict(rows) == ["No test sequence has a reference: nobody can say what was gained."]
     oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
-    assert not any(ORACLES[0] in said for said in verdict([*every(paired=0.7), oracle]))
+    assert not any(ORACLES[0] in said for said in verdict([*every(adaptive=0.7), oracle]))
 
 
 @pytest.mark.parametrize(("best", "told"), [(1.0, True), (0.995, True), (0.8, False)])
 def test_it_is_told_where_no_choice_of_one_set_could_gain(best, told):
     oracle = ComparisonRow(ALL, ORACLES[0], best, best, 0, 0, 0)
-    said = verdict([*every(paired=0.9), oracle])
+    said = verdict([*every(adaptive=0.9), oracle])
     what = "In hindsight, the best set of each sequence would gain less than 1 %"
     assert any(sentence.startswith(what) for sentence in said) == told
     assert said[-1].startswith("What to do: ")
 
 
 def test_an_end_near_1_shows_on_which_side_it_lies():
-    near = [replace(row, ratio_interval=(1.004, 1.12)) for row in rows_of(paired=1.04)]
-    said = verdict([*every(paired=1.04)[:-3], *near])
+    near = [replace(row, ratio_interval=(1.004, 1.12)) for row in rows_of(adaptive=1.04)]
+    said = verdict([*every(adaptive=1.04)[:-3], *near])
     assert "(95 % interval 1.004 to 1.12)" in said[0]
 
 

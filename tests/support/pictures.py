@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
-MODES = ("baseline", "fixed", "paired", "paper")
+MODES = ("baseline", "fixed", "adaptive", "paper")
 
 
 def texts(png: Path) -> list[str]:

@@ -21,7 +21,7 @@ def over_time() -> Chart:
         scenes,
         Line(t, 1.3 * error, "baseline"),
         Line(t, error, "fixed"),
-        Line(t, gap * 0.8, "paired"),
+        Line(t, gap * 0.8, "adaptive"),
         Line(t, np.full(len(t), 0.5), "limit", dashed=True),
         Mark(0.7, "goal"),
         Mark(120.0, "door opens", "x"),
@@ -35,7 +35,7 @@ def over_time() -> Chart:
     )
     weights = rng.dirichlet(np.ones(3), len(k)).T
     members = Shares(k, weights, ("trial 3", "trial 17", "trial 242"))
-    steps = Line(k, rng.uniform(0.1, 1.0, len(k)), "paired", steps=True)
+    steps = Line(k, rng.uniform(0.1, 1.0, len(k)), "adaptive", steps=True)
     return Chart(
         "over-time",
         "Errors and selections over time",
@@ -45,7 +45,7 @@ def over_time() -> Chart:
             Panel(TIME, Axis("voxel size [m]"), (steps,)),
             Panel(TIME, Axis("weight [-]", limits=(0.0, 1.0)), (members,), "members of the bank"),
         ),
-        "The course passes five scenes. The paired mode lost its reference for ten seconds.",
+        "The course passes five scenes. The adaptive mode lost its reference for ten seconds.",
         shared_x=True,
     )
 
@@ -113,7 +113,7 @@ def from_above() -> Chart:
     drawn = (
         *(
             Line(x + d, y - d, mode)
-            for mode, d in (("baseline", 2.0), ("fixed", 1.0), ("paired", 0.3))
+            for mode, d in (("baseline", 2.0), ("fixed", 1.0), ("adaptive", 0.3))
         ),
         Points(x[::200], y[::200], "reference", marker="o"),
         Points([40.0], [0.0], "start", marker="P"),
@@ -146,7 +146,7 @@ def sample_page() -> Page:
     rows = [
         {
             "sequence": f"drive_{i}" + "_with_a_long_name" * (i == 3),
-            "mode": ("fixed", "paired", "<script>alert(1)</script>")[i % 3],
+            "mode": ("fixed", "adaptive", "<script>alert(1)</script>")[i % 3],
             "mean_RTE": (2.5, 10.25, None, 0.0042, float("nan"), 9.0)[i % 6],
             "scans": 1000 - 7 * i,
             **{f"parameter_{k}": 0.1 * k for k in range(6)},
@@ -160,7 +160,7 @@ def sample_page() -> Page:
         "Adaptive tuning of KISS-ICP & friends </title><script>alert(2)</script>",
         "study tunnel.yaml, 12 drives, 2000 trials",
         (
-            "The paired mode has the smallest error: 0.42 %, where the fixed set has 0.61 %.",
+            "The adaptive mode has the smallest error: 0.42 %, where the fixed set has 0.61 %.",
             "It needs 3 % more time for a scan.",
             "On the two drives through the forest, it is not better than the fixed set.",
         ),

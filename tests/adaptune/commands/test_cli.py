@@ -186,10 +186,10 @@ def test_the_whole_way(study_file, tmp_path):
     assert next_words(done)[:2] == ["compare", str(study_file)]
     done = process("compare", study_file, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    for mode in ("baseline", "fixed", "paired", "paper"):
+    for mode in ("baseline", "fixed", "adaptive", "paper"):
         assert mode in done.stdout
     assert all(name in done.stdout for name in ("APE [m]", "RPE [m]"))
-    assert done.stdout.startswith("Whether adapting gains is not known, on three: `paired` has ")
+    assert done.stdout.startswith("Whether adapting gains is not known, on three: `adaptive` has ")
     table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Tables and pictures")]
     assert max(map(len, table.splitlines())) <= 80
     assert (tmp_path / "runs/small/comparison/three.svg").exists()

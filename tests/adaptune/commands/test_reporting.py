@@ -24,12 +24,12 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f"{title}</h2>" in page
     # The first words are those of the comparison.
     said = ended.output.splitlines()[0]
-    assert "`paired`" in said
+    assert "`adaptive`" in said
     assert "Not in it: No validation: run `adaptune validate`." in ended.output
     figures = {path.stem for path in (finished / "report/figures").glob("*.svg")}
     assert {"comparison", "three-errors"} <= figures
     assert figures == {path.stem for path in (finished / "report/figures").glob("*.png")}
-    for mode in ("baseline", "fixed", "paired", "paper"):
+    for mode in ("baseline", "fixed", "adaptive", "paper"):
         assert f">{mode}</td>" in page
     # The files of the comparison are those of `adaptune compare`.
     assert not (finished / "comparison").exists()

@@ -104,7 +104,7 @@ def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_pa
         blocks={"mine:shape": 88, "two": 2},
         window=3,
         descriptors=np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
-        validation={"paired": {"geometric": 0.6, "verdict": "Adapt."}},
+        validation={"adaptive": {"geometric": 0.6, "verdict": "Adapt."}},
     )
     model.save(tmp_path / "model.safetensors")
     assert_same(ErrorModel.load(tmp_path / "model.safetensors"), model)
@@ -113,7 +113,7 @@ def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_pa
 def test_the_digest_is_of_what_selections_depend_on(tmp_path):
     model = random_model()
     assert ErrorModel.load(saved(tmp_path)).digest == model.digest
-    for same in ({"validation": {"paired": {}}}, {"provenance": {}}):
+    for same in ({"validation": {"adaptive": {}}}, {"provenance": {}}):
         assert dataclasses.replace(model, **same).digest == model.digest
     errors = model.errors.copy()
     errors[3, 4] += 1

@@ -171,8 +171,8 @@ def test_it_chooses_among_those_named_on_the_evidence_of_all(seed, n_frames, n_s
 
 def test_its_constants():
     assert tuple(PairedSettings().model_dump().values()) == (True, 3, 6.0, 0.12, 300, -0.1, 0.5)
-    assert RULES[0] == "paired"
-    assert isinstance(make_rule("paired", PairedSettings()), PairedExpectedRatio)
+    assert RULES[0] == "adaptive"
+    assert isinstance(make_rule("adaptive", PairedSettings()), PairedExpectedRatio)
 
 
 def two_sets(fixed, other, n=40):

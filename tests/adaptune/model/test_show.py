@@ -90,7 +90,7 @@ def kinds(model):
         dataclasses.replace(bank, bank_settings=BankSettings(adapt=False)),
         dataclasses.replace(model, paired=PairedSettings(adapt=False)),
         dataclasses.replace(bank, validation={"bank": summary, "paper": summary | {"low": np.nan}}),
-        dataclasses.replace(model, validation={"paired": {"kept": ["a", {"b": None}]}, "x": "y"}),
+        dataclasses.replace(model, validation={"adaptive": {"kept": ["a", {"b": None}]}, "x": "y"}),
         dataclasses.replace(model, provenance={"versions": {"numpy": "2"}, "augment": augment}),
         dataclasses.replace(model, provenance=config),
         dataclasses.replace(model, odometry={"name": "command", "settings": settings}),
@@ -132,11 +132,11 @@ def test_text_of_a_file_is_shown_literally(model, tmp_path):
 
 
 def test_what_validation_found_is_shown(model, tmp_path):
-    found = {"paired": {"geometric": 0.61, "verdict": "Adapt by `paired`."}}
+    found = {"adaptive": {"geometric": 0.61, "verdict": "Adapt by `adaptive`."}}
     text = shown(dataclasses.replace(model, validation=found), tmp_path)
     assert "rule geometric ─" in text
-    assert "paired 0.610" in text
-    assert "paired, verdict: Adapt by `paired`." in text
+    assert "adaptive 0.610" in text
+    assert "adaptive, verdict: Adapt by `adaptive`." in text
 
 
 def test_sets_that_a_sequence_lacks_are_shown(model, tmp_path):

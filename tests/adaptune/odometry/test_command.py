@@ -329,7 +329,7 @@ def test_the_whole_way(make):
             "odometry.settings.format: give 'tum', 'kitti' or 'evalio', not 'tumm'",
         ),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
-        ("online.rules=[paired]", "online.rules: command runs whole recordings"),
+        ("online.rules=[adaptive]", "online.rules: command runs whole recordings"),
         ("online.switching.mechanism=live", "command runs whole recordings and cannot change"),
         ("online.switching.mechanism=bank", "command runs whole recordings and cannot change"),
         ("odometry.settings.command=sh", "settings.command: give a list, not 'sh'"),

@@ -51,11 +51,11 @@ def test_lines_look_as_on_paper():
     (limit,) = traces_of(over_time(), "limit")
     assert "dash" in limit["line"]
     assert "dash" not in wide["line"]
-    assert traces_of(over_time(), "paired")[1]["line"]["shape"] == "hv"
+    assert traces_of(over_time(), "adaptive")[1]["line"]["shape"] == "hv"
 
 
 def test_a_gap_is_a_gap():
-    gaps = traces_of(over_time(), "paired")[0]
+    gaps = traces_of(over_time(), "adaptive")[0]
     assert None in gaps["y"]
     assert gaps["connectgaps"] is False
 

@@ -101,8 +101,8 @@ def headings(seen):
 def test_names_between_backticks_are_code():
     table = Listing("C", [{"one_set": 1.0}], "Of `fixed`.")
     sections = (PageSection("B", ("`a<b` is kept.",), ("run `adaptune online`",), (), (table,)),)
-    seen = Seen(page_text(Page("A", "", ("`paired` has less.",), sections)))
-    assert seen.texts["code"] == ["paired", "a<b", "adaptune online", "fixed"]
+    seen = Seen(page_text(Page("A", "", ("`adaptive` has less.",), sections)))
+    assert seen.texts["code"] == ["adaptive", "a<b", "adaptune online", "fixed"]
     assert headings(seen) == ["one_set"]
     assert not any("`" in text for tag in ("li", "p") for text in seen.texts[tag])
 

@@ -56,7 +56,7 @@ def test_names_are_literal(drawn):
 
 
 def test_modes_have_their_colours(drawn):
-    for mode in ("baseline", "fixed", "paired"):
+    for mode in ("baseline", "fixed", "adaptive"):
         assert share_of(drawn / "from-above.png", LINES[mode]["color"]) > 0.3
 
 

@@ -63,8 +63,14 @@ def shown_within(listing, width):
 LISTING = Listing(
     "RTE_1 & more",
     [
-        {"sequence": "a_1", "gicp: fixed": 1.0, "gicp: paired": 0.5, "ndt: fixed": 2.0, "_no": 1},
-        {"sequence": "b|2", "gicp: fixed": 1.0, "gicp: paired": None, "ndt: fixed": 0.25, "_no": 1},
+        {"sequence": "a_1", "gicp: fixed": 1.0, "gicp: adaptive": 0.5, "ndt: fixed": 2.0, "_no": 1},
+        {
+            "sequence": "b|2",
+            "gicp: fixed": 1.0,
+            "gicp: adaptive": None,
+            "ndt: fixed": 0.25,
+            "_no": 1,
+        },
     ],
     "Over 100 % of `all`.",
     "row",
@@ -74,7 +80,7 @@ LISTING = Listing(
 def test_markdown_has_a_line_a_row_and_the_least_in_bold():
     title, _, head, _, first, second, _, caption = markdown(LISTING).splitlines()
     assert title == "**RTE_1 & more**"
-    assert head == "| sequence | gicp: fixed | gicp: paired | ndt: fixed |"
+    assert head == "| sequence | gicp: fixed | gicp: adaptive | ndt: fixed |"
     # In each group; of a single number nothing is said.
     assert first == "| a_1 | 1.000 | **0.500** | 2.000 |"
     assert second == "| b\\|2 | 1.000 | - | 0.250 |"
@@ -90,7 +96,7 @@ def test_latex_has_rules_groups_and_escaped_texts():
     assert lines[at + 1 : at + 8] == [
         r"\multicolumn{1}{c}{} & \multicolumn{2}{c}{gicp} & \multicolumn{1}{c}{ndt} \\",
         r"\cmidrule(lr){2-3} \cmidrule(lr){4-4}",
-        r"sequence & fixed & paired & fixed \\",
+        r"sequence & fixed & adaptive & fixed \\",
         r"\midrule",
         r"a\_1 & 1.000 & \textbf{0.500} & 2.000 \\",
         r"b|2 & 1.000 & - & 0.250 \\",
