@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, model_validator
 
-from adaptune.errors import AdaptuneError, StrictModel, nearest
+from adaptune.errors import AdaptuneError, nearest
+from adaptune.strict import StrictModel
 
 Value = float | int | str | bool
 ParameterSet = dict[str, Value]

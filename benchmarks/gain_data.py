@@ -15,13 +15,12 @@ from adaptune.live.hops import Hops
 from adaptune.model.descriptor import (
     DESCRIPTORS,
     MOTION,
-    N_FEATURES,
     averaged,
     descriptor,
     lowest_elevation,
-    ndt_histogram,
     speed_and_turn_rate,
 )
+from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits

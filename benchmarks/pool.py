@@ -32,7 +32,7 @@ from replays import ORDERS, mean_error
 
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
-from adaptune.model.descriptor import N_FEATURES
+from adaptune.model.ndt import N_FEATURES
 from adaptune.odometry.base import WarmUp
 from adaptune.odometry.remote import SERVICE
 from adaptune.odometry.tracker import HealthCheck

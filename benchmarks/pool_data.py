@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
 from adaptune.files import replacing
 from adaptune.live.hops import Hops
-from adaptune.model.descriptor import N_FEATURES, averaged, lowest_elevation, ndt_histogram
+from adaptune.model.descriptor import averaged, lowest_elevation
+from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.model.rules import Costs, SetCost
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class

@@ -29,7 +29,8 @@ import numpy as np
 from adaptune import processes
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
-from adaptune.model.descriptor import N_FEATURES, lowest_elevation, ndt_histogram
+from adaptune.model.descriptor import lowest_elevation
+from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.odometry.base import WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from adaptune.bank.bank import Bank
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.model.descriptor import N_FEATURES
+from adaptune.model.ndt import N_FEATURES
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance, WarmUp

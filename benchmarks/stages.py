@@ -22,7 +22,7 @@ from adaptune import processes
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.model.descriptor import ndt_histogram
+from adaptune.model.ndt import ndt_histogram
 from adaptune.odometry.keyframe import crop
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import SequenceConfig

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_serializer, model_validator
 
-from adaptune.errors import Mistake, StrictModel, nearest, validated
+from adaptune.errors import nearest
 from adaptune.recording.config import MOST_VIEWS, ViewConfig, expand
 from adaptune.space import ParameterSpace
+from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
-from adaptune.study.loading import read_study
 from adaptune.study.study import Study
 from offline.samplers.settings import (
     FORGETFUL,
@@ -218,4 +218,6 @@ def load_study(
     runs: Path = Path("runs"),
 ) -> OfflineStudy:
     """Read and check the whole YAML of a study, see `adaptune.study.loading.read_study`."""
+    from adaptune.study.loading import read_study  # which opens recordings
+
     return read_study(Path(path), OfflineStudyConfig, overrides, folder, runs)

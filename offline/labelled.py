@@ -33,7 +33,7 @@ from offline.objective import affordable, choose_fixed, few, margin, mean_value,
 from offline.search import owner
 
 if TYPE_CHECKING:
-    from adaptune.model.descriptor import ScaledPCA
+    from adaptune.model.pca import ScaledPCA
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +270,7 @@ class LabelledData(NamedTuple):
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
-        from adaptune.model.descriptor import ScaledPCA  # takes long to import
+        from adaptune.model.pca import ScaledPCA  # takes long to import
 
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
         blocks = self.sequences[0].blocks

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import RULES, PairedSettings, Rule, TrainingData, make_rule
-from adaptune.model.descriptor import ScaledPCA
+from adaptune.model.pca import ScaledPCA
 from adaptune.model.rules import ERROR_FLOOR, complementary
 from adaptune.study.study import (
     MIN_RECORDINGS,

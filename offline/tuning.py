@@ -34,7 +34,7 @@ from adaptune.study.study import (
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 if TYPE_CHECKING:
-    from adaptune.model.descriptor import ScaledPCA
+    from adaptune.model.pca import ScaledPCA
 
 
 # Expected loss: one number by which all ways to adapt are compared with the fixed set.

@@ -125,7 +125,7 @@ def descriptor_chart(
     tests
         By name of a test sequence its descriptors, of shape (n, n_features) each.
     """
-    from adaptune.model.descriptor import ScaledPCA  # takes long to import
+    from adaptune.model.pca import ScaledPCA  # takes long to import
 
     names = list(model.blocks)
     begin = sum(model.blocks[other] for other in names[: names.index(name)])

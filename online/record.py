@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from adaptune.errors import AdaptuneError, in_one_line
+from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.odometry.tracker import RegisteredScan
+from adaptune.strict import in_one_line
 from adaptune.study.study import differences
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
 from online.replay import Choice, Replay

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin
 
 from adaptune import geometry
 from adaptune.errors import nearest
@@ -352,7 +351,7 @@ def write_mcap(path: Path, replays: RecordedReplays, clouds: Iterable[Cloud]) ->
         child = SENSOR if mode == replays.placing else f"{SENSOR}_{mode}"
         composer.add_mode(mode, recorded, child, replays.start)
     with replacing_folder(path) as new:
-        composer.messages.write(new, composer.topics, composer.ordered(), StoragePlugin.MCAP)
+        composer.messages.write(new, composer.topics, composer.ordered(), mcap=True)
 
 
 def topic(mode: str, kind: str, name: str) -> str:

@@ -18,7 +18,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from adaptune.errors import AdaptuneError, OdometryError, in_one_line, nearest
+from adaptune.errors import AdaptuneError, OdometryError, nearest
 from adaptune.geometry import Poses, invert
 from adaptune.model import ErrorModel
 from adaptune.odometry.base import LastMotion, Motions, OdometryInstance, Registration, Usage
@@ -30,6 +30,7 @@ from adaptune.recording.scan import Scan, Timing
 from adaptune.ros.link import RosLink, Steering
 from adaptune.selection import Selection
 from adaptune.selector import BACK, AnySelector, Selector
+from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, SteerConfig
 from adaptune.study.study import ModeError, Study
 from adaptune.trajectory import Trajectory, tum_lines

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from adaptune import files
-from adaptune.errors import ConfigurationError
 from adaptune.geometry import invert
 from adaptune.odometry.docker import rustle
 from adaptune.recording import SequenceError
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.opening import open_sequence
 from adaptune.simulation.record import Drive
+from adaptune.strict import ConfigurationError
 from adaptune.study.references import to_estimate
 from offline.config import OfflineStudy, load_study
 from online.statistics import ComparisonRow

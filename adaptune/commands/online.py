@@ -3,18 +3,13 @@
 import logging
 import os
 import shlex
-import time
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from adaptune.commands.terminal import (
     Folder,
@@ -29,9 +24,6 @@ from adaptune.commands.terminal import (
     say_next_online,
 )
 from adaptune.errors import AdaptuneError
-from adaptune.report.paper import plain
-from adaptune.selection import Selection
-from online.replay import Progressed
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
@@ -164,6 +156,7 @@ def _replay(
     loaded: "OfflineStudy", model: Path | None, again: bool, untrained: bool
 ) -> tuple[int, int]:
     """Make the replays that are missing; how many were made, and how many there are."""
+    from adaptune.commands.dashboard import Dashboard
     from adaptune.model import ErrorModel
     from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
     from online.run import run_replays, run_untrained
@@ -185,6 +178,7 @@ def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
+    from adaptune.commands.dashboard import Dashboard
     from adaptune.ros.ros1 import local_ros1
     from adaptune.ros.ros2 import Ros2
     from online.modes import UNTRAINED, WITHOUT_MODEL
@@ -390,119 +384,3 @@ def record(
         say(f"Next: {shlex.join(['rerun', str(suffixes['.rrd'])])}    # look at it")
     for missing in (f for f in RecordingFormat if f not in formats and not to):
         say(f"Not written: {missing}; `pip install 'adaptune[{missing}]'` adds it.")
-
-
-# What a replay, or a drive, does now: a dashboard for the terminal.
-
-
-NEWEST = 1000
-"""Scans, and selections, whose milliseconds are shown."""
-
-
-class _Line(NamedTuple):
-    name: str
-    words: str
-    style: str = ""
-
-
-class Dashboard:
-    """Shows what was told last; rich renders it as often as it likes."""
-
-    def __init__(self) -> None:
-        self._what = ""
-
-    def look(self, what: str, total: int, progressed: Progressed) -> None:
-        """Take note of a scan.
-
-        Parameters
-        ----------
-        what
-            What is replayed or driven; where it changes, all begins anew.
-        total
-            How many scans there are; 0 if nobody knows.
-        progressed
-            How far it is.
-        """
-        now = time.perf_counter()
-        if what != self._what:
-            self._what, self._begun = what, now
-            self._first = progressed.step.stamp
-            self._scan_ms: deque[float] = deque(maxlen=NEWEST)
-            self._selection_ms: deque[float] = deque(maxlen=NEWEST)
-            self._restarts = self._n_choices = self._rejected = 0
-            self._choice = None
-        step, choice = progressed.step, progressed.choice
-        self._now, self._total, self._progressed = now, total, progressed
-        self._scan_ms.append(1e3 * (step.prepare_seconds + step.register_seconds))
-        self._restarts += step.unhealthy is not None
-        if choice is not None and choice is not self._choice:
-            self._n_choices += 1
-            self._rejected += bool(choice.why_not)
-            self._selection_ms.append(1e3 * choice.seconds)
-        self._choice = choice
-
-    def __rich__(self) -> Table:
-        table = Table.grid(padding=(0, 2))
-        table.add_column(style="bold")
-        table.add_column()
-        for name, words, style in self._lines() if self._what else ():
-            table.add_row(Text(name), Text(words, style))
-        return table
-
-    def _lines(self) -> Iterator[_Line]:
-        at, real_time = self._progressed, self._progressed.real_time
-        driven = (at.step.stamp - self._first) * 1e-9
-        speed = driven / max(self._now - self._begun, 1e-9)
-        yield _Line(self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded")
-        of = f" of {self._total}" if self._total else ""
-        restarts = f", restarted {self._restarts} times" if self._restarts else ""
-        yield _Line("scans", f"{at.done}{of}{restarts}; {_in_ms(self._scan_ms)} a scan")
-        if real_time is not None:
-            late = 1e3 * np.array(list(real_time.late)[-NEWEST:])
-            words = f"pose {_in_ms(late)} after the scan; scans dropped: {real_time.dropped}"
-            if real_time.missed:
-                words += f", selections missed: {real_time.missed}"
-            is_late = real_time.dropped + real_time.missed > 0
-            yield _Line("latency", words, "yellow" if is_late else "")
-        if self._choice is None:
-            return
-        rejected = f", {self._rejected} not applied" if self._rejected else ""
-        yield _Line("selections", f"{self._n_choices}{rejected}; {_in_ms(self._selection_ms)}")
-        yield from _chosen(self._choice.selection)
-        if why := self._choice.why_not or self._choice.fallen_back:
-            yield _Line("warning", why, "yellow")
-
-
-def _chosen(selection: Selection) -> Iterator[_Line]:
-    """Of a selection: the set or weights, what is predicted, and what was measured."""
-    if selection.weights is None:
-        values = ", ".join(
-            f"{name} {_short(value)}" for name, value in selection.parameters.items()
-        )
-        yield _Line("chosen", f"trial {selection.trial}: {values}")
-    else:
-        yield _Line("weights", _weights(selection.weights))
-    if np.isfinite(selection.predicted_error):
-        fixed = f"{selection.predicted_fixed:.3f} %"
-        yield _Line("predicted", f"{selection.predicted_error:.3f} %, of the fixed set {fixed}")
-    if np.isfinite(selection.estimated_error):
-        low, high = selection.estimated_low, selection.estimated_high
-        words = f"{selection.estimated_error:.3f} % ({low:.3f}-{high:.3f} %)"
-        yield _Line("measured", words)
-    if selection.lost:
-        yield _Line("lost", "do not rely on the pose", "bold red")
-
-
-def _weights(weights: Mapping[int, float]) -> str:
-    heaviest = sorted(weights.items(), key=lambda pair: -pair[1])
-    return ", ".join(f"trial {trial} {100.0 * weight:.0f} %" for trial, weight in heaviest)
-
-
-def _short(value: object) -> str:
-    return plain(value) if isinstance(value, int | float) else str(value)
-
-
-def _in_ms(values: Iterable[float]) -> str:
-    """Median and 99th percentile."""
-    half, most = np.percentile(list(values) or [0.0], (50, 99))
-    return f"{half:.1f} ms (99 %: {most:.1f})"

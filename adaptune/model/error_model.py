@@ -19,7 +19,7 @@ from safetensors.numpy import save_file
 
 from adaptune import __version__
 from adaptune.archive import compact
-from adaptune.errors import AdaptuneError, in_one_line
+from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.metrics import cap
 from adaptune.model.descriptor import DESCRIPTORS
@@ -40,9 +40,10 @@ from adaptune.space import (
     label,
     load_space,
 )
+from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
-    from adaptune.model.descriptor import ScaledPCA
+    from adaptune.model.pca import ScaledPCA
 
 
 # Files of error models: arrays and text in the safetensors format, which runs no code on load.
@@ -280,7 +281,7 @@ class ErrorModel:
 
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
-        from adaptune.model.descriptor import ScaledPCA  # not needed to load a model
+        from adaptune.model.pca import ScaledPCA  # not needed to load a model
 
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
 

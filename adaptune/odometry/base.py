@@ -8,11 +8,12 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field
 
-from adaptune.errors import OdometryError, StrictModel, nearest
+from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses, invert
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.strict import StrictModel
 
 MIN_POINTS = 20
 """An adapter does not register scans with fewer points in range."""

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes
-from adaptune.errors import AdaptuneError, Mistake, OdometryError, in_a_line, validated
+from adaptune.errors import AdaptuneError, OdometryError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.model.descriptor import DESCRIPTORS
 from adaptune.model.descriptor import ENTRY_POINTS as DESCRIPTOR_ENTRY_POINTS
@@ -49,6 +49,7 @@ from adaptune.recording.cache import fingerprint
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+from adaptune.strict import Mistake, validated
 
 # A class of the user in this process: where it goes wrong, this is a fault and nothing else.
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from adaptune import plugins
-from adaptune.errors import OdometryError, in_one_line
+from adaptune.errors import OdometryError
 from adaptune.odometry.base import Description, Odometry
 from adaptune.odometry.wire import Served
 from adaptune.space import ParameterSet
+from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
     from adaptune.odometry.docker.rustle import Rustle

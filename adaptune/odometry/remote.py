@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_validator
 
 from adaptune import processes
-from adaptune.errors import OdometryError, StrictModel, UnavailableError
+from adaptune.errors import OdometryError, UnavailableError
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
 from adaptune.odometry.base import (
@@ -32,6 +32,7 @@ from adaptune.processes import available, next_core
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.space import ParameterSet
+from adaptune.strict import StrictModel
 
 MOST_FAULTS = 10
 """An instance with so many faults does not start again: the rest of its sequence is lost."""

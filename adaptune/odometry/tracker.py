@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from adaptune.errors import StrictModel
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, scale
 from adaptune.odometry.base import OdometryInstance
 from adaptune.recording.scan import Scan
+from adaptune.strict import StrictModel
 
 # A check of an odometry's poses that needs no reference.
 

@@ -39,12 +39,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from adaptune.errors import AdaptuneError, in_one_line, nearest
+from adaptune.errors import AdaptuneError, nearest
 from adaptune.geometry import Poses
 from adaptune.odometry import Description, OdometryError, Registration
 from adaptune.processes import Message, Readable, Writable, receive, send
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.strict import in_one_line
 
 VERSION = 2
 _HOLDS = {

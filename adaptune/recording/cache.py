@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 _NOT_KEPT = "%s: not kept in the cache (%s)"
 
 SMALL = 1 << 24
-"""Bytes below which the content of a file counts, all of it."""
+"""Bytes below which all of a file's content counts, and is read every time."""
 _VERSION = 5
 _SAMPLE = 1 << 16
 _CAP_GB, _MOST_GB = 50.0, 1e9
@@ -328,8 +328,6 @@ def _size(path: Path) -> int:
 # of change. Small files are read every time.
 
 
-SMALL_FILE = SMALL
-"""Bytes below which files are read every time, one or several together."""
 FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
 MANY = 64
@@ -379,7 +377,7 @@ def alongside(files: Sequence[Path]) -> Iterator[None]:
     """
     unknown = False
     with suppress(OSError):
-        unknown = _total(files) >= SMALL_FILE and not _known(files)
+        unknown = _total(files) >= SMALL and not _known(files)
     if not unknown:
         yield
         return
@@ -406,7 +404,7 @@ def _fingerprints(files: Sequence[Path], stop: threading.Event, tell: bool = Fal
         return []
     file = files[0]
     try:
-        remember, keys = _total(files) >= SMALL_FILE, [status_key(file) for file in files]
+        remember, keys = _total(files) >= SMALL, [status_key(file) for file in files]
         known = remember and _known(files)
         if tell and remember and not known and (size := _total(files)) > _LONG:
             _log.info("%s: reading %.1f GB to know it by its content", file, size / 1e9)

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Nodetype
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError, nearest
@@ -447,6 +446,8 @@ def _point_dtype(point: _Fields, cdr: bool, order: str) -> tuple[np.dtype[Any], 
 
 def _extent(description: Any) -> tuple[int, int]:
     """Bytes of an element and number of elements of a field of fixed size."""
+    from rosbags.interfaces import Nodetype  # rosbags takes long to import
+
     if description[0] == Nodetype.ARRAY:
         inner, number = description[1]
         return _extent(inner)[0], number

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -15,11 +16,11 @@ from pydantic import (
 )
 
 from adaptune import geometry
-from adaptune.errors import AdaptuneError, StrictModel
+from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
 from adaptune.geometry import Poses
-from adaptune.recording.bag import bag_paths
-from adaptune.recording.scan import USUAL, Part, Unit
+from adaptune.recording.scan import USUAL, Part, SequenceError, Unit
+from adaptune.strict import StrictModel
 
 MOST_VIEWS = 16
 """Views of one sequence, and views to train on; each costs time with every scan."""
@@ -70,6 +71,49 @@ def _resolve_bags(given: Any, info: ValidationInfo) -> Any:
 
 def _resolve_file(reference: str, info: ValidationInfo) -> str:
     return resolve(reference, info) if reference.endswith(REFERENCE_FILES) else reference
+
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+
+
+def bag_paths(given: Sequence[str]) -> list[Path]:
+    """Bags to open for the paths, folders and patterns that a user gives.
+
+    A SequenceError names what does not exist or holds no bag.
+    """
+    paths: list[Path] = []
+    for text in given:
+        path = Path(text)
+        if path.is_dir():
+            paths += _in_folder(path)
+        elif path.exists():
+            if path.suffix not in BAG_SUFFIXES:
+                bags = "bags are .bag, .mcap and .db3 files and ROS 2 folders"
+                raise SequenceError(f"{path}: not a bag; {bags}")
+            paths.append(path)
+        elif found := sorted(path.parent.glob(path.name)):
+            paths += bag_paths([str(match) for match in found])
+        else:
+            raise SequenceError(f"{path}: there is no such bag")
+    if len({path.suffix == ".bag" for path in paths}) > 1:
+        raise SequenceError(f"{paths[0]} and {paths[-1]} are of ROS 1 and ROS 2: they do not mix")
+    return paths
+
+
+def files_of(paths: Sequence[Path]) -> list[Path]:
+    """The files of bags, of which some may be folders."""
+    found = [sorted(path.iterdir()) if path.is_dir() else [path] for path in paths]
+    return [file for files in found for file in files if file.is_file()]
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    if (folder / "metadata.yaml").exists():
+        return [folder]
+    # A recorder that was killed leaves its files without the metadata.
+    for suffix in (".mcap", ".db3", ".bag"):
+        if found := sorted(folder.glob(f"*{suffix}")):
+            return found
+    raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
 
 
 _Numbers = tuple[float, ...]

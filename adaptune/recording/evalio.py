@@ -12,7 +12,8 @@ import numpy as np
 
 from adaptune import geometry
 from adaptune.geometry import Poses
-from adaptune.recording.bag import BagSource, bag_paths
+from adaptune.recording.bag import BagSource
+from adaptune.recording.config import bag_paths
 from adaptune.recording.recording import Frame, Source
 from adaptune.recording.scan import Imu, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory

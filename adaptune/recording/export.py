@@ -8,10 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
 
 from adaptune import geometry
 from adaptune.files import write_text
@@ -40,6 +36,8 @@ class Messages:
     """Makes messages of a version of ROS."""
 
     def __init__(self, version: Literal[1, 2]) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
         self.version = version
         self.typestore = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
         self.types = self.typestore.types
@@ -95,7 +93,7 @@ class Messages:
         path: Path,
         types: Mapping[str, str],
         messages: Iterable[Message],
-        storage: StoragePlugin = StoragePlugin.SQLITE3,
+        mcap: bool = False,
     ) -> None:
         """Write a bag where nothing is yet: a file of ROS 1, or a folder of ROS 2.
 
@@ -107,12 +105,15 @@ class Messages:
             Of the messages on each topic.
         messages
             In the order in which they are sent.
-        storage
-            Format of a ROS 2 bag's files.
+        mcap
+            Whether the files of a ROS 2 bag are MCAP, and not SQLite.
         """
-        store, writer = self.typestore, Writer1(path) if self.version == 1 else None
+        from rosbags import rosbag1, rosbag2
+
+        store, writer = self.typestore, rosbag1.Writer(path) if self.version == 1 else None
+        storage = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
         serialize = store.serialize_cdr if writer is None else store.serialize_ros1
-        with writer or Writer2(path, version=9, storage_plugin=storage) as bag:
+        with writer or rosbag2.Writer(path, version=9, storage_plugin=storage) as bag:
             topics: dict[str, Any] = {
                 topic: bag.add_connection(topic, kind, typestore=store)
                 for topic, kind in types.items()

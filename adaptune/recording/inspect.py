@@ -18,9 +18,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
 from adaptune.recording import survey as faults
-from adaptune.recording.bag import SUFFIXES as BAG_SUFFIXES
 from adaptune.recording.clouds import DATATYPES, RING_FIELDS
-from adaptune.recording.config import REFERENCE_FILES
+from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES
 from adaptune.recording.opening import open_sequence
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import TIME_FIELDS

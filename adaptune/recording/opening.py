@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adaptune.recording import cache, views
-from adaptune.recording.bag import IMU_TYPES, BagSource, bag_paths, files_of
 from adaptune.recording.config import (
     ESTIMATED,
     NO_REFERENCE,
     REFERENCE_FILES,
     ImuConfig,
     SequenceConfig,
+    bag_paths,
+    files_of,
     to_pose,
 )
 from adaptune.recording.folder import kitti, scan_folder
@@ -145,6 +146,8 @@ def interval_of(config: SequenceConfig) -> tuple[float, float]:
 
 
 def _recorded(config: SequenceConfig) -> RecordedSequence:
+    from adaptune.recording.bag import IMU_TYPES, BagSource  # rosbags takes long to import
+
     given = config.reference not in (ESTIMATED, NO_REFERENCE)
     reference: str | Path | None = config.reference if given else None
     if isinstance(reference, str) and reference.endswith(REFERENCE_FILES):
@@ -169,6 +172,8 @@ def _recorded(config: SequenceConfig) -> RecordedSequence:
 
 def _source(config: SequenceConfig) -> tuple[Source, str | None]:
     """What reads the recording, and under which key its decoded scans are kept."""
+    from adaptune.recording.bag import BagSource  # rosbags takes long to import
+
     timing = Timing(config.stamp, config.time_unit, config.period)
     if config.kitti is not None:
         return kitti(Path(config.kitti), config.elevation), None

@@ -14,8 +14,9 @@ from rosbags.interfaces import Connection
 
 from adaptune import geometry
 from adaptune.recording import Scan, SequenceError
-from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader, bag_paths
+from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
 from adaptune.recording.clouds import PATH, POSES, Pose, header_stamp, usable
+from adaptune.recording.config import bag_paths
 from adaptune.trajectory import Trajectory
 
 # What is wrong with a recording: what it means, and what to do about it.

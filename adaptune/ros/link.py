@@ -2,13 +2,15 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from rosbags.typesys.store import Typestore
 
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.space import ParameterSet
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 
 class LinkError(AdaptuneError):
@@ -27,7 +29,7 @@ class RosLink(Protocol):
         The types of all messages.
     """
 
-    store: Typestore
+    store: "Typestore"
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Have every message of a topic taken, one after the other, in a thread of its own."""

@@ -8,12 +8,13 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from adaptune import geometry
-from adaptune.errors import AdaptuneError, StrictModel
+from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.scan import ImuNoise, Part
 from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.sensors import MOTIONS, SENSORS, WEATHERS
+from adaptune.strict import StrictModel
 
 LONGEST = 20_000.0
 """Metres; a longer course is most likely a mistake."""

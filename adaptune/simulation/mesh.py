@@ -3,57 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Fractal noise: the same value at the same place in every tile.
-
-
 Points = NDArray[np.float64]
-
-
-@numba.njit(cache=True)
-def _corner(i: int, j: int, k: int, seed: int) -> float:
-    """Give a lattice point its value in -1..1, by an integer hash."""
-    h = np.uint32(i) * np.uint32(0x9E3779B1) ^ np.uint32(j) * np.uint32(0x85EBCA77)
-    h ^= np.uint32(k) * np.uint32(0xC2B2AE3D) ^ np.uint32(seed) * np.uint32(0x27D4EB2F)
-    h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
-    h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
-    h = np.uint32(h ^ (h >> np.uint32(15)))
-    return h / 2147483647.5 - 1.0
-
-
-@numba.njit(cache=True)
-def _value(x: float, y: float, z: float, seed: int) -> float:
-    """Interpolate the lattice, with a quintic fade so that slopes are continuous."""
-    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    u, v, w = x - i, y - j, z - k
-    u = u * u * u * (u * (6.0 * u - 15.0) + 10.0)
-    v = v * v * v * (v * (6.0 * v - 15.0) + 10.0)
-    w = w * w * w * (w * (6.0 * w - 15.0) + 10.0)
-    total = 0.0
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
-                total += weight * _corner(i + a, j + b, k + c, seed)
-    return total
-
-
-@numba.njit(cache=True)
-def _fractal(points: Points, wavelength: float, octaves: int, seed: int) -> NDArray[np.float64]:
-    values = np.zeros(len(points))
-    for n in range(len(points)):
-        scale, weight = 1.0 / wavelength, 1.0
-        for octave in range(octaves):
-            values[n] += weight * _value(
-                points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale, seed + octave
-            )
-            scale *= 2.0
-            weight *= 0.5
-    return values
 
 
 def fractal(points: Points, wavelength: float, seed: int, octaves: int = 1) -> NDArray[np.float64]:
@@ -62,8 +17,10 @@ def fractal(points: Points, wavelength: float, seed: int, octaves: int = 1) -> N
     The first octave has its values in -1..1, and `wavelength` metres between lattice points.
     `points` in metres are of shape (n, 3), the noise of shape (n,).
     """
+    from adaptune.simulation import kernels  # compiled, which takes long to import
+
     points = np.ascontiguousarray(points, np.float64)
-    return np.asarray(_fractal(points, float(wavelength), octaves, seed & 0x7FFFFFFF))
+    return np.asarray(kernels.fractal(points, float(wavelength), octaves, seed & 0x7FFFFFFF))
 
 
 def fractal_plane(
@@ -230,3 +187,109 @@ def foliage(centres: NDArray[np.float64], radii: ArrayLike, leaf: float, seed: i
     corners = rng.normal(size=(n, 3, 3)) * (0.6 * leaf)
     vertices = (centres + offset * np.asarray(radii))[:, None] + corners
     return mesh(vertices.reshape(-1, 3), np.arange(3 * n), Material.LEAVES)
+
+
+# Objects of several scenes, each with its origin on the ground.
+
+
+VARIANTS = 4
+"""How many different trees, bushes and boulders there are."""
+
+
+@cache
+def tree(variant: int) -> Mesh:
+    """Broad-leaved tree of some 8 m, with a trunk free of leaves below 2.2 m."""
+    rng = np.random.default_rng([17, variant])
+    bend = rng.normal(0.0, 0.12, (4, 2)).cumsum(axis=0)
+    heights = np.array([-0.3, 0.6, 2.2, 4.0, 6.5])
+    radii = np.array([0.26, 0.19, 0.16, 0.12, 0.02])
+    spine = np.concatenate([np.zeros((1, 2)), bend])
+    parts = [tube(np.column_stack([spine, heights, radii]), Material.BARK, 8)]
+    tips = []
+    for angle in rng.uniform(0.0, 2.0 * np.pi, 6):
+        foot = np.array([*spine[2], rng.uniform(2.2, 3.6)])
+        tip = foot + rng.uniform(1.2, 2.2) * np.array([np.cos(angle), np.sin(angle), 0.7])
+        parts.append(tube([[*foot, 0.07], [*tip, 0.02]], Material.BARK, 5))
+        tips.append(tip)
+    clumps = np.array([*tips, [*spine[4], 5.8], [*spine[3], 4.6]])
+    centres = clumps[rng.integers(len(clumps), size=280)]
+    parts.append(foliage(centres, (1.2, 1.2, 0.9), 0.28, variant))
+    return merge(parts)
+
+
+@cache
+def bush(variant: int) -> Mesh:
+    """Bush of a metre's height: leaves about a denser heart."""
+    heart = blob(Material.LEAVES, 100 + variant, 0.4, 7)
+    centres = np.tile([[0.0, 0.0, 0.45]], (70, 1))
+    return merge([place(heart, (0, 0, 0), 0.0, 0.45), foliage(centres, 0.6, 0.2, variant)])
+
+
+@cache
+def boulder(variant: int) -> Mesh:
+    """Boulder of a metre's radius."""
+    return blob(Material.ROCK, variant, 0.5, 10)
+
+
+def _extrude(profile: ArrayLike, width: float, material: Material) -> Mesh:
+    """Make a body with a convex profile in x and z, `width` metres wide along y."""
+    outline = np.asarray(profile, np.float64)
+    n = len(outline)
+    x, z = outline.T
+    sides = [np.column_stack([x, np.full(n, y), z]) for y in (-width / 2.0, width / 2.0)]
+    closed = np.stack([np.vstack([side, side[:1]]) for side in sides])
+    fan = np.array([[0, i, i + 1] for i in range(1, n - 1)])
+    return merge([grid(closed, material), *(mesh(side, fan, material) for side in sides)])
+
+
+@cache
+def car() -> Mesh:
+    """Car of 4.3 m, heading along x."""
+    rear, front = [(-2.0, 0.92), (-2.15, 0.7)], [(2.15, 0.62), (1.95, 0.75), (1.0, 0.86)]
+    body = _extrude([(-2.1, 0.3), (2.15, 0.3), *front, *rear], 1.76, Material.METAL)
+    windows = [(-1.9, 0.9), (1.0, 0.85), (0.3, 1.42), (-0.3, 1.48), (-1.3, 1.42)]
+    cabin = _extrude(windows, 1.5, Material.GLASS)
+    roof = box((1.5, 1.5, 0.04), Material.METAL, (-0.5, 0.0, 1.45))
+    turn = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    rim = np.column_stack([0.31 * np.cos(turn), 0.31 + 0.31 * np.sin(turn)])
+    wheels = [[x, y, 0.0] for x in (-1.3, 1.35) for y in (-0.78, 0.78)]
+    return merge([body, cabin, roof, place(_extrude(rim, 0.2, Material.METAL), wheels)])
+
+
+@cache
+def walker() -> Mesh:
+    """Person of 1.75 m in mid-step."""
+    torso = [[0.0, 0.0, 0.85, 0.16], [0.0, 0.0, 1.1, 0.17]]
+    limbs = [
+        [[-0.25, 0.1, 0.0, 0.06], [-0.05, 0.1, 0.5, 0.07], [0.0, 0.08, 0.9, 0.1]],
+        [[0.3, -0.1, 0.0, 0.06], [0.15, -0.1, 0.5, 0.07], [0.0, -0.08, 0.9, 0.1]],
+        [*torso, [0.02, 0.0, 1.42, 0.19], [0.02, 0.0, 1.5, 0.06]],
+        [[0.03, 0.0, 1.48, 0.06], [0.04, 0.0, 1.62, 0.1], [0.04, 0.0, 1.75, 0.03]],
+        [[0.2, 0.26, 0.85, 0.04], [0.02, 0.24, 1.4, 0.05]],
+        [[-0.2, -0.26, 0.85, 0.04], [0.02, -0.24, 1.4, 0.05]],
+    ]
+    return merge([tube(limb, Material.CLOTH, 8) for limb in limbs])
+
+
+@cache
+def lamp() -> Mesh:
+    """Street lamp of 6 m whose arm reaches out along y."""
+    pole = tube([[0, 0, -0.2, 0.11], [0, 0, 1.0, 0.09], [0, 0, 6.0, 0.06]], Material.METAL, 8)
+    arm = box((0.08, 1.4, 0.06), Material.METAL, (0.0, 0.7, 5.9))
+    return merge([pole, arm, box((0.2, 0.6, 0.1), Material.METAL, (0.0, 1.3, 5.85))])
+
+
+@cache
+def sign() -> Mesh:
+    """Road sign at 2.2 m, facing along x."""
+    pole = tube([[0, 0, -0.2, 0.04], [0, 0, 2.7, 0.04]], Material.METAL, 6)
+    return merge([pole, box((0.03, 0.6, 0.6), Material.METAL, (0.05, 0.0, 2.1))])
+
+
+@cache
+def bench() -> Mesh:
+    """Bench of 1.8 m along x, facing -y."""
+    seat = box((1.8, 0.45, 0.06), Material.WOOD, (0.0, 0.0, 0.42))
+    back = box((1.8, 0.06, 0.4), Material.WOOD, (0.0, 0.22, 0.5))
+    feet = [box((0.1, 0.45, 0.45), Material.METAL, (x, 0.0, 0.0)) for x in (-0.75, 0.75)]
+    return merge([seat, back, *feet])

@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin
 
 from adaptune import files, geometry
 from adaptune.files import replacing, replacing_folder
@@ -25,7 +24,7 @@ from adaptune.recording.export import (
 )
 from adaptune.recording.scan import Scan
 from adaptune.report.paper import as_png_and_svg, colour_map, picture, plain
-from adaptune.simulation import world as kernels
+from adaptune.simulation import kernels
 from adaptune.simulation.course import (
     IMU,
     NOISE,
@@ -392,16 +391,16 @@ def _write_bag(
     scans: Iterator[SimulatedScan],
     path: Path,
     version: Literal[1, 2],
-    storage: StoragePlugin = StoragePlugin.SQLITE3,
+    mcap: bool = False,
 ) -> None:
     composer = _Composer(drive, version)
-    composer.write(path, composer.topics, composer.messages(scans), storage)
+    composer.write(path, composer.topics, composer.messages(scans), mcap)
 
 
 def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
     with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
         folder = Path(name) / "bag"
-        _write_bag(drive, scans, folder, 2, StoragePlugin.MCAP)
+        _write_bag(drive, scans, folder, 2, mcap=True)
         (file,) = folder.glob("*.mcap")
         file.replace(path)
 

@@ -2,17 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
 from adaptune.geometry import Poses
-from adaptune.simulation import scenes
-from adaptune.simulation.mesh import Mesh, grid, merge
+from adaptune.simulation.mesh import Mesh, car, grid, merge, walker
 from adaptune.simulation.scenes import TILE, Scene, Spots, Tile
 from adaptune.simulation.sensors import Motion
 
@@ -242,7 +239,7 @@ RADIUS = {"car": 2.7, "walker": 1.9}
 
 def model(kind: str) -> Mesh:
     """Shape of a kind of mover, with its origin on the ground and x ahead."""
-    return scenes.car() if kind == "car" else scenes.walker()
+    return car() if kind == "car" else walker()
 
 
 @dataclass(frozen=True)
@@ -282,151 +279,6 @@ def populate(road: Road) -> list[Mover]:
                 aside, phase = offset + rng.uniform(-0.3, 0.3), rng.uniform(0.0, 2.0 * np.pi)
                 movers.append(Mover(kind, float(middle), swing, aside, speed / swing, phase))
     return movers
-
-
-# From rays to echoes: compiled loops over all rays of a scan.
-
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-
-
-class Cast(NamedTuple):
-    """Rays, and what they hit."""
-
-    rays: F32  # origins and directions, of shape (n, 6)
-    hits: F32  # metres to what each ray hit, infinite where nothing, of shape (n,)
-    normals: F32  # of shape (n, 3)
-    reflectivity: F32  # of shape (n,)
-
-
-class Receiver(NamedTuple):
-    """A sensor's range in metres, its standard deviation, and the share of echoes lost."""
-
-    nearest: float
-    farthest: float
-    noise: float
-    dropout: float
-
-
-@numba.njit(cache=True)
-def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
-    """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
-
-    Directions are unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3); poses are
-    one for each column. Near `origin`, that of the rays' coordinates, single precision is exact
-    enough.
-    """
-    columns, rings = directions.shape[:2]
-    rays = np.empty((columns * rings, 6), np.float32)
-    n = 0
-    for c in range(columns):
-        T = T_world_sensor[c]
-        x, y, z = T[0, 3] - origin[0], T[1, 3] - origin[1], T[2, 3] - origin[2]
-        for r in range(rings):
-            u, v, w = directions[c, r]
-            rays[n, 0], rays[n, 1], rays[n, 2] = x, y, z
-            for i in range(3):
-                rays[n, 3 + i] = T[i, 0] * u + T[i, 1] * v + T[i, 2] * w
-            n += 1
-    return rays
-
-
-@numba.njit(cache=True)
-def towards(
-    rays: F32, rings: int, centres: F64, yaw: F64, radius: float
-) -> tuple[NDArray[np.int64], F32]:
-    """Pick the rays that pass a moving object: their indices, and the rays in the object's frame.
-
-    Parameters
-    ----------
-    rays, rings
-        Of shape (n_columns * n_rings, 6), and how many there are in a column.
-    centres, yaw
-        The object's origin (n_columns, 3) and heading in radians (n_columns,) at each column.
-    radius
-        Metres around its origin within which all of it lies.
-    """
-    picked = np.empty(len(rays), np.int64)
-    local = np.empty((len(rays), 6), np.float32)
-    m = 0
-    for n in range(len(rays)):
-        c = n // rings
-        x, y = rays[n, 0] - centres[c, 0], rays[n, 1] - centres[c, 1]
-        z = rays[n, 2] - centres[c, 2]
-        u, v, w = rays[n, 3], rays[n, 4], rays[n, 5]
-        along = -(x * u + y * v + z * w)
-        if along < -radius or x * x + y * y + z * z - along * along > radius * radius:
-            continue
-        cos, sin = np.cos(yaw[c]), np.sin(yaw[c])
-        picked[m] = n
-        local[m, 0], local[m, 1], local[m, 2] = cos * x + sin * y, cos * y - sin * x, z
-        local[m, 3], local[m, 4], local[m, 5] = cos * u + sin * v, cos * v - sin * u, w
-        m += 1
-    return picked[:m], local[:m]
-
-
-@numba.njit(cache=True)
-def receive(
-    directions: F32,
-    cast: Cast,
-    sensor: Receiver,
-    air: tuple[float, float, float],
-    chance: F32,
-    normal: F32,
-) -> tuple[F32, F32, NDArray[np.int64]]:
-    """Decide which rays come back, and with what range and intensity.
-
-    Parameters
-    ----------
-    directions
-        Unit vectors in the sensor's frame, of shape (n, 3).
-    cast, sensor
-        The rays with their hits, and the receiver.
-    air
-        Extinction, backscatter and its reach: see `adaptune.simulation.sensors.Weather`.
-    chance, normal
-        Uniform random numbers of shape (2, n), and normal ones of shape (n,).
-
-    Returns
-    -------
-    points : ndarray of shape (m, 3)
-        In the sensor's frame at the time of each ray.
-    intensities : ndarray of shape (m,)
-        From 0 to 255.
-    kept : ndarray of shape (m,)
-        Which rays came back.
-    """
-    rays, hits, normals, reflectivity = cast
-    nearest, farthest, noise, dropout = sensor
-    n = len(rays)
-    points, intensities = np.empty((n, 3), np.float32), np.empty(n, np.float32)
-    kept = np.empty(n, np.int64)
-    extinction, backscatter, air_reach = air
-    m = 0
-    for i in range(n):
-        distance, power = float(hits[i]), 0.0
-        if backscatter > 0.0:
-            echo = -np.log(1.0 - chance[1, i]) / backscatter
-            if echo < min(distance, air_reach):
-                distance, power = echo, 0.01
-        if not nearest <= distance <= farthest or chance[0, i] < dropout:
-            continue
-        if power == 0.0:
-            cosine = abs(
-                normals[i, 0] * rays[i, 3] + normals[i, 1] * rays[i, 4] + normals[i, 2] * rays[i, 5]
-            )
-            power = reflectivity[i] * cosine * np.exp(-2.0 * extinction * distance)
-            # The echo weakens with the square of the distance; a tenth is seen to the full range.
-            if distance * distance > farthest * farthest * power * 10.0:
-                continue
-        distance += noise * normal[i]
-        for j in range(3):
-            points[m, j] = distance * directions[i, j]
-        intensities[m] = np.rint(255.0 * min(power, 1.0))
-        kept[m] = i
-        m += 1
-    return points[:m], intensities[:m], kept[:m]
 
 
 # The sensor's true trajectory in continuous time.

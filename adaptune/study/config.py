@@ -15,13 +15,14 @@ from pydantic import (
     model_validator,
 )
 
-from adaptune.errors import Key, Mistake, StrictModel, nearest
+from adaptune.errors import nearest
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
 from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
+from adaptune.strict import Key, Mistake, StrictModel
 
 
 def _file_name(name: str) -> str:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from adaptune import __version__
 from adaptune.archive import Archive
-from adaptune.errors import ConfigurationError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
 from adaptune.odometry.factory import descriptor_content
 from adaptune.recording.cache import MANY, status_key
+from adaptune.strict import ConfigurationError
 from adaptune.study.study import Study, differences
 
 FILE = "inputs.json"

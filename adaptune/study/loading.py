@@ -7,17 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar
 
 from adaptune import files
-from adaptune.errors import (
-    AdaptuneError,
-    ConfigurationError,
-    Key,
-    Mistake,
-    NotInstalledError,
-    OdometryError,
-    nearest,
-    validated,
-    validated_rest,
-)
+from adaptune.errors import AdaptuneError, NotInstalledError, OdometryError, nearest
 from adaptune.files import write_text
 from adaptune.odometry.base import Description
 from adaptune.odometry.factory import declare
@@ -35,6 +25,7 @@ from adaptune.space import (
     PooledSpace,
     describe,
 )
+from adaptune.strict import ConfigurationError, Key, Mistake, validated, validated_rest
 from adaptune.study.config import OdometryConfig, StudyConfig, role_name, settle_roles
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 

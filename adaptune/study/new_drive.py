@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adaptune import files
-from adaptune.errors import AdaptuneError, Mistake, nearest, validated
+from adaptune.errors import AdaptuneError, nearest
 from adaptune.files import expand_user
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import ESTIMATED, REFERENCE_FILES, SequenceConfig
 from adaptune.recording.inspect import inspect
 from adaptune.recording.opening import sequence_files
+from adaptune.strict import Mistake, validated
 from adaptune.study.config import role_name
 from adaptune.study.inputs import trained_recording
 from adaptune.study.loading import LearnedDrives, share_scans

@@ -13,16 +13,9 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from adaptune import files
-from adaptune.errors import (
-    AdaptuneError,
-    Key,
-    Mistake,
-    OdometryError,
-    StrictModel,
-    nearest,
-    validated,
-)
+from adaptune.errors import AdaptuneError, OdometryError, nearest
 from adaptune.odometry.template import Template
+from adaptune.strict import Key, Mistake, StrictModel, validated
 
 Number = int | float
 Count = Annotated[int, Field(ge=0, le=10**9)]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adaptune.errors import ConfigurationError
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import REFERENCE_FILES, SequenceConfig, ViewConfig
@@ -16,6 +15,7 @@ from adaptune.recording.scan import OF_VIEW, Recording, origin, part_name
 from adaptune.recording.views import WithImu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
+from adaptune.strict import ConfigurationError
 
 _PATHS = ("bag", "kitti", "folder", "evalio")
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")

@@ -14,7 +14,7 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from adaptune import files
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
 from adaptune.odometry.base import Description, WarmUp
@@ -22,6 +22,7 @@ from adaptune.odometry.factory import Factory, OdometryFactory, OdometryPool, de
 from adaptune.processes import available
 from adaptune.recording.scan import OF_VIEW
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
+from adaptune.strict import ConfigurationError
 from adaptune.study.config import MOST_MEMBERS, OdometryConfig, StudyConfig, SwitchingConfig
 from adaptune.study.sequences import StudySequences
 

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from adaptune import plugins, processes
-from adaptune.errors import AdaptuneError, Mistake, StrictModel, nearest
+from adaptune.errors import AdaptuneError, nearest
 from adaptune.space import (
     Categorical,
     Float,
@@ -21,6 +21,7 @@ from adaptune.space import (
     Value,
     describe,
 )
+from adaptune.strict import Mistake, StrictModel
 
 OPTUNA = {
     "cmaes": "optuna.samplers:CmaEsSampler",

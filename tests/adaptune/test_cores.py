@@ -87,7 +87,7 @@ def test_a_process_that_is_killed_is_told():
 HOLES = """
 import contextlib, sys
 import numpy as np
-from adaptune import cores
+from adaptune import processes as cores
 before = cores.resident_megabytes()
 np.ones(2**21)  # once it is free, the C library keeps arrays of this size
 large, small = [], []

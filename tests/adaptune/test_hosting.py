@@ -10,13 +10,13 @@ from wicked import IMPORTS, gone
 
 from adaptune import processes as hosting
 from adaptune.commands.tools import show
-from adaptune.errors import ConfigurationError
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.remote import Limits
 from adaptune.selector import Selector
 from adaptune.space import Float, ParameterSpace
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.train import train
 from online.run import run_replays

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Archive, Frames, Trial
-from adaptune.errors import ConfigurationError
+from adaptune.strict import ConfigurationError
 from adaptune.study.inputs import InputNotes, check_inputs, resume, warn_of_stale
 from adaptune.trajectory import write_tum
 from offline.config import load_study

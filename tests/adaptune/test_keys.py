@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from adaptune.errors import Mistake, validated
+from adaptune.strict import Mistake, validated
 from adaptune.study.config import complete
 from offline.config import OfflineStudyConfig
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from adaptune.errors import ConfigurationError
+from adaptune.strict import ConfigurationError
 from adaptune.study.loading import LearnedDrives
 from offline.config import load_study
 

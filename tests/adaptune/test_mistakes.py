@@ -5,7 +5,7 @@ import re
 import fuzz
 import pytest
 
-from adaptune.errors import ConfigurationError
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tuple|dict|None")

@@ -6,10 +6,10 @@ import pytest
 from drives import STUDY
 from needs import needs_evalio
 
-from adaptune.errors import ConfigurationError
 from adaptune.odometry.factory import OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
 from adaptune.space import ODOMETRY
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 TWO = """

@@ -5,7 +5,7 @@ import shutil
 import drives
 import pytest
 
-from adaptune.errors import ConfigurationError
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import AnyUrl, BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
-from adaptune.errors import in_one_line, plain_words
+from adaptune.strict import in_one_line, plain_words
 
 
 class Colour(enum.Enum):

@@ -7,10 +7,10 @@ import estimates
 import numpy as np
 import pytest
 
-from adaptune.errors import ConfigurationError
 from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.opening import open_sequence, wants_estimate
 from adaptune.reference.stored import EstimateError
+from adaptune.strict import ConfigurationError
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_in_words
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study

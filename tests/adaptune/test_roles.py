@@ -1,7 +1,7 @@
 import pytest
 import yaml
 
-from adaptune.errors import ConfigurationError
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 COURSES = "courses.cave={scenes: [cave], length: 10, seed: 1}"

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from adaptune.live.evidence import LiveEvidence, OwnError
 from adaptune.live.hops import LiveSquares
 from adaptune.model import BankRule, BankSettings, ErrorModel, PairedSettings
-from adaptune.model.descriptor import describe, speed_and_turn_rate
+from adaptune.model.descriptor import speed_and_turn_rate
+from adaptune.model.ndt import describe
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan

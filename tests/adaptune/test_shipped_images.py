@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from adaptune import files
-from adaptune.errors import ConfigurationError
 from adaptune.odometry.docker import rustle
 from adaptune.odometry.template import Template
 from adaptune.space import ParameterSpace
+from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 from offline.samplers.samplers import AskedSampler
 

@@ -5,9 +5,9 @@ from typing import Annotated
 import pytest
 from pydantic import Field, ValidationError
 
-from adaptune.errors import StrictModel, plain_words
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.space import Value
+from adaptune.strict import StrictModel, plain_words
 from offline.config import OfflineStudyConfig
 from offline.samplers.settings import SETTINGS
 

@@ -4,7 +4,8 @@ import sys
 import pytest
 from needs import needs_evalio
 
-from adaptune.errors import DELETED, RENAMED, ConfigurationError, import_extra
+from adaptune.errors import DELETED, RENAMED, import_extra
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 

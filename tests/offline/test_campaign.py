@@ -12,9 +12,10 @@ from kills import contents
 
 from adaptune import files
 from adaptune.archive import Archive
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import averaged
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.train import train
 from offline.workers import WorkerError, Workers

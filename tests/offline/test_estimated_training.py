@@ -8,10 +8,11 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.reference.stored import EstimateError
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.train import train
 from offline.validate import validate

@@ -13,10 +13,11 @@ from labelled_places import (
     with_motions,
 )
 
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import Rule
 from adaptune.selection import Selection
+from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import driven
 from offline import leave_one_out as leave_one_out_module

@@ -12,10 +12,11 @@ from pictures import texts
 from setups import made_of, setup_of
 
 from adaptune.archive import Archive, Frames, Summary
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.geometry import steps
 from adaptune.odometry import Registration
 from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 from offline.objective import (
     SEVERITY,

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.archive import Archive
-from adaptune.errors import ConfigurationError
 from adaptune.model import ErrorModel
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.search import estimate, rungs, survivors
 from offline.train import train

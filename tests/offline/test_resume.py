@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from adaptune.archive import Archive
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
+from adaptune.strict import ConfigurationError
 from adaptune.study.inputs import check_inputs
 from offline.config import load_study
 from offline.train import train

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from adaptune.archive import Archive, Summary
 from adaptune.commands.cli import app
-from adaptune.errors import ConfigurationError
 from adaptune.model import ErrorModel
 from adaptune.space import Categorical, ParameterSets, ParameterSpace
+from adaptune.strict import ConfigurationError
 from offline.campaign import run_batches
 from offline.config import OfflineConfig, load_study
 from offline.labelled import labelled_data

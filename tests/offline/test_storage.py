@@ -9,8 +9,8 @@ import postgres
 import pytest
 from optuna.storages.journal import JournalFileBackend
 
-from adaptune.errors import ConfigurationError
 from adaptune.space import Float, Integer, ParameterSpace, PooledSpace
+from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 from offline.storage import JOURNAL, MirrorRow, StorageError, open_mirror
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from pictures import texts
 
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.selection import Selection
+from adaptune.strict import ConfigurationError
 from adaptune.study.study import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study

@@ -1,7 +1,7 @@
 import numpy as np
 from rich.console import Console
 
-from adaptune.commands.online import Dashboard
+from adaptune.commands.dashboard import Dashboard
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.selection import Selection
 from online.replay import Choice, Progressed, RealTimeRecord

@@ -8,9 +8,9 @@ from click.testing import Result
 from commands import call
 
 from adaptune import files as yaml
-from adaptune.errors import ConfigurationError
 from adaptune.odometry.docker import rustle as docker_rustle
 from adaptune.space import ParameterSpace
+from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 
 PARAMETERS = """

@@ -15,8 +15,8 @@ from adaptune.model.descriptor import (
     averaged,
     descriptor,
     lowest_elevation,
-    ndt_histogram,
 )
+from adaptune.model.ndt import ndt_histogram
 from adaptune.recording import Scan
 
 EMPTY = Scan(0, np.empty((0, 3), np.float32))

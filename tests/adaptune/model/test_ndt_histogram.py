@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adaptune.model.descriptor import ndt_histogram
+from adaptune.model.ndt import ndt_histogram
 
 modest = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

@@ -6,7 +6,7 @@ from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 
-from adaptune.model.descriptor import ScaledPCA
+from adaptune.model.pca import ScaledPCA
 
 
 def counts(seed, n=60):

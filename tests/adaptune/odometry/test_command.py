@@ -13,8 +13,9 @@ import yaml
 from needs import lacking
 from setups import setup_of
 
-from adaptune.errors import AdaptuneError, ConfigurationError
+from adaptune.errors import AdaptuneError
 from adaptune.odometry.template import Template
+from adaptune.strict import ConfigurationError
 from offline.campaign import BaselineError
 from offline.config import load_study
 from offline.train import train

@@ -10,7 +10,6 @@ import pytest
 import server
 import turns
 
-from adaptune.errors import ConfigurationError
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
@@ -18,6 +17,7 @@ from adaptune.odometry.remote import MOST_FAULTS, Limits, Process, ProcessSettin
 from adaptune.odometry.serving import listen
 from adaptune.recording import Scan
 from adaptune.selection import Selection
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 LIMITS = Limits(seconds=20.0)

@@ -1,7 +1,7 @@
 import numpy as np
 
 from adaptune.geometry import from_quaternions
-from adaptune.simulation import world as kernels
+from adaptune.simulation import kernels
 
 AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)
 CLEAR = (0.0, 0.0, 0.0)

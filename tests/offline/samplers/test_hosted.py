@@ -6,8 +6,8 @@ import optuna
 import pytest
 
 from adaptune import processes
-from adaptune.errors import ConfigurationError
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 from offline.samplers import make_sampler
 from offline.samplers.samplers import AskedSampler, HostedSampler

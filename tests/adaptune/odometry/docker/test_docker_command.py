@@ -18,11 +18,11 @@ from contained import (
 from needs import reference_image
 from setups import setup_of
 
-from adaptune.errors import ConfigurationError
 from adaptune.odometry.docker.engine import Container, EngineError
 from adaptune.odometry.docker.programs import DockerCommand, DockerCommandSettings
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template
+from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 PLAIN = ("odometry-plain", "{points}")

@@ -1,0 +1,191 @@
+"""Compiled loops: noise over all points of a tile, and from rays to echoes over all of a scan."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@numba.njit(cache=True)
+def _corner(i: int, j: int, k: int, seed: int) -> float:
+    """Give a lattice point its value in -1..1, by an integer hash."""
+    h = np.uint32(i) * np.uint32(0x9E3779B1) ^ np.uint32(j) * np.uint32(0x85EBCA77)
+    h ^= np.uint32(k) * np.uint32(0xC2B2AE3D) ^ np.uint32(seed) * np.uint32(0x27D4EB2F)
+    h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
+    h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
+    h = np.uint32(h ^ (h >> np.uint32(15)))
+    return h / 2147483647.5 - 1.0
+
+
+@numba.njit(cache=True)
+def _value(x: float, y: float, z: float, seed: int) -> float:
+    """Interpolate the lattice, with a quintic fade so that slopes are continuous."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    u, v, w = x - i, y - j, z - k
+    u = u * u * u * (u * (6.0 * u - 15.0) + 10.0)
+    v = v * v * v * (v * (6.0 * v - 15.0) + 10.0)
+    w = w * w * w * (w * (6.0 * w - 15.0) + 10.0)
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
+                total += weight * _corner(i + a, j + b, k + c, seed)
+    return total
+
+
+@numba.njit(cache=True)
+def fractal(points: F64, wavelength: float, octaves: int, seed: int) -> NDArray[np.float64]:
+    """See `adaptune.simulation.mesh.fractal`."""
+    values = np.zeros(len(points))
+    for n in range(len(points)):
+        scale, weight = 1.0 / wavelength, 1.0
+        for octave in range(octaves):
+            values[n] += weight * _value(
+                points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale, seed + octave
+            )
+            scale *= 2.0
+            weight *= 0.5
+    return values
+
+
+class Cast(NamedTuple):
+    """Rays, and what they hit."""
+
+    rays: F32  # origins and directions, of shape (n, 6)
+    hits: F32  # metres to what each ray hit, infinite where nothing, of shape (n,)
+    normals: F32  # of shape (n, 3)
+    reflectivity: F32  # of shape (n,)
+
+
+class Receiver(NamedTuple):
+    """A sensor's range in metres, its standard deviation, and the share of echoes lost."""
+
+    nearest: float
+    farthest: float
+    noise: float
+    dropout: float
+
+
+@numba.njit(cache=True)
+def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
+    """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
+
+    Directions are unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3); poses are
+    one for each column. Near `origin`, that of the rays' coordinates, single precision is exact
+    enough.
+    """
+    columns, rings = directions.shape[:2]
+    rays = np.empty((columns * rings, 6), np.float32)
+    n = 0
+    for c in range(columns):
+        T = T_world_sensor[c]
+        x, y, z = T[0, 3] - origin[0], T[1, 3] - origin[1], T[2, 3] - origin[2]
+        for r in range(rings):
+            u, v, w = directions[c, r]
+            rays[n, 0], rays[n, 1], rays[n, 2] = x, y, z
+            for i in range(3):
+                rays[n, 3 + i] = T[i, 0] * u + T[i, 1] * v + T[i, 2] * w
+            n += 1
+    return rays
+
+
+@numba.njit(cache=True)
+def towards(
+    rays: F32, rings: int, centres: F64, yaw: F64, radius: float
+) -> tuple[NDArray[np.int64], F32]:
+    """Pick the rays that pass a moving object: their indices, and the rays in the object's frame.
+
+    Parameters
+    ----------
+    rays, rings
+        Of shape (n_columns * n_rings, 6), and how many there are in a column.
+    centres, yaw
+        The object's origin (n_columns, 3) and heading in radians (n_columns,) at each column.
+    radius
+        Metres around its origin within which all of it lies.
+    """
+    picked = np.empty(len(rays), np.int64)
+    local = np.empty((len(rays), 6), np.float32)
+    m = 0
+    for n in range(len(rays)):
+        c = n // rings
+        x, y = rays[n, 0] - centres[c, 0], rays[n, 1] - centres[c, 1]
+        z = rays[n, 2] - centres[c, 2]
+        u, v, w = rays[n, 3], rays[n, 4], rays[n, 5]
+        along = -(x * u + y * v + z * w)
+        if along < -radius or x * x + y * y + z * z - along * along > radius * radius:
+            continue
+        cos, sin = np.cos(yaw[c]), np.sin(yaw[c])
+        picked[m] = n
+        local[m, 0], local[m, 1], local[m, 2] = cos * x + sin * y, cos * y - sin * x, z
+        local[m, 3], local[m, 4], local[m, 5] = cos * u + sin * v, cos * v - sin * u, w
+        m += 1
+    return picked[:m], local[:m]
+
+
+@numba.njit(cache=True)
+def receive(
+    directions: F32,
+    cast: Cast,
+    sensor: Receiver,
+    air: tuple[float, float, float],
+    chance: F32,
+    normal: F32,
+) -> tuple[F32, F32, NDArray[np.int64]]:
+    """Decide which rays come back, and with what range and intensity.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors in the sensor's frame, of shape (n, 3).
+    cast, sensor
+        The rays with their hits, and the receiver.
+    air
+        Extinction, backscatter and its reach: see `adaptune.simulation.sensors.Weather`.
+    chance, normal
+        Uniform random numbers of shape (2, n), and normal ones of shape (n,).
+
+    Returns
+    -------
+    points : ndarray of shape (m, 3)
+        In the sensor's frame at the time of each ray.
+    intensities : ndarray of shape (m,)
+        From 0 to 255.
+    kept : ndarray of shape (m,)
+        Which rays came back.
+    """
+    rays, hits, normals, reflectivity = cast
+    nearest, farthest, noise, dropout = sensor
+    n = len(rays)
+    points, intensities = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    kept = np.empty(n, np.int64)
+    extinction, backscatter, air_reach = air
+    m = 0
+    for i in range(n):
+        distance, power = float(hits[i]), 0.0
+        if backscatter > 0.0:
+            echo = -np.log(1.0 - chance[1, i]) / backscatter
+            if echo < min(distance, air_reach):
+                distance, power = echo, 0.01
+        if not nearest <= distance <= farthest or chance[0, i] < dropout:
+            continue
+        if power == 0.0:
+            cosine = abs(
+                normals[i, 0] * rays[i, 3] + normals[i, 1] * rays[i, 4] + normals[i, 2] * rays[i, 5]
+            )
+            power = reflectivity[i] * cosine * np.exp(-2.0 * extinction * distance)
+            # The echo weakens with the square of the distance; a tenth is seen to the full range.
+            if distance * distance > farthest * farthest * power * 10.0:
+                continue
+        distance += noise * normal[i]
+        for j in range(3):
+            points[m, j] = distance * directions[i, j]
+        intensities[m] = np.rint(255.0 * min(power, 1.0))
+        kept[m] = i
+        m += 1
+    return points[:m], intensities[:m], kept[:m]

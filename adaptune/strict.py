@@ -1,0 +1,291 @@
+"""What a user sets, and what is wrong with it in plain words."""
+
+import json
+import re
+import types
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+
+from adaptune.errors import DELETED, RENAMED, AdaptuneError, nearest
+
+# Base class of everything that a user sets: its numbers are numbers.
+
+
+_LARGEST = 10**100
+"""No number is as large; the square of one is still a number."""
+
+_UNTOUCHED = ("default", "metadata", "serialization")
+"""Parts of a schema that hold no schemas."""
+
+
+def _strict(schema: Any) -> Any:
+    if isinstance(schema, list | tuple):
+        return type(schema)(map(_strict, schema))
+    if not isinstance(schema, dict) or schema.get("type") == "model":
+        return schema
+    if (kind := schema.get("type")) in ("int", "float"):
+        return core_schema.no_info_wrap_validator_function(partial(_number, kind), schema)
+    return {k: v if k in _UNTOUCHED else _strict(v) for k, v in schema.items()}
+
+
+def _number(kind: str, given: Any, check: Callable[[Any], Any]) -> Any:
+    """Refuse what is no number, and what no unit makes sensible."""
+    if isinstance(given, bool | str | bytes):
+        raise PydanticKnownError("int_type" if kind == "int" else "float_type")
+    if kind == "int" and isinstance(given, float) and given.is_integer():
+        given = int(given)
+    if isinstance(given, int):
+        given = max(-_LARGEST, min(given, _LARGEST))
+    value = check(given)
+    if abs(value) >= _LARGEST:
+        limit = {"le": float(_LARGEST)} if value > 0 else {"ge": -float(_LARGEST)}
+        raise PydanticKnownError("less_than_equal" if value > 0 else "greater_than_equal", limit)
+    return value
+
+
+class StrictModel(BaseModel):
+    """Settings without unknown keys.
+
+    Neither true nor text counts as a number, and all numbers are finite.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Make what checks the values: pydantic itself takes true for 1, and "1" as well."""
+        schema = handler(source)
+        model: Any = handler.resolve_ref_schema(schema)
+        while model["type"] != "model":
+            model = model["schema"]
+        model["schema"] = _strict(model["schema"])
+        return schema
+
+
+# What pydantic finds wrong, in plain words.
+
+
+Key = tuple[str | int, ...]
+"""Keys and indices that lead to a value."""
+
+UNKNOWN = "unknown key"
+
+_LONGEST = 60
+"""Characters of a value that a message quotes."""
+
+_NUMBER, _WHOLE, _LIST, _MAPPING = "a number", "a whole number", "a list", "keys with values"
+_WANTED = {
+    **dict.fromkeys(("float_type", "float_parsing"), _NUMBER),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), _WHOLE),
+    "finite_number": "a finite number",
+    "string_type": "text",
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("tuple_type", "list_type", "set_type", "frozen_set_type"), _LIST),
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type", "mapping_type"), _MAPPING),
+    "none_required": "nothing",
+    "greater_than": "a number above {gt}",
+    "greater_than_equal": "a number of at least {ge}",
+    "less_than": "a number below {lt}",
+    "less_than_equal": "a number of at most {le}",
+    "too_short": "at least {min_length}",
+    "too_long": "at most {max_length}",
+    "string_too_short": "at least {min_length} characters",
+    "string_too_long": "at most {max_length} characters",
+    "literal_error": "{expected}",
+}
+"""What to give, by pydantic's type of a mistake."""
+_OF_VALUES = {kind for kind, wanted in _WANTED.items() if "{" in wanted}
+
+
+def plain_words(error: ValidationError, data: Any) -> dict[Key, str]:
+    """What is wrong with data that are not valid, and what to give, by the key of each mistake."""
+    found: dict[Key, list[Any]] = {}
+    named = []
+    for detail in error.errors(include_url=False):
+        path = _path(data, detail)
+        found.setdefault(path, []).append(detail)
+        if detail["loc"][-1:] == ("[key]",):
+            named.append(path)
+    said = {}
+    for path, details in found.items():
+        # Of several types that are allowed, the one that the value comes nearest to counts.
+        deeper = any(len(other) > len(path) and other[: len(path)] == path for other in found)
+        if path in named or not deeper:
+            said[path] = _message(details)
+    return said
+
+
+def in_one_line(error: Exception, data: Any = None) -> str:
+    """An error in one line; in plain words where `data`, which may be unknown, are not valid."""
+    if not isinstance(error, ValidationError):
+        return " ".join(str(error).split())
+    said = plain_words(error, data).items()
+    return "; ".join(": ".join(filter(None, (".".join(map(str, key)), text))) for key, text in said)
+
+
+def _path(data: Any, detail: Any) -> Key:
+    """Keys that lead to a mistake; between them, pydantic names the types that are allowed."""
+    if data is None:
+        return tuple(detail["loc"])
+    path: list[str | int] = []
+    for part in detail["loc"]:
+        indexed = isinstance(data, list | tuple) and isinstance(part, int) and part < len(data)
+        if indexed or (isinstance(data, dict) and part in data):
+            data = data[part]
+            path.append(part)
+    return (*path, detail["loc"][-1]) if detail["type"] == "missing" else tuple(path)
+
+
+def _message(details: Sequence[Any]) -> str:
+    """What is wrong with a value, by each of the types that are allowed for it."""
+    kinds = [detail["type"] for detail in details]
+    if "extra_forbidden" in kinds:
+        return UNKNOWN
+    if "missing" in kinds:
+        return "this key is missing"
+    for detail in details:
+        if detail["type"] not in _WANTED:
+            return _plain(str(detail["msg"]))
+    # A value of the right type comes nearest.
+    nearest = [detail for detail in details if detail["type"] in _OF_VALUES] or list(details)
+    wanted = [_wanted(detail) for detail in nearest]
+    if _NUMBER in wanted and _WHOLE in wanted:
+        wanted.remove(_WHOLE)
+    return f"give {' or '.join(dict.fromkeys(wanted))}, not {_given(nearest[0])}"
+
+
+def _wanted(detail: Any) -> str:
+    figures = {
+        name: f"{value:,}" if isinstance(value, int) else f"{value:g}"
+        for name, value in detail.get("ctx", {}).items()
+        if isinstance(value, int | float)
+    }
+    if detail["type"] == "literal_error":
+        return str(detail["ctx"]["expected"]).replace("True", "true").replace("False", "false")
+    if detail["type"] == "too_short" and figures["min_length"] == "1":
+        return "at least one"
+    return _WANTED[detail["type"]].format(**figures)
+
+
+def _given(detail: Any) -> str:
+    """A value in few words, as YAML has it."""
+    value = detail["input"]
+    if detail["type"] in ("too_short", "too_long"):
+        return f"{len(value):,}" if len(value) else "none"
+    if value is None:
+        return "nothing"
+    if isinstance(value, dict):
+        return _MAPPING
+    if isinstance(value, list | tuple):
+        return _LIST
+    text = repr(value) if isinstance(value, str) else json.dumps(value, default=str)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def _plain(message: str) -> str:
+    """What a class of the user, or a rule of ours, says of a value, without pydantic's words."""
+    message = re.sub(r"^(Value error|Assertion failed), ", "", message)
+    message = re.sub(r"\b[Ii]nput should be\b", "give", message)
+    return re.sub(r" (after|during) validation", "", message).replace("Input should", "it should")
+
+
+# Mistakes in a study's YAML, each with the path of its key.
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class ConfigurationError(AdaptuneError):
+    """One or more mistakes in a study's YAML, a line each."""
+
+
+class Mistake(NamedTuple):
+    """What is wrong with a value, and what to do; the key of the whole study is empty."""
+
+    key: Key
+    message: str
+
+    def below(self, key: Key) -> "Mistake":
+        """The mistake as seen from outside the section at `key`."""
+        return Mistake(key + self.key, self.message)
+
+
+def validated(
+    model: type[M],
+    data: Any,
+    key: Key,
+    mistakes: list[Mistake],
+    context: dict[str, Any] | None = None,
+) -> M | None:
+    """Validate a section; None if it has mistakes, which are added to `mistakes`."""
+    try:
+        return model.model_validate(data, context=context)
+    except ValidationError as error:
+        for path, message in plain_words(error, data).items():
+            said = _unknown(model, path, key) if message == UNKNOWN else message
+            mistakes.append(Mistake(key + path, said))
+        return None
+
+
+def validated_rest(
+    model: type[M],
+    data: dict[str, Any],
+    needed: dict[str, Any],
+    mistakes: Iterable[Mistake],
+    context: dict[str, Any],
+) -> M | None:
+    """Validate what is left of a section without its mistakes, with `needed` where it lacks keys.
+
+    What is not mistaken by itself may still not go together. None if nothing can be left.
+    """
+    keys, given = [mistake.key for mistake in mistakes], data
+    while (rest := needed | _without(data, keys)) != given:
+        found: list[Mistake] = []
+        if (valid := validated(model, rest, (), found, context)) is not None:
+            return valid
+        given = rest
+        keys += [mistake.key for mistake in found]
+    return None
+
+
+def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:
+    """Leave out what the keys lead to; where there is no such key, the section that lacks it."""
+    rest = {}
+    for name, value in data.items():
+        below = [key[1:] for key in keys if key[:1] == (name,)]
+        if not below:
+            rest[name] = value
+        elif isinstance(value, dict) and all(key and key[0] in value for key in below):
+            rest[name] = _without(value, below)
+    return rest
+
+
+def _unknown(model: type[BaseModel], path: Key, key: Key) -> str:
+    old = ".".join(map(str, key + path))
+    if old in RENAMED:
+        return f"is now called {RENAMED[old]}"
+    if old in DELETED:
+        return DELETED[old]
+    return f"{UNKNOWN}; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
+
+
+def _keys(annotation: Any, path: Sequence[str | int]) -> list[str]:
+    """Keys that a model has at a path below it."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if not path:
+            return list(annotation.model_fields)
+        field = annotation.model_fields.get(str(path[0]))
+        return _keys(field.annotation, path[1:]) if field else []
+    arguments = typing.get_args(annotation)
+    if typing.get_origin(annotation) in (dict, list, tuple) and path:
+        # This part of the path is a key or an index; the last argument is the type of the values.
+        return _keys(next(a for a in reversed(arguments) if a is not Ellipsis), path[1:])
+    unions = (types.UnionType, typing.Union, Annotated)
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) in unions:
+        return [key for a in arguments for key in _keys(a, path)]
+    return []
