@@ -49,9 +49,6 @@ _ERRORS = {
 _TIMES = ("prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv`` that are series."""
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is."""
-
 
 class Series(NamedTuple):
     """Finite numbers over time."""

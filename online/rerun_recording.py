@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from adaptune.errors import import_extra
 from adaptune.files import replacing
+from adaptune.progress import Progress, unseen
 from adaptune.report.paper import LINES, OTHERS
 from adaptune.study.study import Study
 from online.parquet_tables import TABLES, write_parquet
 from online.recordings import (
     Cloud,
-    Progress,
     RecordedMode,
     RecordedReplays,
     Series,
@@ -293,7 +293,7 @@ def record_replays(
     study: Study,
     name: str,
     formats: Collection[str],
-    progress: Progress = lambda *_: None,
+    progress: Progress = unseen,
 ) -> list[Path]:
     """Write the replays of a sequence as recordings.
 

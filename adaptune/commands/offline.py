@@ -55,12 +55,8 @@ def simulate(
         courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
         due = [n for n in courses if overwrite or not loaded.sequences.recording(n).exists()]
         for name in due:
-
-            def step(done: int, total: int, name: str = name) -> None:
-                show(name, done, total)
-
             path = loaded.sequences.recording(name)
-            record(courses[name], path, overwrite=overwrite, progress=step)
+            record(courses[name], path, overwrite=overwrite, progress=show)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
     say_next_of_study("run trials, fit the error model", "offline", study, override, folder)
 

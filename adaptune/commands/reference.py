@@ -11,7 +11,6 @@ import typer
 
 from adaptune.commands.terminal import (
     Override,
-    Show,
     console,
     load,
     progress,
@@ -20,6 +19,7 @@ from adaptune.commands.terminal import (
     say_next_of_study,
 )
 from adaptune.errors import AdaptuneError
+from adaptune.progress import Progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -141,7 +141,7 @@ def _on_one_core() -> "Iterator[None]":
         unpin()
 
 
-def _advance(show: Show, what: str) -> Callable[[int, int], None]:
+def _advance(show: Progress, what: str) -> Callable[[int, int], None]:
     return lambda done, total: show(what, done, total)
 
 

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +18,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 
 from adaptune.errors import AdaptuneError
+from adaptune.progress import Progress
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -67,15 +68,9 @@ LOG_EVERY = 5.0
 MOST_FINISHED = 8
 """Bars that stay on the screen when they are full."""
 
-Show = Callable[..., None]
-"""Called with what is done, how much of it is done, how much there is, and a remark.
-
-How much is done may be a fraction: half a run, say.
-"""
-
 
 @contextmanager
-def progress(above: Any = None) -> Iterator[Show]:
+def progress(above: Any = None) -> Iterator[Progress]:
     """Show a bar for each thing that is done; without a terminal, write a line now and then.
 
     In a terminal, `above` stands over the bars: something that rich can render, again and again.
@@ -84,22 +79,16 @@ def progress(above: Any = None) -> Iterator[Show]:
     if not errors.is_terminal:
         yield _logger()
         return
+    from rich import progress as columns
     from rich.console import Group
     from rich.live import Live
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-    )
 
-    bars = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[remark]}", markup=False),
+    bars = columns.Progress(
+        columns.TextColumn("{task.description}", markup=False),
+        columns.BarColumn(),
+        columns.MofNCompleteColumn(),
+        columns.TimeElapsedColumn(),
+        columns.TextColumn("{task.fields[remark]}", markup=False),
         console=errors,
     )
     tasks: dict[str, TaskID] = {}
@@ -107,7 +96,7 @@ def progress(above: Any = None) -> Iterator[Show]:
     shown = bars if above is None else Live(Group(above, bars), console=errors)
     with shown:
 
-        def show(what: str, done: float, total: int, remark: str = "") -> None:
+        def show(what: str, done: float, total: int, remark: str = "", /) -> None:
             if full.again(what, done, total):
                 return
             if what not in tasks:
@@ -121,12 +110,12 @@ def progress(above: Any = None) -> Iterator[Show]:
         yield show
 
 
-def _logger() -> Show:
+def _logger() -> Progress:
     log = logging.getLogger("adaptune")
     last = time.monotonic()
     pace, full = _Pace(), _Full()
 
-    def show(what: str, done: float, total: int, remark: str = "") -> None:
+    def show(what: str, done: float, total: int, remark: str = "", /) -> None:
         nonlocal last
         if full.again(what, done, total):
             return

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from adaptune.commands.terminal import Show, begin_work, console, progress, say, say_next
+from adaptune.commands.terminal import begin_work, console, progress, say, say_next
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
+from adaptune.progress import Progress
 
 if TYPE_CHECKING:
     from adaptune.recording.inspect import Inspection
@@ -54,7 +55,7 @@ UNKNOWN = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 50
 """The length of sub-trajectories to propose where the path is not known."""
 
 
-def _measured(found: "Inspection", show: Show) -> "tuple[MeasuredReference | None, str]":
+def _measured(found: "Inspection", show: Progress) -> "tuple[MeasuredReference | None, str]":
     """Registrations along the reference, and what they tell; None where there is none to measure.
 
     Only what can be used to train is measured.

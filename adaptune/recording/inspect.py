@@ -16,6 +16,7 @@ from rich.text import Text
 from adaptune import files
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
+from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
 from adaptune.recording import survey as faults
 from adaptune.recording.clouds import DATATYPES, RING_FIELDS
@@ -23,7 +24,7 @@ from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES
 from adaptune.recording.opening import open_sequence
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import TIME_FIELDS
-from adaptune.recording.survey import Fault, Parts, Reading, Show, Survey, n_valid, survey
+from adaptune.recording.survey import Fault, Parts, Reading, Survey, n_valid, survey
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 Layout = tuple[tuple[str, str, int], ...]
@@ -106,11 +107,7 @@ _INPUTS = {
 }
 
 
-def _silent(what: str, done: int, total: int) -> None:
-    """Show no progress."""
-
-
-def inspect(path: Path, deep: bool = False, show: Show | None = None) -> Inspection:
+def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
     """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
 
     It is a bag, a folder with bags, a KITTI sequence or drive, a folder of scans, or a file of
@@ -125,8 +122,8 @@ def inspect(path: Path, deep: bool = False, show: Show | None = None) -> Inspect
         return _inspect_poses(path)
     kind = _kind(path)
     if kind == "bag":
-        return _inspect_bag(path, survey(path, deep, show or _silent))
-    return _inspect_scans(path, kind, deep, show or _silent)
+        return _inspect_bag(path, survey(path, deep, show))
+    return _inspect_scans(path, kind, deep, show)
 
 
 def _kind(path: Path) -> str:
@@ -177,7 +174,7 @@ def _inspect_bag(path: Path, found: Survey) -> Inspection:
     )
 
 
-def _inspect_scans(path: Path, kind: str, deep: bool, show: Show) -> Inspection:
+def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
     given = {kind: str(path)}
     sequence = open_sequence(SequenceConfig(**given, cache=False))
     assert isinstance(sequence, RecordedSequence)

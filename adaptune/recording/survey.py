@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 
 from adaptune import geometry
+from adaptune.progress import Progress
 from adaptune.recording import Scan, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
 from adaptune.recording.clouds import PATH, POSES, Pose, header_stamp, usable
@@ -190,9 +191,6 @@ def of_overlap(reference: Trajectory, scans: tuple[int, int], slack: float) -> I
         yield Fault(f"the reference {spans}: the scans outside get no label", "reference")
 
 
-Show = Callable[[str, int, int], None]
-"""Called with what is done, how much of it is done, and how much there is."""
-
 Take = Callable[[bytes], None]
 """Decodes a message."""
 
@@ -257,7 +255,7 @@ class Survey:
         return found
 
 
-def survey(path: Path, deep: bool, show: Show) -> Survey:
+def survey(path: Path, deep: bool, show: Progress) -> Survey:
     """Read the bags of a path: all messages if there are few or if it is to be `deep`."""
     source = _source(bag_paths([str(path)]))
     with source.open(by_index=True) as reader:
@@ -360,7 +358,7 @@ def _indexed(reader: AnyReader) -> bool:
     return all(getattr(file, "chunks", True) for file in files)
 
 
-def _read(source: BagSource, reader: AnyReader, found: Survey, number: int, show: Show) -> None:
+def _read(source: BagSource, reader: AnyReader, found: Survey, number: int, show: Progress) -> None:
     """Read so many parts, or everything if it is 0."""
     takers, usual = _takers(source, reader, found), _usual(found)
     total, done = sum(t.count for t in found.topics.values()), 0

@@ -1,7 +1,7 @@
 """Recordings of simulated courses: ROS bags and KITTI odometry folders."""
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adaptune import files, geometry
 from adaptune.files import replacing, replacing_folder
 from adaptune.geometry import Poses, invert
+from adaptune.progress import Progress, unseen
 from adaptune.recording.export import (
     T_CAMERA_LIDAR,
     Message,
@@ -238,8 +239,6 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
 Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
 
-Progress = Callable[[int, int], None]
-
 _MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
 """Marks of a recording's folder, which may be overwritten."""
 
@@ -250,7 +249,7 @@ def record(
     *,
     layout: Layout | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = unseen,
 ) -> None:
     """Simulate a course and write its recording, its ground truth and a preview.
 
@@ -269,10 +268,8 @@ def record(
     overwrite
         Whether to replace an existing recording; no other file or folder is replaced.
     progress
-        Called after every scan with the numbers of finished and of all scans.
+        Notes every scan, under the recording's name.
     """
-    # matplotlib takes a second to import.
-
     path = Path(path)
     layout = _layout(path) if layout is None else layout
     stem = path.name if layout in _MARKS else path.stem
@@ -286,7 +283,7 @@ def record(
     with ExitStack() as stack:
         temporary_truth = stack.enter_context(replacing(truth))
         temporary_previews = [stack.enter_context(replacing(preview)) for preview in previews]
-        scans = _watched(drive, picture := Preview(drive), progress)
+        scans = _watched(drive, picture := Preview(drive), progress, path.stem)
         new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
         if layout == "kitti":
             _write_kitti(drive, scans, new)
@@ -318,13 +315,12 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
 
 
 def _watched(
-    drive: Drive, preview: "Preview", progress: Progress | None
+    drive: Drive, preview: "Preview", progress: Progress, name: str
 ) -> Iterator[SimulatedScan]:
     for number, scan in enumerate(drive.scans(), start=1):
         preview.add(scan)
         yield scan
-        if progress is not None:
-            progress(number, len(drive))
+        progress(name, number, len(drive))
 
 
 class _Composer(Messages):

@@ -185,8 +185,8 @@ def test_a_folder_of_something_else_stays(tmp_path):
 
 @pytest.mark.parametrize("layout", ["ros1", "mcap", "ros2", "kitti"])
 def test_nothing_is_left_of_an_interrupted_recording(tmp_path, layout):
-    def interrupt(done, total):
-        assert total == len(Drive(COURSE))
+    def interrupt(name, done, total):
+        assert (name, total) == ("run" if layout != "kitti" else "kitti", len(Drive(COURSE)))
         if done == 3:
             raise KeyboardInterrupt
 
@@ -199,7 +199,7 @@ def test_nothing_is_left_of_an_interrupted_recording(tmp_path, layout):
 def test_progress_counts_every_scan(tmp_path, scans):
     calls = []
     record(COURSE, tmp_path / "run.bag", progress=lambda *call: calls.append(call))
-    assert calls == [(i + 1, len(scans)) for i in range(len(scans))]
+    assert calls == [("run", i + 1, len(scans)) for i in range(len(scans))]
 
 
 def test_recordings_are_deterministic(tmp_path):
