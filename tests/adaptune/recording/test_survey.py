@@ -163,7 +163,7 @@ def test_the_sample_of_an_mcap_file_without_chunks_is_its_beginning(tmp_path: Pa
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
 def test_a_large_bag_is_inspected_by_its_index(tmp_path: Path, name: str) -> None:
     # The benchmark has ten times as many chunks.
-    file = Path(__file__).parents[2] / "benchmarks/inspecting.py"
+    file = Path(__file__).parents[3] / "benchmarks/inspecting.py"
     written = runpy.run_path(str(file))["write_mcap" if name == "a.mcap" else "write_ros1"]
     written(tmp_path / name, 10_000, 800_000)
     assert (tmp_path / name).stat().st_size > 8e9
