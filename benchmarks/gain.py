@@ -18,7 +18,7 @@ from pathlib import Path
 
 from gain_ablation import ablate, less
 from gain_data import ODOMETRIES, describe, factory_of, labelled, training_courses, trials
-from gain_modes import by_descriptor, by_kind, curve, own_errors, validate
+from gain_modes import by_descriptor, by_kind, own_errors, validate
 
 from offline.labelled import LabelledData
 from offline.leave_one_out import BANK_SIZE
@@ -28,8 +28,6 @@ def compare(data: LabelledData, arguments: argparse.Namespace) -> None:
     """Leave each sequence out in turn, in the way that is asked for."""
     if arguments.less:
         less(data)
-    elif arguments.curve:
-        curve(data)
     elif arguments.kinds:
         by_kind(data, arguments.bank)
     elif arguments.own_error:
@@ -52,7 +50,6 @@ def main() -> None:
     parser.add_argument("--bank", type=int, default=BANK_SIZE, help="members of the bank")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--ablate", action="store_true", help="without one thing after the other")
-    what.add_argument("--curve", action="store_true", help="with fewer training sequences")
     what.add_argument("--less", action="store_true", help="with fewer frames, or runs")
     what.add_argument("--kinds", action="store_true", help="with a whole kind of scene left out")
     what.add_argument("--own-error", action="store_true", help="how right the own error is")

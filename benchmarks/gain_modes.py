@@ -14,7 +14,6 @@ from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.descriptor import DESCRIPTORS, averaged
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.bank_simulation import chained
-from offline.curves import learning_curve
 from offline.labelled import LabelledData, LabelledSequence, periods
 from offline.leave_one_out import Validation, leave_one_out, leave_out
 from offline.tuning import cancelling_members, on_labelled, simulated_with
@@ -147,12 +146,6 @@ def by_descriptor(data: LabelledData, paths: list[Path], described: list[Path], 
         print(f"by {' and '.join(names)}: ", end="")
         validation = leave_one_out(data._replace(sequences=sequences), {}, bank=size)
         print_summary(validation, ["adaptive"])
-
-
-def curve(data: LabelledData) -> None:
-    """Print the gain with fewer training sequences."""
-    for row in learning_curve(data):
-        print(" ".join(f"{key} {value:.3g}" for key, value in row.items()), flush=True)
 
 
 def print_summary(validation: Validation, modes: Iterable[str]) -> None:

@@ -18,17 +18,14 @@ from adaptune.report.chart import (
     Charts,
     Drawn,
     Line,
-    Mark,
     Panel,
     Points,
     charts_of,
 )
-from adaptune.report.paper import POINTS
 from adaptune.study.study import Study
 from offline import trial_charts
 from offline.config import OfflineStudy
-from offline.objective import pareto_front, sampler_results
-from offline.pictures import CANCELLING, RATIO, THRIFTY
+from offline.objective import sampler_results
 from offline.search import Search, assess, make_stages
 from offline.trial_charts import TrialTable, importance_chart, importances, read_trials
 from offline.tuning import figures
@@ -38,6 +35,7 @@ from offline.tuning import figures
 
 MOST_NAMED = 8
 """With more recordings, stretches do not show of which they are."""
+RATIO = "error over the fixed set's [-]"
 _FACTS = ("recording", "stretch", "fixed [%]")
 
 
@@ -92,57 +90,6 @@ def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence
     title = f"{mode}: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
     x = Axis("stretch, by rising ratio [-]", limits=(0.5, float(ends[1])))
     return Panel(x, Axis(RATIO, log=True), tuple(drawn), title)
-
-
-def frontier_chart(rows: Sequence[Mapping[str, Any]], budget: float | None = None) -> Chart | None:
-    """Error over cost of sets, banks and modes.
-
-    Parameters
-    ----------
-    rows
-        Of ``costs.json``, see `offline.frontier`.
-    budget
-        Milliseconds of CPU time a scan that may be spent, if there is a limit.
-    """
-    known = [r for r in rows if np.isfinite([r["ms a scan"], r["ratio"]]).all()]
-    if not known:
-        return None
-    banks = {"bank of 2, 3, ... members": CANCELLING, "the same, by gain per cost": THRIFTY}
-    others = [r for r in known if r["what"] not in POINTS and r["what"] not in banks.values()]
-    drawn: list[Drawn] = []
-    for what in dict.fromkeys(r["what"] for r in others):
-        mine = [r for r in others if r["what"] == what]
-        texts = [f"trial {r['name']}" for r in mine]
-        drawn.append(Points(*_xy(mine), str(what), texts=texts))
-    if others:
-        x, y = _xy(others)
-        front = pareto_front(np.column_stack([x, y]))
-        drawn.append(Line(x[front], y[front], "Pareto front of the sets", steps=True))
-    for label, what in banks.items():
-        mine = [r for r in known if r["what"] == what]
-        texts = [f"{r['name']} members" for r in mine]
-        drawn += [Line(*_xy(mine), label), Points(*_xy(mine), label, texts=texts)] if mine else []
-    drawn += [Points(*_xy([r]), str(r["what"])) for r in known if r["what"] in POINTS]
-    drawn += [Mark(budget, "budget", "x")] if budget is not None else []
-    drawn.append(Mark(1.0))
-    ratios = _xy(known)[1]
-    y_axis = Axis(RATIO, log=True, limits=(0.9 * float(ratios.min()), _top(ratios)))
-    return Chart(
-        "frontier",
-        "Error over cost: sets, banks and modes",
-        (Panel(Axis("CPU time a scan [ms]", log=True), y_axis, tuple(drawn)),),
-        "Lower is better, and further left is cheaper. Banks and modes were chosen without what "
-        "is left out. Sets with more than five times the fixed set's error are not shown.",
-    )
-
-
-def _xy(rows: Sequence[Mapping[str, Any]]) -> tuple[Any, Any]:
-    found = np.array([(r["ms a scan"], r["ratio"]) for r in rows], float)
-    return found[:, 0], found[:, 1]
-
-
-def _top(ratios: np.ndarray[Any, Any]) -> float:
-    return min(1.1 * float(ratios.max()), 5.0)
 
 
 def charts_of_trials(study: OfflineStudy) -> Charts:
@@ -247,13 +194,6 @@ def _of_validation(study: Study) -> Iterator[Chart | str | None]:
         return
     with _damage_told(study, "stretches"):
         yield stretch_chart(stretches)
-    costs = _rows(study, "costs")
-    with _damage_told(study, "costs"):
-        yield (
-            frontier_chart(costs, study.config.online.budget)
-            if costs
-            else ("No costs of banks and modes: they were not measured.")
-        )
 
 
 def _rows(study: Study, name: str) -> list[dict[str, Any]]:

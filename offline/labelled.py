@@ -203,15 +203,6 @@ class LabelledData(NamedTuple):
         cuts = np.concatenate([s.stretch for s in self.sequences])
         return stretch_numbers(np.repeat(place, lengths), cuts)
 
-    def drawn(self, size: int, rng: np.random.Generator) -> "LabelledData":
-        """Some of the stretches, drawn at random, with all their views."""
-        number = self.stretches()
-        known = np.unique(number)
-        kept = np.isin(number, rng.choice(known, min(size, len(known)), replace=False))
-        ends = np.cumsum([len(s.errors) for s in self.sequences])[:-1]
-        parts = zip(self.sequences, np.split(kept, ends), strict=True)
-        return self._replace(sequences=[s.frames(of) for s, of in parts if of.any()])
-
     def bounds(self) -> dict[int, float]:
         """The objective of every set in trials on these sequences, see `Verdict.bound`."""
         values = [

@@ -7,22 +7,19 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel, ModelError
 from adaptune.report import tables
+from adaptune.report.paper import draw_chart
 from adaptune.study.inputs import check_model
 from adaptune.study.references import estimates_beside_intervals
 from adaptune.study.study import Driven, driven
 from offline.campaign import rivalry
+from offline.charts import stretch_chart
 from offline.config import OfflineStudy
-from offline.curves import bank_curve, learning_curve
-from offline.frontier import frontier
 from offline.labelled import LabelledData, labelled_data
 from offline.leave_one_out import PAIRED, Interval, Validation, ValidationError, leave_one_out
-from offline.pictures import LeftOutResults, draw_frontier, draw_validation
-from offline.tuning import BANK_SETTINGS
 
 _log = logging.getLogger(__name__)
 
@@ -33,16 +30,12 @@ class Validated(NamedTuple):
     validation: Validation
     # Ratio to the fixed set's error of every mode on every sequence left out.
     rows: list[dict[str, Any]]
-    learning: list[dict[str, Any]]  # see `learning_curve`; empty if not asked for
-    banks: list[dict[str, Any]]  # see `bank_curve`; empty if not asked for
     # Sentences: what `adaptune online` will drive, its estimate, and what reference judged it.
     verdicts: list[str]
 
 
 def validate(
     study: OfflineStudy,
-    curve: bool = False,
-    sizes: bool = False,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Validated:
     """Validate the selection rules on a study's training sequences.
@@ -50,12 +43,8 @@ def validate(
     Parameters
     ----------
     study
-        A study that the offline stage has finished. Its folder receives ``validation`` and
-        ``costs`` (CSV, JSON and pictures) and ``stretches`` (CSV, JSON), and its model the summary.
-    curve
-        Compute, too, what fewer training stretches would gain (``learning``).
-    sizes
-        Compute, too, what banks of other sizes would gain (``banks``).
+        A study that the offline stage has finished. Its folder receives ``validation`` (CSV, JSON
+        and a picture) and ``stretches`` (CSV, JSON), and its model the summary.
     progress
         Called about every fold.
 
@@ -77,58 +66,15 @@ def validate(
         raise ValidationError(f"{error}. {online.words}") from error
     rows = _rows(validation, _rate(data))
     tables.write_rows(study.folder, "validation", rows)
-    tables.write_rows(study.folder, "stretches", _stretch_rows(validation))
-    learning = banks = []
-    if curve:
-        learning = learning_curve(data, progress=partial(progress, "learning curve"), bank=bank)
-        tables.write_rows(study.folder, "learning", learning)
-    if sizes:
-        banks = bank_curve(data, partial(progress, "sizes of banks"))
-        tables.write_rows(study.folder, "banks", banks)
-    _draw(study, validation, learning, banks)
-    _write_frontier(study, model, data, validation, progress)
+    stretches = _stretch_rows(validation)
+    tables.write_rows(study.folder, "stretches", stretches)
+    if (chart := stretch_chart(stretches)) is not None:
+        draw_chart(study.folder / "validation.png", chart)
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
     said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
     said += estimates_beside_intervals(study, study.training)
-    return Validated(validation, rows, learning, banks, said)
-
-
-def _write_frontier(
-    study: OfflineStudy,
-    model: ErrorModel,
-    data: LabelledData,
-    validation: Validation,
-    progress: Callable[[str, int, int], None],
-) -> None:
-    """Write and draw error against cost, where costs are known."""
-    settings = None
-    if validation.bank:
-        settings = model.bank_settings if model.bank_adapts else BANK_SETTINGS[0]
-    points = frontier(data, validation, settings, partial(progress, "banks of other sizes"))
-    if points:
-        tables.write_rows(study.folder, "costs", [point.row() for point in points])
-        draw_frontier(study.folder / "costs.png", study.name, points, study.config.online.budget)
-
-
-def _draw(
-    study: OfflineStudy,
-    validation: Validation,
-    learning: list[dict[str, Any]],
-    banks: list[dict[str, Any]],
-) -> None:
-    draw_validation(
-        study.folder / "validation.png",
-        study.name,
-        LeftOutResults(
-            validation.ratios,
-            [s.name for s in validation.left_out],
-            *_by_familiarity(validation),
-            validation.portfolio(),
-            learning,
-            banks,
-        ),
-    )
+    return Validated(validation, rows, said)
 
 
 def _bank(study: OfflineStudy, model: ErrorModel) -> int | list[int]:
@@ -263,13 +209,3 @@ def _stretch_rows(validation: Validation) -> list[dict[str, Any]]:
                 | {mode: float(np.exp(of[len(rows)])) for mode, of in logs.items()}
             )
     return rows
-
-
-def _by_familiarity(validation: Validation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean familiarity of every stretch left out, and its ratio to the fixed set's error."""
-    familiarity = [
-        s.familiarity[s.stretches == number].mean()
-        for s in validation.left_out
-        for number in np.unique(s.stretches)
-    ]
-    return np.array(familiarity), np.exp(validation.logs[validation.default])

@@ -198,12 +198,6 @@ def validate(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
-    curve: Annotated[
-        bool, typer.Option("--learning-curve", help="Add the gain with fewer stretches.")
-    ] = False,
-    sizes: Annotated[
-        bool, typer.Option("--bank-sizes", help="Add the gain of banks of 2 to 6 members.")
-    ] = False,
 ) -> None:
     """Estimate what adapting gains in places without training data.
 
@@ -217,8 +211,8 @@ def validate(
     from offline.validate import validate as validate_study
 
     with progress() as show:
-        validated = validate_study(loaded, curve, sizes, show)
-    validation, rows, learning, banks, verdicts = validated
+        validated = validate_study(loaded, show)
+    validation, rows, verdicts = validated
     console.print(
         tables.table(
             "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
@@ -230,17 +224,10 @@ def validate(
     )
     known = ", ".join(f"{ratio:.2f}" for ratio in validation.portfolio())
     say(f"If the best of 1, 2, ... complementary sets were always known: {known}.")
-    for title, found in (
-        (f"With fewer training stretches, by `{validation.default}`", learning),
-        ("Banks by number of members", banks),
-    ):
-        if found:
-            caption = "Ratio to the fixed set's error on what is left out; 95 % interval."
-            console.print(tables.table(title, found, caption))
     for verdict in verdicts:
         say(verdict)
-    names = ("validation", "costs", "stretches")
-    say(f"Tables and pictures: {', '.join(f'{loaded.folder / name}.*' for name in names)}")
+    names = ("validation", "stretches")
+    say(f"Tables and picture: {', '.join(f'{loaded.folder / name}.*' for name in names)}")
     say_next_online(loaded.config.test, study, override, folder)
 
 

@@ -24,7 +24,6 @@ from offline import leave_one_out as leave_one_out_module
 from offline import tuning
 from offline import validate as validation_of_study
 from offline.config import load_study
-from offline.curves import bank_curve, learning_curve
 from offline.labelled import LabelledSequence
 from offline.leave_one_out import LeftOut, Validation, ValidationError, leave_one_out
 from offline.train import fit, tuned
@@ -140,15 +139,6 @@ def test_what_several_sets_would_be_worth():
     )
 
 
-def test_more_sequences_teach_more():
-    sequences = two_kinds(np.random.default_rng(0))
-    rows = learning_curve(labelled(sequences))
-    assert [row["stretches"] for row in rows] == [3, 5, 7]
-    assert rows[-1]["geometric"] == pytest.approx(np.sqrt(0.5 * 0.4), rel=0.05)
-    assert rows[-1]["geometric"] <= rows[0]["geometric"] + 1e-9
-    assert learning_curve(labelled(sequences)) == rows
-
-
 def test_one_sequence_cannot_be_validated():
     with pytest.raises(ValidationError, match="one stretch"):
         leave_one_out(labelled(two_kinds(np.random.default_rng(0))[:1]))
@@ -181,7 +171,7 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
 
 def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     study = load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
-    validation, rows, learning, banks, verdicts = validate(study, curve=True, sizes=True)
+    validation, rows, verdicts = validate(study)
     assert verdicts[0] == driven(study, ErrorModel.load(study.model_path)).words
     assert all(np.isnan(one.familiarity).all() for one in validation.left_out)
     ends = ["ms a scan", "cores", "geometric", "arithmetic", "worst tenth", "worst"]
@@ -192,11 +182,8 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     summary = validation.summary("adaptive")
     assert rows[4]["adaptive, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
     assert validation.left_out[0].block > 1
-    assert [row["stretches"] for row in learning] == [1]
-    n_sets = len(ErrorModel.load(study.model_path).sets)
-    assert [row["instances"] for row in banks] == list(range(2, 1 + min(6, n_sets)))
-    for name in ("validation", "stretches", "learning", "banks"):
-        assert (study.folder / f"{name}.csv").exists()
+    for name in ("validation.csv", "validation.svg", "stretches.csv"):
+        assert (study.folder / name).exists()
     other_range = "odometry.parameters.keyframe_interval.high=20"
     with pytest.raises(ConfigurationError, match=r"keyframe_interval\.high has another value"):
         validate(load_study(study_file, [other_range], study.folder))
@@ -224,19 +211,7 @@ def test_a_bank_gains_where_no_set_is_better_than_another():
     assert "expected gain" in validation.verdict("adaptive")
     assert "of the weight on other sets than fixed" in validation.verdict("adaptive")
     assert all(0.2 < left_out.adapted["adaptive"] < 1.0 for left_out in validation.left_out)
-    banks = bank_curve(labelled(sequences))
-    assert [row["instances"] for row in banks] == [2, 3, 4, 5]
-    assert banks[1] == {"instances": 3} | validation.summary("adaptive")
     assert not leave_one_out(labelled(sequences), {}, bank=0).modes
-
-
-def test_a_bank_learns_from_few_stretches():
-    rng = np.random.default_rng(6)
-    sequences = [with_motions(f"s{i}", rng, 120) for i in range(6)]
-    rows = learning_curve(labelled(sequences), bank=2)
-    assert [row["stretches"] for row in rows] == [3, 5]
-    all_of_them = leave_one_out(labelled(sequences), {}, bank=2)
-    assert rows[1] == {"stretches": 5} | all_of_them.summary("adaptive")
 
 
 def judged(data, study, monkeypatch, given=()):

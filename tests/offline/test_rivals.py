@@ -1,5 +1,3 @@
-import itertools
-
 import numpy as np
 import pytest
 from labelled_places import TRIALS, labelled, two_kinds, with_motions
@@ -9,9 +7,7 @@ from adaptune.model import BankSettings, PairedSettings
 from adaptune.model.rules import Costs, SetCost
 from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
 from adaptune.study.study import BEST_DEFAULT, EQUAL_COST
-from offline.frontier import frontier
 from offline.leave_one_out import PAIRED, leave_one_out
-from offline.pictures import CANCELLING, draw_frontier
 from offline.tuning import NO_BANK, Policy, driven_cost, rivals
 
 ONE = ParameterSpace({"x": Float(low=0.0, high=9.0, baseline=1.0)})
@@ -100,23 +96,6 @@ def test_without_costs_there_is_no_rival_of_equal_cost(validation):
     found = leave_one_out(known._replace(costs=None), {}, bank=0)
     assert EQUAL_COST not in found.ratios
     assert np.isnan(found.cost("fixed"))
-    assert frontier(known._replace(costs=None), found, None) == []
-
-
-def test_error_against_cost(validation, tmp_path):
-    known, found = validation
-    points = frontier(known, found, BankSettings())
-    sets = [p for p in points if p.what in ("gicp", "ndt")]
-    assert [p.cost for p in sets] == [COSTS.alone(t) for t in TRIALS]
-    banks = [p for p in points if p.what == CANCELLING]
-    assert [p.name for p in banks] == ["2", "3", "4", "5"]
-    assert all(a.cost < b.cost for a, b in itertools.pairwise(banks))
-    modes = {p.what: p for p in points}
-    assert modes["fixed"].ratio == 1.0
-    assert modes[PAIRED].ratio == pytest.approx(np.exp(np.log(found.ratios[PAIRED]).mean()))
-    draw_frontier(tmp_path / "costs.png", "test", points, 30.0)
-    text = (tmp_path / "costs.svg").read_text()
-    assert all(label in text for label in ("gicp", "ndt", "adaptive", "budget", "CPU time"))
 
 
 def test_a_bank_stays_within_the_budget():

@@ -200,13 +200,3 @@ def test_without_an_extent_a_sequence_is_one_stretch():
     folds = labelled([plain, replace(plain, name="b"), replace(plain, name="a+noise")]).folds()
     names = [[s.name for s in others.sequences] for _, others in folds]
     assert names == [["b"], ["a", "a+noise"]]
-
-
-def test_stretches_are_drawn_with_their_views():
-    rng = np.random.default_rng(3)
-    one = in_stretches(with_motions("one", rng, 700))
-    data = labelled([one, replace(one, name="one+noise")])
-    some = data.drawn(2, np.random.default_rng(0))
-    known = [np.unique(s.stretch).tolist() for s in some.sequences]
-    assert known[0] == known[1]
-    assert len(known[0]) == 2

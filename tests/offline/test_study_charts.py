@@ -115,11 +115,7 @@ def test_validation_is_read_or_missed(study):
     (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
     charts, notes = charts_of_validation(study)
     assert [chart.key for chart in charts] == ["stretches"]
-    assert notes == ["No costs of banks and modes: they were not measured."]
-    costs = [{"what": "set", "name": "0", "ms a scan": 1.0, "ratio": None}]
-    costs += [{"what": "set", "name": str(i), "ms a scan": 1.0 + i, "ratio": 1.0} for i in (1, 2)]
-    (study.folder / "costs.json").write_text(json.dumps(costs), "utf-8")
-    assert [c.key for c in charts_of_validation(study).charts] == ["stretches", "frontier"]
+    assert notes == []
 
 
 @pytest.mark.parametrize("text", ["[{", "{}x", '{"a": 1}', '[{"a": 1}]', "[1]"])

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.report.chart import Band, Line, Points
-from offline.charts import MOST_NAMED, frontier_chart, stretch_chart
-from offline.pictures import CANCELLING
+from offline.charts import MOST_NAMED, stretch_chart
 from offline.tuning import figures
 
 
@@ -44,28 +43,3 @@ def test_many_recordings_are_not_named():
     assert len(points.x) == 2 * (MOST_NAMED + 1)
     assert set(points.texts) == {f"drive_{r}" for r in range(MOST_NAMED + 1)}
     assert stretch_chart([]) is None
-
-
-def test_the_frontier_marks_modes_and_banks():
-    rows = [
-        {"what": what, "name": name, "ms a scan": ms, "ratio": ratio}
-        for what, name, ms, ratio in (
-            ("set", "0", 3.0, 1.5),
-            ("set", "1", 4.0, 1.0),
-            ("set", "2", 5.0, 20.0),
-            ("set", "3", np.nan, 0.1),
-            (CANCELLING, "2", 8.0, 0.9),
-            (CANCELLING, "3", 12.0, 0.8),
-            ("baseline", "baseline", 3.0, 1.5),
-            ("fixed", "fixed", 4.0, 1.0),
-        )
-    ]
-    chart = frontier_chart(rows, budget=10.0)
-    (panel,) = chart.panels
-    named = {d.name: d for d in panel.drawn if isinstance(d, Points)}
-    assert list(named) == ["set", "bank of 2, 3, ... members", "baseline", "fixed"]
-    front = next(d for d in panel.drawn if isinstance(d, Line))
-    assert (list(front.x), list(front.y)) == ([3.0, 4.0], [1.5, 1.0])
-    assert panel.y.limits == pytest.approx((0.72, 5.0))
-    assert [m.at for m in panel.drawn if not hasattr(m, "name")] == [10.0, 1.0]
-    assert frontier_chart([]) is None
