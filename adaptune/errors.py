@@ -57,7 +57,15 @@ def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
         raise NotInstalledError(what) from error
 
 
-RENAMED = {"online.switching.beside": "online.switching.catch_up_scans"}
+RENAMED: dict[str, str] = {}
 """Keys of a study's earlier versions, and their present names."""
-DELETED = {"offline.search": "is gone: a search is always for single sets; leave it out"}
+_NO_HAND_OVER = "is gone with the hand-over, which gained nothing; leave it out"
+DELETED = {
+    "offline.search": "is gone: a search is always for single sets; leave it out",
+    "online.dwell": "is gone: selections do not wait; leave it out",
+    "online.switching.beside": _NO_HAND_OVER,
+    "online.switching.catch_up_scans": _NO_HAND_OVER,
+    "online.switching.full_rate": _NO_HAND_OVER,
+    "online.switching.stride": _NO_HAND_OVER,
+}
 """Keys of earlier versions that are gone, and what became of them."""

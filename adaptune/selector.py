@@ -84,13 +84,8 @@ class Selector:
         Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
         weighs them, others choose among them. None takes the model's bank for the paired rule if
         that is what is driven; an empty one is for a single odometry.
-    switch_cost
-        What a switch must promise, as a share of the fixed set's error.
     descriptors
         Descriptors besides adaptune's own that may be used: a model that names another is refused.
-    dwell
-        Seconds for which a set stays at least, unless it does worse than predicted. The weights of
-        a bank do not wait.
     measures
         Whether `measure` measures anything; if not, only the training counts.
 
@@ -115,9 +110,7 @@ class Selector:
         model: ErrorModel,
         rule: str = RULES[0],
         members: Sequence[int] | None = None,
-        switch_cost: float = 0.0,
         descriptors: Collection[str] = (),
-        dwell: float = 0.0,
         measures: bool = True,
     ):
         model.check_descriptors(descriptors)
@@ -127,7 +120,6 @@ class Selector:
         self.members = tuple(members)
         self.fixed = self.members[0] if self.members else model.fixed
         self._model = model
-        self._dwell = dwell * 1e9
         self._measures = measures
         self._pca = model.pca()
         weighs = bool(self.members) and rule == "adaptive"
@@ -136,7 +128,7 @@ class Selector:
         self._always = [member for member in self.members if member not in self._reserve]
         # A bank that need not always work weighs its members where it does.
         settings = model.bank_settings.model_copy(update={"adapt": True})
-        fitted = BankRule(settings) if weighs else make_rule(rule, model.paired, switch_cost)
+        fitted = BankRule(settings) if weighs else make_rule(rule, model.paired)
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
         self._live = LiveEvidence(self.members, model.length)
         self._describe = Describer(model.blocks)
@@ -228,15 +220,8 @@ class Selector:
         if selection.weights is not None:
             selection = self._smoothed(selection)
         elif selection.trial != self._current:
-            if (current := self._kept()) is not None:
-                selection = selection._replace(
-                    trial=current,
-                    parameters=self._model.sets[current],
-                    predicted_error=self._predicted,
-                )
-            else:
-                self._live.forget()  # the hops were those of another set
-                self._switched = self._stamp
+            self._live.forget()  # the hops were those of another set
+            self._switched = self._stamp
         self._current, self._predicted = selection.trial, selection.predicted_error
         self._resting = selection.resting
         return self._live.estimated(selection)
@@ -265,8 +250,8 @@ class Selector:
                 return found._replace(resting=self._reserve)
             return self._rule.weigh(near, self._live.squares())
         if isinstance(self._rule, PairedExpectedRatio):
-            return self._rule.select(feature, self._current, self._worse_than_predicted())
-        return self._rule.select(feature, self._current)
+            return self._rule.select(feature, self._worse_than_predicted())
+        return self._rule.select(feature)
 
     def _is_enough(self, familiarity: float, predicted: float) -> bool:
         """Whether the members that always work are enough.
@@ -297,12 +282,6 @@ class Selector:
             elif error is not None and error.low > WORSE * self._predicted:
                 self._worse[current] = _Worse(error.mean, seconds + REMEMBERED)
         return {trial: worse.error for trial, worse in self._worse.items()}
-
-    def _kept(self) -> int | None:
-        """The current set, if it has just been selected and does not do worse than predicted."""
-        if self._current in self._worse or self._stamp - self._switched >= self._dwell:
-            return None
-        return self._current
 
     def _motion(self) -> NDArray[np.float64]:
         """Speed and turn rate over the last second of registered scans, of shape (2,)."""

@@ -44,9 +44,9 @@ class OfLess(Rule):
         """See `Rule.predict`."""
         return self.rule.predict(feature)
 
-    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
+    def select(self, feature: NDArray[np.float64]) -> Selection:
         """See `Rule.select`."""
-        return self.rule.select(feature, current)
+        return self.rule.select(feature)
 
 
 def thinned(data: TrainingData, every: int) -> TrainingData:

@@ -1,14 +1,13 @@
-"""The time that adapters add to their odometries, and the error that a switch adds.
+"""The time that adapters add to their odometries, and what becomes of faults.
 
     python benchmarks/odometry.py adapters RECORDING.bag [METRES]
-    python benchmarks/odometry.py switching RECORDING.bag [ODOMETRY ...]
     python benchmarks/odometry.py faults
 
 The recording is that of a simulated course, as `adaptune simulate` writes it, or another one with
 the same topics. *adapters* runs every installed odometry with its default parameters. It prints the
 time for a scan, the part of it that is not spent in the odometry's own code, and the time that a
 process of its own adds. Limit: 5 % of the odometry's time, or 0.3 ms where that is more.
-*switching* hands over to the same parameters every 5 s. The RTE is over 25 m, or the given METRES.
+The RTE is over 25 m, or the given METRES.
 All times are CPU time on one core, medians, so that other work on the machine counts less. *faults*
 plants each kind of fault at the fourth scan.
 """
@@ -23,25 +22,18 @@ import numpy as np
 import small_gicp
 
 from adaptune import files, processes
-from adaptune.bank.hand_over import HandOver
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import InProcess, OdometryInstance, WarmUp
+from adaptune.odometry import InProcess, OdometryInstance
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan, SequenceError
 from adaptune.recording.opening import open_sequence
 from adaptune.recording.views import WithImu
-from adaptune.selection import Selection
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence
 
 LENGTH = 25.0
-WARM_UPS = (
-    *(WarmUp(seconds, seconds, 1) for seconds in (2.0, 4.0, 8.0, 12.0)),
-    WarmUp(12.0, 4.0, 2),
-)
-EVERY = 5.0
 SOME = 30
 """Scans for which another process is measured."""
 
@@ -94,14 +86,11 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
     return scans, reference.at(np.array([scan.stamp for scan in scans]))
 
 
-def run(
-    odometry: OdometryInstance, scans: list[Scan], before: Callable[[int], None] = lambda _: None
-) -> tuple[Poses, float]:
+def run(odometry: OdometryInstance, scans: list[Scan]) -> tuple[Poses, float]:
     """Poses, and the median CPU time for a scan in milliseconds."""
     odometry.start(odometry.prepare(scans[0]), np.eye(4))
     poses, at = [np.eye(4)], []
-    for i, scan in enumerate(scans[1:], start=1):
-        before(i)
+    for scan in scans[1:]:
         poses.append(odometry.register(odometry.prepare(scan)).T_odom_sensor)
         # Another process reports its CPU time with each pose, not before the first.
         at.append(computed(odometry))
@@ -162,60 +151,8 @@ def adapters(path: Path, length: float) -> None:
         rte = np.nanmean(sub_trajectory_rte(T_ref, poses, length))
         print(
             f"{name:16} {rte:6.3f} {whole:6.1f} {added:6.2f} ({added / (whole - added):4.0%})"
-            f"  {isolated:>8}       {'itself' if cls.live else 'bank, hand-over'}",
+            f"  {isolated:>8}       {'itself' if cls.live else 'bank'}",
             flush=True,
-        )
-
-
-def rte_of(
-    odometry: OdometryInstance,
-    scans: list[Scan],
-    T_ref: Poses,
-    switch: Callable[[int], None] | None = None,
-) -> float:
-    """RTE in percent of an odometry that has to switch every `EVERY` seconds."""
-    first = scans[0].stamp
-
-    def before(i: int) -> None:
-        now, last = ((scans[k].stamp - first) // int(EVERY * 1e9) for k in (i, i - 1))
-        if switch is not None and now > last:
-            switch(now)
-
-    poses, _ = run(odometry, scans, before)
-    return float(np.nanmean(sub_trajectory_rte(T_ref, poses, LENGTH)))
-
-
-def there_and_back(odometry: InProcess) -> None:
-    """Change all real numbers a little and back, so that an odometry does the work of a switch."""
-    real = {name: v for name, v in odometry.odometry.parameters.items() if isinstance(v, float)}
-    odometry.apply(Selection(0, {name: v * (1.0 + 1e-9) for name, v in real.items()}))
-    odometry.apply(Selection(0, real))
-
-
-def switching(path: Path, names: list[str]) -> None:
-    """Print the RTE of hand-overs to the same parameters, for every length of warm-up."""
-    scans, T_ref = read(path)
-    heads = [f"{w.seconds:.0f} s" for w in WARM_UPS[:-1]] + ["sparse"]
-    print("odometry           alone " + "".join(f"{head:>10}" for head in heads) + "   itself")
-    for name in names:
-        cls = odometry_class(name)
-
-        def make(_: Any, name: str = name, cls: Any = cls) -> OdometryInstance:
-            if cls.clean:
-                return InProcess(cls())
-            return Isolated(name, {}, cls.settings_type(), Limits())
-
-        row = [rte_of(make({}), scans, T_ref)]
-        for warm_up in WARM_UPS:
-            odometry = HandOver(make, {"number": 0}, warm_up)
-            switch = lambda n, one=odometry: one.apply(Selection(n, {"number": n}))  # noqa: E731
-            row.append(rte_of(odometry, scans, T_ref, switch))
-        itself = ""
-        if cls.live:
-            live = InProcess(cls())
-            itself = f"{rte_of(live, scans, T_ref, lambda _, live=live: there_and_back(live)):8.3f}"
-        print(
-            f"{name:16} {row[0]:7.3f} " + "".join(f"{r:10.3f}" for r in row[1:]), itself, flush=True
         )
 
 
@@ -245,7 +182,5 @@ if __name__ == "__main__":
         adapters(Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else LENGTH)
     elif sys.argv[1:] == ["faults"]:
         faults()
-    elif len(sys.argv) > 2 and sys.argv[1] == "switching":
-        switching(Path(sys.argv[2]), sys.argv[3:] or ["gicp", "vgicp", "kiss_icp", "mad_icp"])
     else:
         sys.exit(__doc__)

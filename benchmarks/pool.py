@@ -33,7 +33,6 @@ from replays import ORDERS, mean_error
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.ndt import N_FEATURES
-from adaptune.odometry.base import WarmUp
 from adaptune.odometry.remote import SERVICE
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server
@@ -122,7 +121,7 @@ def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, Replay]]:
 def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> Replay:
     """Replay scans with the model's bank."""
     sets = {trial: model.sets[trial] for trial in model.bank}
-    bank = Bank(pool(), sets, WarmUp())
+    bank = Bank(pool(), sets)
     result = replay(scans, bank, HealthCheck(), Selector(model, PAIRED, list(sets)))
     bank.close()
     return result

@@ -31,7 +31,6 @@ from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
-from adaptune.odometry.base import WarmUp
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Limits
@@ -47,7 +46,6 @@ from adaptune.study.config import RealTimeConfig
 from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import kept_up
 from online.replay import replay
-from online.switch_cost import Alternating
 
 REPEATS = 5
 SETTINGS = {"downsampling": 0.5}
@@ -82,14 +80,14 @@ def bare(scans: Iterable[Scan]) -> None:
             odometry.start(prepared, np.eye(4))
 
 
-def single(scans: Iterable[Scan], selector: Alternating | None = None) -> None:
+def single(scans: Iterable[Scan]) -> None:
     """Replay with one instance."""
-    replay(scans, GICP(), HealthCheck(), selector)
+    replay(scans, GICP(), HealthCheck())
 
 
 def of_four(scans: Iterable[Scan]) -> None:
     """Replay with a bank of four on two cores, and no selector."""
-    bank = Bank(GICP, dict(zip(SETS.trials, SETS.parameters, strict=True)), WarmUp(), cores=2)
+    bank = Bank(GICP, dict(zip(SETS.trials, SETS.parameters, strict=True)), cores=2)
     with closing(bank):
         replay(scans, bank, HealthCheck())
 
@@ -100,9 +98,6 @@ def lockstep(bag: Path) -> None:
     bare(sequence)  # decodes the recording
     seconds, ratio = compared(lambda: bare(sequence), lambda: single(sequence))
     print(f"lockstep: {seconds:.2f} s bare, a replay takes {ratio:.3f} times as long", flush=True)
-    adapting = Alternating([SPACE.baseline, SPACE.baseline])
-    seconds, ratio = compared(lambda: single(sequence), lambda: single(sequence, adapting))
-    print(f"one set applied each second: {ratio:.3f} times as long", flush=True)
 
 
 def spread_bank(scans: list[Scan]) -> None:

@@ -26,7 +26,7 @@ from adaptune.model import ErrorModel
 from adaptune.model.ndt import N_FEATURES
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.model.weights import weighted_selection
-from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
+from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
@@ -91,7 +91,7 @@ def untrained(factory: OdometryFactory) -> Way:
     """A bank of which nothing is known."""
     sets = untrained_sets(factory.space)
     members = dict(zip(sets.trials, sets.parameters, strict=True))
-    return lambda: Bank(factory, members, WarmUp()), UntrainedSelector(sets, SUB_TRAJECTORY)
+    return lambda: Bank(factory, members), UntrainedSelector(sets, SUB_TRAJECTORY)
 
 
 def bank_of(
@@ -107,7 +107,7 @@ def bank_of(
         bank_settings=chosen.bank,
     )
     selector = Selector(of_bank, "adaptive", chosen.members)
-    return chosen, (lambda: Bank(factory, members, WarmUp()), selector)
+    return chosen, (lambda: Bank(factory, members), selector)
 
 
 def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, Way]:

@@ -140,6 +140,7 @@ class LabelledData(NamedTuple):
     costs: Costs | None = None  # of the sets, as far as they are known
     # Milliseconds of CPU time a scan that may be spent, live evidence included.
     budget: float | None = None
+    live: bool = True  # whether the odometry changes from one set to another between scans
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
         """The same with some of the sets."""
@@ -420,7 +421,7 @@ def labelled_data(
         labelled.append(replace(found, recorded_in=recorded_in(name)))
     cut_up = _with_cuts(_with_whole_runs(archive, labelled, sets, config))
     costs = measured_costs(archive, run, sets, odometry)
-    return LabelledData(cut_up, sets, costs, config.online.budget)
+    return LabelledData(cut_up, sets, costs, config.online.budget, odometry.description.live)
 
 
 def _check_finished(archive: Archive, run: Mapping[str, Sequence[int]]) -> None:

@@ -219,7 +219,7 @@ def choose(
     most
         Number of folds at most, evenly chosen.
     one_set
-        Whether one set at a time is considered.
+        Whether one set at a time is considered, where the odometry can change it.
     fixed
         Trial number of the fixed set, `LabelledData.fixed` by default.
     """
@@ -228,7 +228,7 @@ def choose(
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
     fixed = data.fixed() if fixed is None else fixed
     choosers = _choosers(bank, data) if _has_motions(data) else {}
-    one_set = one_set and _may_measure(data, fixed)
+    one_set = one_set and data.live and _may_measure(data, fixed)
     banks = {way: make(data, fixed) for way, make in choosers.items()}
     banks = {way: members for way, members in banks.items() if len(members) > 1}
     members = next(iter(banks.values()), [])

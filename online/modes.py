@@ -9,10 +9,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from adaptune.bank.bank import Bank
-from adaptune.bank.hand_over import HandOver
 from adaptune.model import ErrorModel
 from adaptune.model.weights import weighted_selection
-from adaptune.odometry.base import Motions, OdometryInstance, WarmUp
+from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.factory import Factory
 from adaptune.processes import together
 from adaptune.recording.scan import Scan, part_name
@@ -119,8 +118,6 @@ SINGLES = ("one_set", RANDOM)
 """Those that drive one set at a time."""
 WITHOUT_MODEL = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
-CATCH_UP_SCANS = 4
-"""Of a hand-over in real time, unless the study says otherwise: the sensor does not wait."""
 
 
 class Mode(NamedTuple):
@@ -137,16 +134,14 @@ class ReplaySetup:
     odometry: Factory
     rules: tuple[str, ...]  # selection rules to compare
     switching: SwitchingConfig
-    mechanism: Mechanism  # how the odometry changes its parameters
-    warm_up: WarmUp
+    mechanism: Mechanism | None  # how the odometry changes its parameters
+    warm_up: float  # seconds of scans that a member of a bank sees when it restarts
     sub_trajectory: float  # metres
     lost_track: float  # metres a second by which the members of a bank may differ and agree
-    switch_cost: float  # what a switch must promise, as a share of the fixed set's error
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
     real_time: RealTimeConfig | None = None
     pins: Mapping[str, Any] = field(default_factory=dict)  # values that parameters have in all sets
-    dwell: float = 0.0  # seconds for which a set stays at least
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
 
     @property
@@ -166,12 +161,10 @@ class ReplaySetup:
             study.warm_up,
             config.sub_trajectory,
             config.lost_track,
-            study.switch_cost(),
             config.descriptor.names,
             config.online.budget,
             config.online.real_time,
             config.online.pin,
-            config.online.dwell,
             config.online.also,
         )
 
@@ -183,7 +176,8 @@ class ReplaySetup:
         """
         rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
         also = [m for m in self.also if self.twin(m, model) == m and not self.obstacle(m, model)]
-        modes = {BASELINE, *rivals, "fixed", *self.rules, *also}
+        rules = [rule for rule in self.rules if self._mechanism(rule, model) is not None]
+        modes = {BASELINE, *rivals, "fixed", *rules, *also}
         return tuple(mode for mode in LINES if mode in modes)
 
     def twin(self, mode: str, model: ErrorModel) -> str:
@@ -278,24 +272,17 @@ class ReplaySetup:
         about = {"mode": mode, "parameters": None, "model": None, "switching": None}
         if mode == UNTRAINED:
             members = list(self.untrained_sets().parameters)
-            warm_up = self.warm_up._asdict()
-            return about | {
-                "switching": {"mechanism": "bank", "members": members, "warm_up": warm_up}
-            }
+            switching = {"mechanism": "bank", "members": members, "warm_up": self.warm_up}
+            return about | {"switching": switching}
         if not self.adapts(mode):
             return about | {"parameters": self.parameters(mode, model)}
-        used = {"live": set[str](), "hand_over": {"catch_up_scans"}, "bank": {"size", "sets"}}
         mechanism = self._mechanism(mode, needed(mode, model))
-        used[mechanism] |= used["bank"] if mode == RANDOM else set()
-        settings = self.switching.model_dump(mode="json", include=used[mechanism])
-        if mechanism != "live":
-            settings["warm_up"] = self.warm_up._asdict()
+        used = {"size", "sets"} if mechanism == "bank" or mode == RANDOM else set()
+        settings = self.switching.model_dump(mode="json", include=used)
+        if mechanism == "bank":
+            settings["warm_up"] = self.warm_up
         if mode == RANDOM:
             settings["seed"] = SEED
-        elif mechanism != "bank":
-            settings |= {"switch_cost": self.switch_cost} | (
-                {"dwell": self.dwell} if self.dwell else {}
-            )
         settings["mechanism"] = mechanism
         return about | {"model": digest, "switching": settings}
 
@@ -345,12 +332,7 @@ class ReplaySetup:
         if mechanism == "bank":
             return self._bank(self.members(mode, model))
         fixed = model.sets[model.fixed]
-        if mechanism == "live":
-            return self.odometry(fixed)
-        scans = self.switching.catch_up_scans
-        if self.real_time is not None and not scans:
-            scans = CATCH_UP_SCANS
-        return HandOver(self.odometry, fixed, self.warm_up, scans)
+        return self.odometry(fixed)
 
     def selector(
         self,
@@ -374,15 +356,13 @@ class ReplaySetup:
             candidates = list(self.members(mode, model))
             seed = random_seed(sequence or "", repeat)
             return RandomSelector(model.sets, candidates, model.fixed, seed)
-        descriptors, dwell, rule = self.descriptors, self.dwell, mode
+        descriptors, rule = self.descriptors, mode
         if mode not in self.rules:
             model, rule = _adapting(model), "adaptive"
         if self._mechanism(mode, model) != "bank":
-            return Selector(model, rule, (), self.switch_cost, descriptors, dwell)
+            return Selector(model, rule, (), descriptors)
         members, measures = list(self.members(mode, model)), mode != LEARNED
-        return Selector(
-            model, rule, members, descriptors=descriptors, dwell=dwell, measures=measures
-        )
+        return Selector(model, rule, members, descriptors, measures)
 
     def members(self, mode: str, model: ErrorModel) -> dict[int, ParameterSet]:
         """The members of the bank that a mode drives, or among which it chooses.
@@ -426,7 +406,7 @@ class ReplaySetup:
         rate = None if self.real_time is None or waits else self.real_time.rate
         return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores, rate)
 
-    def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism:
+    def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism | None:
         if mode in BANKS:
             return "bank"
         mechanism = self.mechanism

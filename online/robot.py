@@ -329,7 +329,7 @@ class RobotDrive:
         if mode not in modes:
             raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
         if self._ros.steer is not None:
-            if mode not in setup.rules:
+            if mode not in config.online.rules:
                 raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
         elif study.odometry.description.whole:
             raise ModeError(
@@ -509,8 +509,7 @@ def _selector(
     """Make the selector; a node that is steered has one set at a time."""
     if not steers:
         return setup.selector(mode, model)
-    cost, names, dwell = setup.switch_cost, setup.descriptors, setup.dwell
-    return Selector(needed(mode, model), mode, (), cost, names, dwell)
+    return Selector(needed(mode, model), mode, (), setup.descriptors)
 
 
 def _topic(link: RosLink, name: str | None, kind: str, key: str) -> str:

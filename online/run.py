@@ -16,7 +16,7 @@ from adaptune.selection import Selection
 from adaptune.study.config import StudyConfig
 from adaptune.study.inputs import odometry_inputs
 from adaptune.study.references import ensure_references
-from adaptune.study.study import Study
+from adaptune.study.study import Study, cannot_adapt
 from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import (
@@ -81,12 +81,15 @@ def run_replays(
     model = setup.model(study, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
+    names = setup.modes(model)
+    if not {"adaptive", "paper"}.intersection(names):
+        _log.warning("only the fixed set is driven, because %s", cannot_adapt(study))
     for mode in setup.also:
         if (twin := setup.twin(mode, model)) != mode:
             _log.info("%s is not replayed again: %s drives the same", mode, twin)
         elif why := setup.obstacle(mode, model):
             _log.warning("%s is not replayed: %s", mode, why)
-    of = _Modes(setup, setup.modes(model), look, model, model_path)
+    of = _Modes(setup, names, look, model, model_path)
     return _replay_all(study, study.config.test, of, again, progress)
 
 

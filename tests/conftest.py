@@ -57,7 +57,6 @@ SLOW = [
     "adaptune/test_selector.py",
     "adaptune/model/test_knn.py",
     "online/test_untrained.py",
-    "online/test_switch_cost.py",
     "offline/test_estimated_training.py",
     "online/test_estimated_replays.py",
     "offline/test_storage.py",

@@ -4,7 +4,6 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from statistics import median
 from typing import Any, NamedTuple
@@ -25,10 +24,9 @@ from adaptune.odometry.base import (
     PreparedScan,
     Registration,
     Usage,
-    WarmUp,
 )
 from adaptune.odometry.factory import Factory
-from adaptune.recording.scan import Imu, Scan, joined
+from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.space import ODOMETRY, ParameterSet
 
@@ -46,40 +44,30 @@ class PastScan(NamedTuple):
     T_odom_sensor: Poses
     T_previous_current: Poses | None
 
-    @property
-    def imu(self) -> Imu | None:
-        """What the IMU measured since the scan before."""
-        return self.scan.scan.imu
-
 
 class RecentScans:
     """The scans of the last seconds.
 
     Parameters
     ----------
-    warm_up
-        Which of them a new instance sees.
+    seconds
+        How far back they go.
     """
 
-    def __init__(self, warm_up: WarmUp):
-        self._warm_up = warm_up
+    def __init__(self, seconds: float):
+        self._seconds = seconds
         self._past: deque[PastScan] = deque()
-        self._n_dropped = 0
-
-    def __bool__(self) -> bool:
-        return bool(self._past)
 
     def start(self, scan: PreparedScan, T_odom_sensor: Poses, motion: Poses | None) -> None:
         """Forget all scans and begin with this one."""
-        self._past, self._n_dropped = deque([PastScan(scan, T_odom_sensor, motion)]), 0
+        self._past = deque([PastScan(scan, T_odom_sensor, motion)])
 
     def add(self, scan: PreparedScan, T_odom_sensor: Poses) -> None:
         """Add the newest scan and drop those that are too old."""
         T_previous_current = invert(self.last.T_odom_sensor) @ T_odom_sensor
         self._past.append(PastScan(scan, T_odom_sensor, T_previous_current))
-        while len(self._past) > 1 and self._age(self._past[0]) > self._warm_up.seconds:
+        while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._seconds:
             self._past.popleft()
-            self._n_dropped += 1
 
     @property
     def last(self) -> PastScan:
@@ -88,27 +76,7 @@ class RecentScans:
 
     def replay_to(self, odometry: OdometryInstance) -> "Successor":
         """Start an instance with the first of these scans; the others wait for it."""
-        _, full_rate, stride = self._warm_up
-        seen: list[PastScan] = []
-        missed: list[Imu] = []
-        for number, past in enumerate(self._past, self._n_dropped):
-            if self._age(past) <= full_rate or number % stride == 0:
-                seen.append(self._with_imu(past, missed))
-                missed = []
-            elif seen and past.imu is not None:
-                missed.append(past.imu)
-        return Successor(odometry, seen)
-
-    def _with_imu(self, past: PastScan, missed: list[Imu]) -> PastScan:
-        """A scan with all IMU measurements since the last scan that the instance sees."""
-        scan = past.scan.scan
-        if not missed or scan.imu is None:
-            return past
-        joint = replace(scan, imu=joined([*missed, scan.imu]))
-        return past._replace(scan=past.scan.with_scan(joint))
-
-    def _age(self, past: PastScan) -> float:
-        return (self.last.scan.stamp - past.scan.stamp) * 1e-9
+        return Successor(odometry, self._past)
 
 
 class Successor:
@@ -417,7 +385,7 @@ class Bank(OdometryInstance):
     sets
         Parameter sets by trial number. The first is the fixed one: it begins with all the weight.
     warm_up
-        Which scans a member sees when it restarts.
+        Seconds of the last scans that a member sees when it restarts.
     lost_track
         Metres a second by which motions may never differ and agree.
     cores
@@ -439,7 +407,7 @@ class Bank(OdometryInstance):
         self,
         make: Make,
         sets: Mapping[int, ParameterSet],
-        warm_up: WarmUp,
+        warm_up: float = 12.0,
         lost_track: float = 3.0,
         cores: int = 1,
         rate: float | None = None,

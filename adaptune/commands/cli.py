@@ -29,7 +29,6 @@ app = typer.Typer(
         "    adaptune learn    configs/demo.yaml my.bag    # learn from another drive\n\n"
         "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
         "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
-        "    adaptune switching configs/demo.yaml   # what a switch costs\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
         "    adaptune oracle   configs/demo.yaml    # what was there to gain, in hindsight?\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
@@ -45,7 +44,7 @@ for _command in (
     *(tools.inspect, tools.cache, tools.serve),
     *(offline.simulate, reference.reference),
     *(offline.offline, offline.learn, offline.trials, offline.validate, offline.oracle),
-    *(online.online, online.switching, online.compare, online.record),
+    *(online.online, online.compare, online.record),
     *(report.report, importing.import_rustle),
 ):
     app.command()(_command)

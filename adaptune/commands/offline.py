@@ -278,9 +278,5 @@ def learn(
         say(sentence)
     say(f"Learned drives: {loaded.folder / 'learned.yaml'}")
     say(f"Error model: {loaded.model_path}")
-    if (loaded.folder / "switching.json").exists():
-        why = "the switch cost was measured without this drive"
-        say_next_of_study(why, "switching", study, override, folder)
-        return
     several, test = bool(lesson.training.model.expected), lesson.study.config.test
     say_next_of_trained(several, test, study, override, folder)

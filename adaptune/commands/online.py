@@ -21,7 +21,6 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next_of_study,
-    say_next_online,
 )
 from adaptune.errors import AdaptuneError
 
@@ -193,41 +192,6 @@ def _drive(
         driven = drive.run(link, dashboard.look)
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
     say(f"{driven.scans} scans{dropped}: {driven.folder}/")
-
-
-def switching(
-    study: StudyFile,
-    override: Override = [],  # noqa: B006
-    folder: Folder = None,
-    seconds: Annotated[
-        float, typer.Option(help="Seconds of every training sequence to use.", min=10.0)
-    ] = 60.0,
-) -> None:
-    """Measure what a change of parameters costs during a replay.
-
-    Replays the training sequences with the odometry's own parameters, and switches every 5 s to the
-    same parameters: with every mechanism that the odometry supports, and several warm-ups. The
-    study keeps the switch cost of one set at a time, which selections take into account.
-    """
-    loaded = load(study, override, folder)
-    from adaptune.report import tables as report
-    from adaptune.study.references import estimates_in_words
-    from online.switch_cost import measure_switching, switch_cost_in_words
-
-    with progress() as show:
-        rows, caption = measure_switching(loaded, seconds, show)
-    console.print(
-        report.table(
-            f"RTE over {loaded.config.sub_trajectory:g} m as a ratio to that without switching",
-            rows,
-            caption,
-        )
-    )
-    for sentence in estimates_in_words(loaded, loaded.config.training):
-        say(sentence)
-    say(switch_cost_in_words(loaded))
-    say(f"Kept in {loaded.folder / 'switching.json'}.")
-    say_next_online(loaded.config.test, study, override, folder)
 
 
 def compare(

@@ -9,8 +9,8 @@ RULES = ("adaptive", "paper")
 """Names of the selection rules; the first is the default."""
 
 
-def make_rule(name: str, settings: PairedSettings, switch_cost: float = 0.0) -> Rule:
-    """Make a selection rule for a single odometry; `paper` has neither settings nor switch cost.
+def make_rule(name: str, settings: PairedSettings) -> Rule:
+    """Make a selection rule for a single odometry; `paper` has no settings.
 
     Raises
     ------
@@ -23,7 +23,7 @@ def make_rule(name: str, settings: PairedSettings, switch_cost: float = 0.0) -> 
         from adaptune.model.knn import NearestNeighbours  # compiled code, which few need
 
         return NearestNeighbours()
-    return PairedExpectedRatio(settings, switch_cost)
+    return PairedExpectedRatio(settings)
 
 
 __all__ = [

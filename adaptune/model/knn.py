@@ -213,7 +213,6 @@ class NearestNeighbours(Rule):
     def select(
         self,
         feature: NDArray[np.float64],
-        current: int | None = None,  # noqa: ARG002
     ) -> Selection:
         """See `Rule.select`."""
         sets = self.data_.sets

@@ -406,7 +406,7 @@ class Rule(ABC):
         """
 
     @abstractmethod
-    def select(self, feature: NDArray[np.float64], current: int | None = None) -> Selection:
+    def select(self, feature: NDArray[np.float64]) -> Selection:
         """Choose a set, or weights, for one scan.
 
         Parameters
@@ -490,15 +490,12 @@ class PairedExpectedRatio(Rule):
     ----------
     settings
         `offline.tuning` chooses them on the training sequences.
-    switch_cost
-        What a switch must promise besides, as a share of the fixed set's error.
     """
 
     gated = True
 
-    def __init__(self, settings: PairedSettings | None = None, switch_cost: float = 0.0):
+    def __init__(self, settings: PairedSettings | None = None):
         self.settings = settings or PairedSettings()
-        self.switch_cost = switch_cost
 
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
@@ -587,7 +584,6 @@ class PairedExpectedRatio(Rule):
     def select(
         self,
         feature: NDArray[np.float64],
-        current: int | None = None,
         measured: Mapping[int, float] | None = None,
     ) -> Selection:
         """See `Rule.select`.
@@ -596,8 +592,6 @@ class PairedExpectedRatio(Rule):
         ----------
         feature
             The scan's scaled descriptor, of shape (n_features,).
-        current
-            Trial number of the set that the odometry has now.
         measured
             By trial number, errors in percent of sets that did worse than predicted.
         """
@@ -613,13 +607,6 @@ class PairedExpectedRatio(Rule):
             of_known = [(errors[trial], trial != BASELINE) for trial in self._known]
             best = min(range(len(of_known)), key=of_known.__getitem__)
         familiarity = float(near.evidence.familiarity[0])
-        at = self._known.index(current) if current in self._known else None
-        # In a place unlike all training, a switch back to the fixed set need not pay. Nor need a
-        # switch away from a set that is expected to be worse than the fixed one.
-        weighs = self.settings.adapt and self.switch_cost > 0.0 and not familiarity < NOVEL
-        weighs = weighs and current not in measured
-        if weighs and at is not None and cautious[best] + self.switch_cost >= cautious[at] <= 1.0:
-            best = at
         trial = self._known[best]
         return Selection(
             trial,

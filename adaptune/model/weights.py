@@ -166,7 +166,6 @@ class BankRule(Rule):
     def select(
         self,
         feature: NDArray[np.float64],
-        current: int | None = None,  # noqa: ARG002 - nothing is switched
     ) -> Selection:
         """See `Rule.select`; by the training alone."""
         return self.weigh(self.near(feature[None]), None)

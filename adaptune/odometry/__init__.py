@@ -10,7 +10,6 @@ from adaptune.odometry.base import (
     OdometryInstance,
     Registration,
     Usage,
-    WarmUp,
 )
 
 __all__ = [
@@ -23,5 +22,4 @@ __all__ = [
     "OdometryInstance",
     "Registration",
     "Usage",
-    "WarmUp",
 ]

@@ -39,14 +39,6 @@ class RangeSettings(BaseSettings):
     deskew: bool = True
 
 
-class WarmUp(NamedTuple):
-    """Which of the last scans a new instance sees before it takes over."""
-
-    seconds: float = 12.0  # how far back they go
-    full_rate: float = 4.0  # seconds before the newest scan in which it sees every scan
-    stride: int = 1  # of the scans before those, it sees every `stride`-th
-
-
 class Registration(NamedTuple):
     """Where an odometry believes the sensor was at the scan's stamp."""
 
@@ -104,7 +96,7 @@ class Description(NamedTuple):
     space: ParameterSpace | None
     live: bool
     needs_imu: bool = False
-    warm_up: WarmUp = WarmUp()
+    warm_up: float = 12.0  # seconds of scans that a member of a bank sees when it restarts
     whole: bool = False
 
 
@@ -260,8 +252,9 @@ class Odometry(ABC):
         the process; class attribute. Others run in a process of their own.
     needs_imu : bool
         Whether scans must bring along what an IMU measured; class attribute.
-    warm_up : WarmUp
-        The warm-up of a new instance that takes over, unless a study sets another; class attribute.
+    warm_up : float
+        Seconds of the last scans that a member of a bank sees when it restarts, unless a study says
+        otherwise; class attribute.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -284,7 +277,7 @@ class Odometry(ABC):
     live: ClassVar[bool]
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
-    warm_up: ClassVar[WarmUp] = WarmUp()
+    warm_up: ClassVar[float] = 12.0
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -331,7 +324,7 @@ class Odometry(ABC):
         if not self.live:
             raise OdometryError(
                 f"{type(self).__name__} cannot change its parameters between scans: "
-                f"set online.switching.mechanism to hand_over or bank"
+                f"set online.switching.mechanism to bank"
             )
         self.parameters |= self._known(parameters)
 

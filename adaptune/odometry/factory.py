@@ -30,7 +30,6 @@ from adaptune.odometry.base import (
     OdometryInstance,
     Registration,
     Usage,
-    WarmUp,
 )
 from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.registry import (
@@ -280,12 +279,12 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
         return declare_here(name, settings, folder)
     given = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
     answer = _ask(name, json.dumps(given, default=str), str(folder or ""))
-    space, warm_up = ParameterSpace.load(answer["space"]), WarmUp(*answer["warm_up"])
+    space = ParameterSpace.load(answer["space"])
     complete = answer["settings"]
     return Declaration(
         None if complete is None else UserSettings(complete),
         [Mistake(tuple(key), message) for key, message in answer["mistakes"]],
-        Description(space, answer["live"], answer["needs_imu"], warm_up, answer["whole"]),
+        Description(space, answer["live"], answer["needs_imu"], answer["warm_up"], answer["whole"]),
         answer["clean"],
         answer["module"],
     )
@@ -574,11 +573,7 @@ class OdometryPool:
             self.space,
             live=False,
             needs_imu=any(one.needs_imu for one in every),
-            warm_up=WarmUp(
-                max(one.warm_up.seconds for one in every),
-                max(one.warm_up.full_rate for one in every),
-                min(one.warm_up.stride for one in every),
-            ),
+            warm_up=max(one.warm_up for one in every),
             whole=any(one.whole for one in every),
         )
 

@@ -127,7 +127,7 @@ def _declared(name: str, message: processes.Message) -> dict[str, Any]:
     described = found.description
     assert described is not None  # it is a class
     return wire.about(described) | {
-        "warm_up": list(described.warm_up),
+        "warm_up": described.warm_up,
         "whole": described.whole,
         "clean": found.clean,
         "module": found.module,

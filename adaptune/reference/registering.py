@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify
 from adaptune.live.hops import Hop, HopCloud, register
-from adaptune.odometry.base import InProcess, Odometry, WarmUp
+from adaptune.odometry.base import InProcess, Odometry
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.scan import Scan
@@ -64,7 +64,7 @@ class Consensus:
             return InProcess(adapter(*POOL[int(parameters["number"])]))
 
         sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
-        self._bank = Bank(make, sets, WarmUp(seconds=_WARM_UP))
+        self._bank = Bank(make, sets, _WARM_UP)
         even = dict.fromkeys(sets, 1.0)
         self._bank.apply(Selection(trial=0, parameters={}, weights=even))
         self._tracker = Tracker(self._bank, HealthCheck())

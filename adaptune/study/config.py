@@ -92,30 +92,26 @@ class DescriptorConfig(StrictModel):
         return {"names": data} if isinstance(data, list) else data
 
 
-def _catches_up(scans: int) -> int:
-    if scans == 1:
-        raise ValueError("with 1 a new instance never catches up; give 0, or 2 or more")
-    return scans
-
-
 MOST_MEMBERS = 6
 """Of a bank."""
+
+
+def _mechanism(name: Any) -> Any:
+    if name == "hand_over":
+        raise ValueError("hand_over is gone (it gained nothing); give auto, live or bank")
+    return name
 
 
 class SwitchingConfig(StrictModel):
     """How the odometry changes its parameters during a replay.
 
-    `live`: it changes them between scans. `hand_over`: a new instance takes over. `bank`: several
-    instances run side by side, and their motions are averaged. `auto`: the first of bank (given
-    more than one core, and enough memory), live and hand_over that is possible.
-    ``docs/adapting-live.md`` describes every key.
+    `live`: it changes them between scans. `bank`: several instances run side by side, and their
+    motions are averaged. `auto`: a bank, given more than one core and enough memory, else live if
+    the odometry can. ``docs/adapting-live.md`` describes every key.
     """
 
-    mechanism: Literal["auto", "live", "hand_over", "bank"] = "auto"
+    mechanism: Annotated[Literal["auto", "live", "bank"], BeforeValidator(_mechanism)] = "auto"
     warm_up: float | None = Field(None, gt=0, le=3600)
-    full_rate: float | None = Field(None, ge=0, le=3600)
-    stride: int | None = Field(None, ge=1, le=10_000)
-    catch_up_scans: Annotated[int, Field(ge=0, le=10_000), AfterValidator(_catches_up)] = 0
     size: int = Field(4, ge=2, le=MOST_MEMBERS)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0, le=10**9)] | dict[str, Value], ...] | None,
@@ -233,13 +229,12 @@ class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, switching, and what it may cost.
 
     `also` names modes that are replayed besides, or `all`. Each mode is replayed `repeats` times.
-    A set stays for `dwell` seconds at least. Parameters of `pin` have these values in all sets.
+    Parameters of `pin` have these values in all sets.
     The budget is in milliseconds of CPU time a scan, all members and live evidence together.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
-    dwell: float = Field(0.0, ge=0, le=3600)
     pin: dict[str, Value] = Field(default_factory=dict)
     rules: tuple[Rule, ...] = ("adaptive", "paper")
     also: tuple[Also, ...] = ()

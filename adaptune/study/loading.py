@@ -255,7 +255,7 @@ def _check_switching(
         message = f"{names} runs whole recordings and cannot change parameters; leave this out"
         yield Mistake((*key, "mechanism"), message)
     elif online.switching.mechanism == "live" and not live:
-        message = f"{names} cannot change parameters between scans; choose auto, hand_over or bank"
+        message = f"{names} cannot change parameters between scans; choose auto or bank"
         yield Mistake((*key, "mechanism"), message)
 
 

@@ -1,8 +1,6 @@
 """A study: a checked configuration, and what is made of it."""
 
 import fcntl
-import json
-import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from adaptune import files
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
-from adaptune.odometry.base import Description, WarmUp
+from adaptune.odometry.base import Description
 from adaptune.odometry.factory import Factory, OdometryFactory, OdometryPool, declare
 from adaptune.processes import available
 from adaptune.recording.scan import OF_VIEW
@@ -110,9 +108,7 @@ def differences(a: Any, b: Any, path: str = "") -> Iterable[str]:
 
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
 
-_log = logging.getLogger(__name__)
-
-Mechanism = Literal["live", "hand_over", "bank"]
+Mechanism = Literal["live", "bank"]
 
 
 @dataclass(frozen=True)
@@ -170,8 +166,8 @@ class Study(Generic[C_co]):
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """Selection rules; none where the odometry runs whole recordings."""
-        return () if self.odometry.description.whole else self.config.online.rules
+        """Selection rules; none where the odometry cannot adapt."""
+        return () if self.mechanism is None else self.config.online.rules
 
     @property
     def window(self) -> int:
@@ -179,9 +175,11 @@ class Study(Generic[C_co]):
         return max(1, math.ceil(self.config.descriptor.window / self.config.online.period))
 
     @cached_property
-    def mechanism(self) -> Mechanism:
-        """How the odometry changes its parameters during a replay."""
-        switching = self.config.online.switching
+    def mechanism(self) -> Mechanism | None:
+        """How the odometry changes its parameters during a replay; None if it cannot."""
+        switching, described = self.config.online.switching, self.odometry.description
+        if described.whole:
+            return None
         if switching.mechanism != "auto":
             return switching.mechanism
         instances = switching.size if switching.sets is None else len(switching.sets)
@@ -191,61 +189,13 @@ class Study(Generic[C_co]):
         enough = instances * self.config.isolation.memory <= switching.memory
         if cores > 1 and enough:
             return "bank"
-        return "live" if self.odometry.description.live else "hand_over"
+        return "live" if described.live else None
 
-    @cached_property
-    def warm_up(self) -> WarmUp:
-        """Which scans a new instance sees before it takes over."""
-        switching, usual = self.config.online.switching, self.odometry.description.warm_up
-        given: dict[str, Any] = {
-            "seconds": switching.warm_up,
-            "full_rate": switching.full_rate,
-            "stride": switching.stride,
-        }
-        return usual._replace(**{k: v for k, v in given.items() if v is not None})
-
-    def switch_cost(self) -> float:
-        """Share by which a switch raises the RTE, as `adaptune switching` measured it.
-
-        Returns
-        -------
-        float
-            0.0 if it was not measured, or with another odometry or warm-up.
-        """
-        path = self.folder / "switching.json"
-        try:
-            measured = json.loads(path.read_text(encoding="utf-8"))
-            if "switch_cost" not in measured:
-                raise ConfigurationError(
-                    f"{path}: was written by an older adaptune; run `adaptune switching` again"
-                )
-            if measured["of"] != self.switching_identity():
-                _log.warning(
-                    "%s: was measured with another odometry, warm-up or recording; a switch counts "
-                    "as free until you run `adaptune switching` again",
-                    path,
-                )
-                return 0.0
-            return max(0.0, float(measured["switch_cost"]))
-        except FileNotFoundError:
-            return 0.0
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigurationError(
-                f"{path}: is damaged ({error}); remove it, or run `adaptune switching` again"
-            ) from error
-
-    def switching_identity(self) -> dict[str, Any]:
-        """Everything that the switch cost depends on, as plain data."""
-        return {
-            "odometry": self.odometry.identity,
-            "content": self.odometry.content,
-            "sequences": {name: self._measured_on(name) for name in self.config.training},
-            "mechanism": self.mechanism,
-            "warm_up": self.warm_up._asdict(),
-        }
-
-    def _measured_on(self, name: str) -> dict[str, Any]:
-        return self.sequences.identity(name) | self.sequences.reference(name)
+    @property
+    def warm_up(self) -> float:
+        """Seconds of the last scans that a member of a bank sees when it restarts."""
+        own = self.config.online.switching.warm_up
+        return self.odometry.description.warm_up if own is None else own
 
     def check(self) -> None:
         """Refuse a folder that was begun with other settings of the offline stage.
@@ -343,12 +293,6 @@ class Driven(NamedTuple):
 
     mechanism: Mechanism | None  # of `adaptive`; None if the fixed set is its plan
     words: str  # a sentence
-    paper: Mechanism | None = None  # of `paper`, if the study names it
-
-    @property
-    def switches(self) -> bool:
-        """Whether one set follows another; a bank changes weights only."""
-        return self.mechanism in ("live", "hand_over")
 
 
 def driven(study: Study, model: ErrorModel) -> Driven:
@@ -362,20 +306,11 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     number = f"trial {named(model, model.fixed)}" + ("" if model.fixed else ", the baseline")
     fixed = f"`online` will drive the fixed set ({number})"
     if not study.rules:
-        why = "no rule is named (online.rules)"
-        if study.odometry.description.whole:
-            why = "a program that runs whole recordings cannot change its parameters"
-        return Driven(None, f"{fixed} only, because {why}.")
-    mechanism, paper = (
-        mechanism_of(mode, model, study.mechanism, study.odometry.description.live)
-        if mode in study.rules
-        else None
-        for mode in ("adaptive", "paper")
-    )
-    if mechanism is None:
-        return Driven(
-            None, "`online` will drive `paper`, and not `adaptive` (online.rules).", paper
-        )
+        return Driven(None, f"{fixed} only, because {cannot_adapt(study)}.")
+    if "adaptive" not in study.rules:
+        return Driven(None, "`online` will drive `paper`, and not `adaptive` (online.rules).")
+    live = study.odometry.description.live
+    mechanism = mechanism_of("adaptive", model, study.mechanism, live)
     if mechanism == "bank" and model.bank_adapts:
         trials = always_at_work(study.config.online.switching, model)
         members = ", ".join(named(model, trial) for trial in trials)
@@ -387,18 +322,30 @@ def driven(study: Study, model: ErrorModel) -> Driven:
         else:
             words += f". It relies on what it measures while it drives, for {_too_little(model)}."
         words += _who_joins_in(study, model)
-        return Driven("bank", words, paper)
-    if model.paired.adapt:
-        how = "changed live" if mechanism == "live" else "by hand-over"
-        words = f"`online` will drive one set at a time as `adaptive`, {how}"
+        return Driven("bank", words)
+    if mechanism == "live" and model.paired.adapt:
+        words = "`online` will drive one set at a time as `adaptive`, changed live"
         if ONE_SET in model.expected:
             words += f", because it has the least expected loss: {_expected(model, ONE_SET)}"
-        return Driven(mechanism, f"{words}.", paper)
+        return Driven(mechanism, f"{words}.")
     why = _why_fixed(study, model, mechanism)
-    return Driven(None, f"{fixed} as `adaptive`, because {why}", paper)
+    return Driven(None, f"{fixed} as `adaptive`, because {why}")
 
 
-def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism) -> str:
+def cannot_adapt(study: Study) -> str:
+    """Why no mode of a study adapts."""
+    name = study.odometry.name
+    if study.odometry.description.whole:
+        return "a program that runs whole recordings cannot change its parameters"
+    if not study.config.online.rules:
+        return "no rule is named (online.rules)"
+    why = "the model has no bank"
+    if study.mechanism is None:
+        why = "a bank needs more than one core and more memory (online.switching)"
+    return f"{name} cannot change its parameters between scans, and {why}"
+
+
+def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism | None) -> str:
     """Why the fixed set is driven, and where it is left."""
     ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
     known = [way for way in ways if way in model.expected]
@@ -473,8 +420,10 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
     )
 
 
-def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool) -> Mechanism:
-    """How a mode that adapts changes parameters.
+def mechanism_of(
+    mode: str, model: ErrorModel, mechanism: Mechanism | None, live: bool
+) -> Mechanism | None:
+    """How a mode that adapts changes parameters; None if it cannot.
 
     Parameters
     ----------
@@ -489,7 +438,7 @@ def mechanism_of(mode: str, model: ErrorModel, mechanism: Mechanism, live: bool)
     """
     if mechanism == "bank" and (mode != "adaptive" or model.bank_adapts or model.bank_rests):
         return "bank"
-    return "live" if mechanism != "hand_over" and live else "hand_over"
+    return "live" if live else None
 
 
 def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, ParameterSet]:

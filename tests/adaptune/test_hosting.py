@@ -70,7 +70,7 @@ with Path(__file__).with_name("imported").open("a") as file:
 import numpy as np
 import optuna
 from pydantic import Field
-from adaptune.odometry import BaseSettings, Odometry, Registration, WarmUp
+from adaptune.odometry import BaseSettings, Odometry, Registration
 from adaptune.space import Float, ParameterSpace
 
 class Settings(BaseSettings):
@@ -79,7 +79,7 @@ class Settings(BaseSettings):
 class Mine(Odometry):
     space = ParameterSpace({"scale": Float(low=0.5, high=2.0, baseline=1.1)})
     settings_type = Settings
-    live, clean, warm_up = True, True, WarmUp(0.5, 0.5, 1)
+    live, clean, warm_up = True, True, 0.5
     def prepare(self, scan):
         return scan.stamp
     def start(self, prepared, T_odom_sensor, T_previous_current=None):
@@ -109,7 +109,7 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
     ]
     study = load_study(study_file, overrides, tmp_path / "study")
     assert study.odometry.settings.model_dump() == {"step": 0.3}
-    assert study.warm_up.seconds == 0.5
+    assert study.warm_up == 0.5
     model = train(study).model
     assert len(model.sets) == 4
     assert run_replays(study, study.model_path) == 4

@@ -16,9 +16,9 @@ HEAVY = ("scipy", "numba", "open3d", "optuna", "matplotlib", "rosbags", "sklearn
     ("incomplete", "completed"),
     [
         ("offline.tr", ["offline.trials="]),
-        ("online.switching.c", ["online.switching.catch_up_scans=", "online.switching.cores="]),
+        ("online.switching.c", ["online.switching.cores="]),
         ("offline.sets=", ["offline.sets=shared", "offline.sets=own", "offline.sets=both"]),
-        ("online.switching.mechanism=h", ["online.switching.mechanism=hand_over"]),
+        ("online.switching.mechanism=l", ["online.switching.mechanism=live"]),
         ("offline.trials=", []),
         ("offline.sampler=gr", ["offline.sampler=grid"]),
         ("nonsense", []),

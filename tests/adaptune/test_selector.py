@@ -98,29 +98,6 @@ def with_motion():
     )
 
 
-def test_a_set_stays_for_a_while():
-    (scan, *_) = drive_cave("hdl32e", 3)
-
-    def switches(**given):
-        """Seconds at which another set is selected, where the best one changes every 3 s."""
-        selector, chosen = Selector(with_motion(), "paper", **given), []
-        for i in range(200):
-            selector.observe(i * 10**8, scan, moving(0.05 if (i // 30) % 2 else 0.5))
-            if i % 10 == 0:
-                chosen.append(selector.select().trial)
-        return np.flatnonzero(np.diff(chosen)) + 1
-
-    assert set(np.diff(switches())) == {3}
-    assert min(np.diff(switches(dwell=4.0))) >= 4
-    assert not len(switches(dwell=100.0))
-    selector = Selector(with_motion(), "paper", dwell=100.0)
-    selector.observe(0, scan, moving(0.05))
-    first = selector.select().trial
-    for i in range(1, 30):
-        selector.observe(i * 10**8, scan, moving(0.5))
-    assert selector.select().trial == first
-
-
 def test_places_differ_by_the_sensors_motion():
     selector = Selector(with_motion(), "paper")
     (scan, *_) = drive_cave("hdl32e", 3)
@@ -280,11 +257,6 @@ def test_a_single_odometry_leaves_a_set_that_does_worse_than_predicted(monkeypat
     assert told.forgotten == forgotten + 1
     assert select(REMEMBERED + 1.9).trial == 3
     assert select(REMEMBERED + 2.1).trial == 5
-    # It need not stay for the dwell.
-    selector, told.error = Selector(of_two_caves(), members=(), dwell=100.0), None
-    assert select(0.0).trial == 5
-    told.error = OwnError(9.0, 1.01 * limit, 20.0)
-    assert select(1.0).trial == 3
     # After a reset nothing is held against it.
     told.error = OwnError(9.0, 1.01 * limit, 20.0)
     assert select(REMEMBERED + 3.0).trial == 3

@@ -1,4 +1,3 @@
-import json
 import sys
 
 import pytest
@@ -27,7 +26,7 @@ def test_switching_that_the_odometry_has_not(study_file):
 def test_switching_is_chosen_by_what_there_is(study_file, monkeypatch):
     needs_evalio()
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
-    for cores, own, mechanism in ((1, "live", "hand_over"), (2, "bank", "bank")):
+    for cores, own, mechanism in ((1, "live", None), (2, "bank", "bank")):
         monkeypatch.setattr("adaptune.study.study.available", lambda cores=cores: cores)
         assert load_study(study_file).mechanism == own
         assert load_study(study_file, stiff).mechanism == mechanism
@@ -39,28 +38,12 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
     stiff = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
     for given, mechanism in (
         ("online.switching.memory=16", "bank"),
-        ("online.switching.memory=15", "hand_over"),
-        ("online.switching.cores=1", "hand_over"),
-        ("online.switching.size=5", "hand_over"),
-        ("isolation.memory=5", "hand_over"),
+        ("online.switching.memory=15", None),
+        ("online.switching.cores=1", None),
+        ("online.switching.size=5", None),
+        ("isolation.memory=5", None),
     ):
         assert load_study(study_file, [*stiff, given]).mechanism == mechanism
-
-
-def test_the_study_keeps_the_switch_cost(study_file, tmp_path):
-    study = load_study(study_file, folder=tmp_path)
-    assert study.switch_cost() == 0.0
-    found = {"of": study.switching_identity(), "switch_cost": 0.07}
-    (tmp_path / "switching.json").write_text(json.dumps(found))
-    assert study.switch_cost() == 0.07
-    # Another mechanism has another cost.
-    other = load_study(study_file, ["online.switching.mechanism=hand_over"], tmp_path)
-    assert other.switch_cost() == 0.0
-    (tmp_path / "switching.json").write_text(json.dumps(found | {"switch_cost": -0.02}))
-    assert study.switch_cost() == 0.0
-    (tmp_path / "switching.json").write_text("{")
-    with pytest.raises(ConfigurationError, match=r"switching\.json: is damaged"):
-        study.switch_cost()
 
 
 def test_an_odometry_that_needs_an_imu(study_file):
@@ -137,13 +120,10 @@ def test_reads_a_study(study_file, tmp_path):
         ("offline.trials=0", ["offline.trials", "not 0"]),
         ("online.rules=[best]", ["online.rules.0", "best"]),
         ("online.switching.mechanism=banks", ["online.switching.mechanism", "banks"]),
+        ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
         ("online.switching.warm_up=0", ["online.switching.warm_up", "not 0"]),
         ("online.switching.size=7", ["online.switching.size", "not 7"]),
         ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
-        (
-            "online.switching.catch_up_scans=1",
-            ["catch_up_scans", "never catches up"],
-        ),
         ("online.switching.sets=[0]", ["online.switching.sets"]),
         (
             "online.switching.sets=[0, {keyframe_intervall: 1.0}]",

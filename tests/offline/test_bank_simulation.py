@@ -9,7 +9,7 @@ from adaptune.geometry import invert, steps
 from adaptune.live.hops import CLIP, Hop, Hops
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model.weights import MemberWeights
-from adaptune.odometry import InProcess, Odometry, WarmUp
+from adaptune.odometry import InProcess, Odometry
 from adaptune.odometry.base import Registration
 from adaptune.recording import Scan
 from adaptune.selection import Selection
@@ -225,7 +225,7 @@ def test_it_is_what_a_bank_does():
     weights = rng.dirichlet(np.ones(3), 6)
     simulation, _ = simulated(trials, weights[0])
     sets = [{"number": float(i)} for i in range(3)]
-    box = Bank(lambda p: InProcess(Recorded(p, trials)), dict(enumerate(sets)), WarmUp(), 1e9)
+    box = Bank(lambda p: InProcess(Recorded(p, trials)), dict(enumerate(sets)), lost_track=1e9)
     f = frames()
     poses = [np.eye(4)]
     for i, stamp in enumerate(f.stamps):

@@ -54,7 +54,7 @@ def of_pool(*order):
         {n: OdometryFactory(n, {}, odometry_class(n).space, Limits()) for n in sorted(names)}
     )
     sets = {trial: pool.space.complete(SETS[trial]) for trial in order}
-    bank = Bank(pool, sets, pool.description.warm_up._replace(seconds=2.0))
+    bank = Bank(pool, sets, 2.0)
     return bank, UntrainedSelector(ParameterSets(pool.space, order, tuple(sets.values())), 10.0)
 
 

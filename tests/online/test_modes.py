@@ -27,7 +27,6 @@ def setup(budget=None):
         factory.description.warm_up,
         25.0,
         3.0,
-        0.0,
         ("ndt",),
         budget,
     )
@@ -124,17 +123,6 @@ def test_a_bank_of_one_member_is_not_compared_with():
         *("untrained", "one_set", "paper"),
     )
     assert "no other member" in asked.obstacle("even", model)
-
-
-@pytest.mark.parametrize("mechanism", ["bank", "live", "hand_over"])
-def test_modes_on_demand_have_their_mechanisms_whatever_the_study_has(mechanism):
-    model = random_model()
-    asked = replace(setup(), mechanism=mechanism, also=("one_set", "random", "bank_learned"))
-    single = "hand_over" if mechanism == "hand_over" else "live"
-    of = {mode: asked.identity(mode, model, "of it")["switching"] for mode in asked.also}
-    assert [of[mode]["mechanism"] for mode in asked.also] == [single, single, "bank"]
-    assert ("warm_up" in of["random"]) == (single == "hand_over")
-    assert ("switch_cost" in of["one_set"], "switch_cost" in of["random"]) == (True, False)
 
 
 def test_a_program_that_runs_whole_recordings_has_none():

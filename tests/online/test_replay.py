@@ -9,7 +9,7 @@ import pytest
 
 from adaptune.bank.bank import Bank
 from adaptune.errors import AdaptuneError, OdometryError
-from adaptune.odometry.base import InProcess, Odometry, Registration, Usage, WarmUp
+from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
@@ -238,7 +238,7 @@ def test_a_bank_without_a_model_takes_odometries_that_are_not_live():
         live = False
 
     sets = untrained_sets(Scripted.space)
-    odometry = Bank(lambda _: InProcess(Stiff()), {n: sets[n] for n in sets}, WarmUp())
+    odometry = Bank(lambda _: InProcess(Stiff()), {n: sets[n] for n in sets})
     result = replay(scans(np.arange(20) / 10), odometry, HEALTH, UntrainedSelector(sets, 25.0))
     np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], 0.1 * np.arange(20))
     assert [choice.selection.weights for choice in result.choices] == [

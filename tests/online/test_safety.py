@@ -8,7 +8,7 @@ import pytest
 
 from adaptune.bank.bank import Bank
 from adaptune.errors import OdometryError
-from adaptune.odometry.base import InProcess, Odometry, Registration, WarmUp
+from adaptune.odometry.base import InProcess, Odometry, Registration
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
@@ -168,7 +168,7 @@ def test_a_bank_without_a_pose_gets_the_fixed_weights():
     def make(parameters):
         return InProcess(Fragile(lambda n, _: math.nan if n == 25 else None, parameters))
 
-    bank = Bank(make, {0: {"gain": 1.0}, 2: {"gain": 2.0}}, WarmUp(seconds=1.0))
+    bank = Bank(make, {0: {"gain": 1.0}, 2: {"gain": 2.0}}, 1.0)
     half = Selection(2, {"gain": 2.0}, {0: 0.2, 2: 0.8})
     fixed = Selection(0, {"gain": 1.0}, {0: 1.0, 2: 0.0})
 
@@ -193,7 +193,7 @@ def test_where_a_bank_that_rests_fails_all_join_in(caplog):
         made.append(one)
         return InProcess(one)
 
-    bank = Bank(make, {0: {"gain": 1.0}, 2: {"gain": 2.0}}, WarmUp(seconds=1.0))
+    bank = Bank(make, {0: {"gain": 1.0}, 2: {"gain": 2.0}}, 1.0)
     fixed = Selection(0, {"gain": 1.0}, {0: 1.0, 2: 0.0})
 
     class Alone(InTurns):

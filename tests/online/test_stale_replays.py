@@ -17,7 +17,6 @@ from online.charts import charts_of_replays
 from online.compare import compare, current_modes
 from online.record import StoredReplayError, check_reference
 from online.run import run_replays
-from online.switch_cost import measure_switching
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +105,7 @@ def test_a_training_recording_that_was_replaced(load):
     study = load()
     change(study.folder.parent / "one.bag")
     words = r"one\.bag has other content .* the model, 2 replays\. `adaptune offline --again`"
-    for use in (run, validate, measure_switching):
+    for use in (run, validate):
         with pytest.raises(AdaptuneError, match=words):
             use(study)
     train(study, again=True)
@@ -123,7 +122,7 @@ def test_a_training_recording_that_was_replaced(load):
 def test_another_version_of_the_odometry(load, monkeypatch):
     study = load()
     monkeypatch.setattr("importlib.metadata.version", lambda _: "99.0")
-    for use in (run, validate, measure_switching, compare):
+    for use in (run, validate, compare):
         with pytest.raises(AdaptuneError, match=r"version of small_gicp is 99\.0, .* 3 replays"):
             use(study)
 
@@ -167,7 +166,7 @@ def test_what_is_refused_is_told_and_not_drawn(load):
     folder = study.folder / "replays/three"
     shutil.copytree(folder / "adaptive", folder / "paper")
     assert "paper" not in current_modes(study, "three").modes
-    other = load("online.switching.mechanism=hand_over", "online.switching.warm_up=3")
+    other = load("online.switching.mechanism=bank", "online.switching.warm_up=3")
     modes, refused = current_modes(other, "three")
     assert modes == ("baseline", "fixed")
     with pytest.raises(StoredReplayError) as caught:
@@ -223,7 +222,7 @@ def test_replays_of_another_rate_or_reference_are_not_drawn(load):
 
 
 def test_other_ways_to_switch_are_not_compared(load):
-    other = load("online.switching.mechanism=hand_over", "online.switching.warm_up=3")
+    other = load("online.switching.mechanism=bank", "online.switching.warm_up=3")
     with pytest.raises(StoredReplayError, match="was replayed with another switching"):
         compare(other)
     assert run(other) == 1
@@ -260,14 +259,3 @@ def test_a_file_that_was_removed_is_made_again(load, file):
         compare(study)
     assert run(study) == 1
     compare(study)
-
-
-def test_the_switch_cost_of_another_recording_does_not_count(load, caplog):
-    study = load("online.switching.mechanism=live", "training=[one]")
-    measure_switching(study)
-    path = study.folder / "switching.json"
-    path.write_text(path.read_text().replace('"switch_cost": ', '"switch_cost": 7'))
-    assert study.switch_cost() > 0.0
-    change(study.folder.parent / "one.bag")
-    assert study.switch_cost() == 0.0
-    assert "run `adaptune switching` again" in caplog.text

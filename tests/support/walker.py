@@ -1,8 +1,8 @@
-"""An odometry that does what a script says, and what the tests of hand-overs and banks share."""
+"""An odometry that does what a script says, and what the tests of banks share."""
 
 import numpy as np
 
-from adaptune.odometry import InProcess, Odometry, Registration, WarmUp
+from adaptune.odometry import InProcess, Odometry, Registration
 from adaptune.recording import Scan
 from adaptune.selection import Selection
 from adaptune.space import Float, ParameterSpace
@@ -34,11 +34,6 @@ class Walker(Odometry):
         self.T = self.T.copy()
         self.T[0, 3] += self.script.get(prepared, self.parameters["speed"])
         return Registration(self.T, prepared != 4)
-
-
-def every(seconds):
-    """A warm-up on all scans of the last seconds."""
-    return WarmUp(seconds, seconds, 1)
 
 
 def at(second):

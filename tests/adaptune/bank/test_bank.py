@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import turns
 from needs import needs_evalio
-from walker import at, every, kept, makes, selected, x_of, x_on
+from walker import at, kept, makes, selected, x_of, x_on
 
 from adaptune.bank.bank import Bank
-from adaptune.bank.hand_over import HandOver
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
@@ -32,9 +31,7 @@ def weigh(bank, *weights):
 
 def test_the_mean_of_all_motions_is_taken_by_their_weights():
     make, made = makes()
-    odometry = Bank(
-        make, {7: {"speed": 1.0}, 3: {"speed": 1.05}, 5: {"speed": 1.09}}, every(3.0), 0.1
-    )
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.05}, 5: {"speed": 1.09}}, 3.0, 0.1)
     x = x_of(odometry, range(5), {2: 5})
     np.testing.assert_allclose(np.diff(x), [1.0, 1.09, 1.09, 1.09])
     weigh(odometry, 0.5, 0.0, 0.5)
@@ -50,7 +47,7 @@ def test_a_lost_one_is_left_out_and_started_anew(lost):
     speeds, weights = np.array([1.0, 1.02, 1.06]), np.array([0.4, 0.3, 0.3])
     make, made = makes({speeds[lost]: {5: 4.0}})
     sets = {trial: {"speed": speed} for trial, speed in zip((7, 3, 5), speeds, strict=True)}
-    odometry = Bank(make, sets, every(2.0), 0.1)
+    odometry = Bank(make, sets, 2.0, 0.1)
     weigh(odometry, *weights)
     x = x_of(odometry, range(9))
     mean, weights[lost] = weights @ speeds, 0.0
@@ -64,7 +61,7 @@ def test_a_lost_one_is_left_out_and_started_anew(lost):
 
 def test_where_two_disagree_the_heavier_is_believed():
     make, _ = makes()
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
     assert x_of(odometry, range(5), {3: 3}) == [0, 1, 2, 5, 8]
     for heavy, step, seconds in ((0.4, 1.0, range(5, 8)), (0.6, 3.0, range(8, 11))):
         weigh(odometry, 1.0 - heavy, heavy)
@@ -75,7 +72,7 @@ def test_where_two_disagree_the_heavier_is_believed():
 def test_a_member_restarts_once_a_second_at_most():
     make, made = makes({1.02: dict.fromkeys(range(60), 4.0)})
     sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}
-    odometry = Bank(make, sets, every(2.0), 3.0)
+    odometry = Bank(make, sets, 2.0, 3.0)
     odometry.start(odometry.prepare(at(0)), np.eye(4))
     x = [odometry.register(odometry.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, 41)]
     # It is lost all the time.
@@ -87,7 +84,7 @@ def test_a_member_restarts_once_a_second_at_most():
 def test_two_lost_members_that_agree_do_not_outvote_the_one_that_fits_the_scans(place):
     make, _ = makes()
     speeds = np.roll([turns.STEP, 0.0, 0.0, 3 * turns.STEP], place)
-    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)}, every(1.0))
+    bank = Bank(make, {trial: {"speed": speed} for trial, speed in enumerate(speeds)}, 1.0)
     weigh(bank, *[0.25] * 4)
     scans = list(map(turns.turn, range(13)))
     bank.start(bank.prepare(scans[0]), np.eye(4))
@@ -102,7 +99,7 @@ def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
     sets = {trial: {"speed": speed} for trial, speed in enumerate((0.0, 0.001, turns.STEP))}
     x = {}
     for lost in (False, True):
-        bank = Bank(make, sets, every(1.0))
+        bank = Bank(make, sets, 1.0)
         bank.apply(Selection(0, {}, dict.fromkeys(range(3), 1 / 3), lost=lost))
         bank.start(bank.prepare(turns.turn(0)), np.eye(4))
         x[lost] = bank.register(bank.prepare(turns.turn(1))).T_odom_sensor[0, 3]
@@ -112,7 +109,7 @@ def test_a_bank_that_is_lost_asks_the_scans_whom_to_believe():
 
 def test_members_restart_where_the_selection_says_so():
     make, made = makes()
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 2.0, 0.1)
     x_of(odometry, range(5))
     odometry.apply(Selection(7, {}, {7: 0.5, 3: 0.5}, restart=frozenset({3})))
     x_on(odometry, range(5, 8))
@@ -126,7 +123,7 @@ def test_members_restart_where_the_selection_says_so():
 def test_members_that_rest_see_no_scans_until_they_are_woken():
     make, made = makes()
     sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.04}}
-    odometry = Bank(make, sets, every(2.0), 0.1)
+    odometry = Bank(make, sets, 2.0, 0.1)
     alone = Selection(7, {}, {7: 1.0}, resting=frozenset({3, 5}))
     odometry.apply(alone)
     assert x_of(odometry, range(5)) == [0, 1, 2, 3, 4]
@@ -154,7 +151,7 @@ def test_members_that_rest_see_no_scans_until_they_are_woken():
 @pytest.mark.parametrize("chosen", [1.0, 3.0])
 def test_no_pose_is_worse_than_any(chosen):
     make, _ = makes({1.0: {3: np.nan}})
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
     x = x_of(odometry, range(6), {0: 7 if chosen == 1.0 else 3})
     assert np.diff(x).tolist() == [chosen, chosen, 3.0, chosen, chosen]
     assert odometry.restarts == 1
@@ -162,7 +159,7 @@ def test_no_pose_is_worse_than_any(chosen):
 
 def test_no_pose_at_all_is_told():
     make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, every(2.0), 0.1)
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
     x = x_of(odometry, range(4))
     assert np.isnan(x[3])
     # The caller starts it anew.
@@ -174,7 +171,7 @@ def test_no_pose_at_all_is_told():
 
 def test_a_bank_has_no_other_sets():
     make, _ = makes()
-    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}}, every(1.0))
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}}, 1.0)
     with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4"):
         bank.apply(selected(4))
     with pytest.raises(OdometryError, match="the bank holds trials 7, 3, not 4, 5"):
@@ -183,7 +180,7 @@ def test_a_bank_has_no_other_sets():
 
 def test_motions_of_the_members_by_trial_number():
     make, made = kept(makes({1.02: {5: 4.0}})[0])
-    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, every(2.0), 0.1)
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}, 2.0, 0.1)
     x_of(bank, range(6))
     whole, members, starts = bank.motions
     assert starts == 1
@@ -214,13 +211,13 @@ def drive(odometry, switch=None, n=30):
 
 
 def test_a_bank_of_equal_instances_is_the_single_run():
-    bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=1.0)
     switched = drive(bank, [0, 1], n=15)
     np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
 
 
 def test_a_bank_that_rests_is_the_single_run():
-    bank = Bank(gicp, {0: NEAR, 1: FAR}, warm_up=every(1.0))
+    bank = Bank(gicp, {0: NEAR, 1: FAR}, warm_up=1.0)
     bank.apply(Selection(0, {}, {0: 1.0}, resting=frozenset({1})))
     np.testing.assert_allclose(drive(bank, n=15), drive(gicp(NEAR), n=15), atol=1e-12)
 
@@ -229,19 +226,13 @@ def test_a_bank_in_other_processes_is_the_same():
     def elsewhere(parameters):
         return Isolated("gicp", parameters, KeyframeSettings(), Limits())
 
-    a, b = (
-        drive(Bank(make, {0: NEAR, 1: FAR}, every(0.5)), [0, 1], 15) for make in (gicp, elsewhere)
-    )
+    a, b = (drive(Bank(make, {0: NEAR, 1: FAR}, 0.5), [0, 1], 15) for make in (gicp, elsewhere))
     np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("mechanism", ["hand_over", "bank"])
-def test_real_odometries_go_straight_on(mechanism):
-    if mechanism == "bank":
-        sets = {0: NEAR, 1: FAR, 2: {**NEAR, "keyframe_interval": 2.0}}
-        poses = drive(Bank(gicp, sets, every(0.5)), [1, 0], n=15)
-    else:
-        poses = drive(HandOver(gicp, NEAR, every(0.5)), [FAR, NEAR], n=15)
+def test_real_odometries_go_straight_on():
+    sets = {0: NEAR, 1: FAR, 2: {**NEAR, "keyframe_interval": 2.0}}
+    poses = drive(Bank(gicp, sets, 0.5), [1, 0], n=15)
     steps = invert(poses[:-1]) @ poses[1:]
     np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
     np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)
@@ -258,7 +249,7 @@ def with_faulty(fault):
         return Isolated("faulty:Faulty", {"x": 0.1}, faulty.Settings(fault=fault), limits)
 
     sets = {3: {"odometry": "mine", "x": 0.1}, 7: {"speed": 0.1}}
-    return Bank(make, sets, every(2.0))
+    return Bank(make, sets, 2.0)
 
 
 def steps_of(bank, n):
@@ -313,7 +304,7 @@ def test_other_processes_work_while_members_of_this_one_do():
         one.apart = parameters["speed"] > 1.0
         return one
 
-    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, every(2.0), 0.1)
+    bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 2.0, 0.1)
     x_of(bank, range(2))
     assert calls == [("submit", True), ("submit", False), ("collect", False), ("collect", True)]
     assert [T[0, 3] for T in bank.motions.members.values()] == [1.0, 1.02]
@@ -326,7 +317,7 @@ def test_odometries_with_global_state_are_as_if_they_were_alone():
     def genz(parameters):
         return Isolated("genz_icp", parameters, EvalioSettings(), Limits())
 
-    bank, moved = Bank(genz, sets, every(1.0)), []
+    bank, moved = Bank(genz, sets, 1.0), []
     alone = {trial: genz(parameters) for trial, parameters in sets.items()}
     for i in range(12):
         if i == 0:

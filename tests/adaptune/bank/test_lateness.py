@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from adaptune.bank.bank import Bank, Lateness
-from adaptune.odometry.base import LastMotion, OdometryInstance, Registration, WarmUp
+from adaptune.odometry.base import LastMotion, OdometryInstance, Registration
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import SERVICE, Limits
@@ -41,7 +41,7 @@ def make():
 
     def bank(rate):
         sets = {trial: pool.space.complete(one) for trial, one in SETS.items()}
-        banks.append(Bank(pool, sets, WarmUp(seconds=1.0), cores=2, rate=rate))
+        banks.append(Bank(pool, sets, 1.0, cores=2, rate=rate))
         banks[-1].apply(EVEN)
         return banks[-1]
 
@@ -159,7 +159,7 @@ class Slow(OdometryInstance):
 def test_a_bank_of_which_nobody_is_in_time_waits_for_the_first(scans):
     """As one odometry that is too slow does."""
     slow = {3: Slow(0.03), 5: Slow(0.05)}
-    bank = Bank(lambda given: slow[given["n"]], {n: {"n": n} for n in slow}, WarmUp(), rate=10.0)
+    bank = Bank(lambda given: slow[given["n"]], {n: {"n": n} for n in slow}, rate=10.0)
     bank.apply(EVEN)
     poses, moved = run(bank, scans, {})  # one every 10 ms
     np.testing.assert_allclose(poses[:, 0, 3], STEP * np.arange(30), atol=1e-6)

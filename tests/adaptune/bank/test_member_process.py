@@ -8,7 +8,7 @@ import pytest
 
 from adaptune.bank.bank import Bank
 from adaptune.bank.members import KEPT, Member, spread
-from adaptune.odometry.base import InProcess, WarmUp
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
 from adaptune.odometry.registry import odometry_class
@@ -43,7 +43,7 @@ def bank(n_cores, seconds=1.0):
     return Bank(
         POOL,
         {3 * i: POOL.space.complete(one) for i, one in enumerate(SETS)},
-        WarmUp(seconds=seconds),
+        seconds,
         cores=n_cores,
     )
 

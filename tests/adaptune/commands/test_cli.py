@@ -122,7 +122,6 @@ def test_inspect_says_what_to_do_where_the_reference_does_not_serve(tmp_path):
         (["trials"], "validate"),
         (["trials", "-o", "offline.trials=12"], "offline"),
         (["validate"], "online"),
-        (["switching", "--seconds", "10"], "online"),
         (["model", "show", "MODEL"], "online"),
         (["cache"], "cache"),
     ],
@@ -244,7 +243,6 @@ def test_help_and_version(adaptune):
         "validate",
         "online",
         "oracle",
-        "switching",
         "compare",
         "cache",
     ):

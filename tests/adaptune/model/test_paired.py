@@ -327,38 +327,6 @@ def test_of_a_single_sequence_familiarity_is_unknown_and_all_counts():
     selection = PairedExpectedRatio().fit(data).select(np.full(2, 50.0))
     assert selection.trial == 1
     assert math.isnan(selection.familiarity)
-    # A switch must pay here, too.
-    dear = PairedExpectedRatio(switch_cost=0.9).fit(data)
-    assert dear.select(np.zeros(2), current=0).trial == 0
-
-
-def test_a_switch_must_pay():
-    data = two_sets(1.0, 0.8)
-    data.errors[:, 1] = 0.8
-    rule = PairedExpectedRatio(switch_cost=0.3).fit(data)
-    assert rule.select(np.zeros(2)).trial == 1
-    assert rule.select(np.zeros(2), current=0).trial == 0
-    assert rule.select(np.zeros(2), current=1).trial == 1
-    cheap = PairedExpectedRatio(switch_cost=0.1).fit(data)
-    assert cheap.select(np.zeros(2), current=0).trial == 1
-    # A set that is not among those chosen from is left whatever it costs.
-    assert rule.select(np.zeros(2), current=7).trial == 1
-
-
-@pytest.mark.parametrize(("other", "chosen"), [(0.95, 1), (1.25, 0)])
-def test_what_is_worse_than_the_fixed_set_need_not_be_kept(other, chosen):
-    rule = PairedExpectedRatio(switch_cost=0.5).fit(two_sets(1.0, other))
-    assert rule.select(np.zeros(2), current=1).trial == chosen
-
-
-def test_in_a_place_unlike_all_training_going_back_costs_nothing():
-    data = random_data(1, 60, 5)
-    data.errors[:, 0], data.errors[:, 1:] = 0.5, 1.0
-    data = replace(data, fixed=1, sets=table(np.arange(5.0)[:, None] / 4.0))
-    rule = PairedExpectedRatio(switch_cost=0.2).fit(data)
-    at_home = data.features.mean(axis=0)
-    assert rule.select(at_home, current=1).trial == 0
-    assert rule.select(np.full(3, 1e6), current=0).trial == 1
 
 
 def test_it_says_how_many_sequences_it_rests_on():

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from walker import Walker, at, every, x_on
+from walker import Walker, at, x_on
 
 from adaptune.bank.bank import Bank
 from adaptune.odometry import InProcess, Motions, Odometry, OdometryError, Usage
@@ -50,7 +50,7 @@ def test_motions_chain_whatever_an_adapter_is_made_of(adapter):
 
 def test_a_bank_of_adapters_with_a_mixin_moves():
     sets = {4: {"speed": 1.0}, 9: {"speed": 1.05}}
-    bank = Bank(lambda parameters: InProcess(Via(parameters)), sets, every(2.0), 0.1)
+    bank = Bank(lambda parameters: InProcess(Via(parameters)), sets, 2.0, 0.1)
     bank.start(bank.prepare(at(0)), np.eye(4))
     assert x_on(bank, range(1, 4)) == [1.0, 2.0, 3.0]
     moved = {trial: T[0, 3] for trial, T in bank.motions.members.items()}
@@ -76,6 +76,6 @@ def test_no_pose_is_no_motion():
 
 def test_other_parameters_of_an_adapter_that_is_not_live():
     odometry = InProcess(Walker({}))
-    words = "scans: set online.switching.mechanism to hand_over or bank"
+    words = "scans: set online.switching.mechanism to bank"
     with pytest.raises(OdometryError, match=words):
         odometry.apply(Selection(0, {"speed": 2.0}))

@@ -2,17 +2,13 @@
 
 import pickle
 
-import numpy as np
 import pytest
-from street import N_SCANS, scan
 
-from adaptune.bank.hand_over import HandOver
 from adaptune.odometry import OdometryError
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
-from adaptune.selection import Selection
 from adaptune.space import ODOMETRY, SpaceError
 
 
@@ -51,8 +47,7 @@ def test_it_says_what_a_study_must_know():
     assert not both.description.needs_imu
     assert not both.description.whole
     assert both.description.space is both.space
-    assert both.description.warm_up.seconds == max(one.warm_up.seconds for one in every)
-    assert both.description.warm_up.stride == min(one.warm_up.stride for one in every)
+    assert both.description.warm_up == max(one.warm_up for one in every)
     settings = {label: one.identity for label, one in both.factories.items()}
     assert both.identity == {"name": "gicp, coarse", "settings": settings}
     assert {"small_gicp", "open3d"} <= set(both.versions)
@@ -67,28 +62,3 @@ def test_it_pickles():
     assert copy.space == both.space
     assert copy.space.baselines == both.space.baselines
     assert type(copy(both.space.baselines[1]).odometry) is KeyframeNdt
-
-
-@pytest.mark.parametrize("catch_up_scans", [0, 3])
-def test_a_hand_over_to_another_odometry_prepares_anew(catch_up_scans):
-    both = pool()
-    first, second = both.space.baselines
-    made = []
-
-    def make(parameters):
-        made.append(both(parameters))
-        return made[-1]
-
-    warm_up = both.description.warm_up._replace(seconds=0.5, full_rate=0.5, stride=1)
-    odometry = HandOver(make, first, warm_up, catch_up_scans)
-    poses = [np.eye(4)]
-    odometry.start(odometry.prepare(scan(0)), np.eye(4))
-    for i in range(1, N_SCANS):
-        if i == N_SCANS // 2:
-            odometry.apply(Selection(1, second))
-        poses.append(odometry.register(odometry.prepare(scan(i))).T_odom_sensor)
-    assert [type(one.odometry) for one in made] == [KeyframeGicp, KeyframeNdt]
-    assert made[0].preparation != made[1].preparation
-    x = np.array(poses)[:, 0, 3]
-    truth = np.linspace(0.0, np.mean(np.diff(x)) * (N_SCANS - 1), N_SCANS)
-    np.testing.assert_allclose(x, truth, atol=0.3)

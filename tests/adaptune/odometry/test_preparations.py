@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
 
-from adaptune.bank.hand_over import HandOver
-from adaptune.odometry.base import InProcess, Odometry, Preparations, Registration, WarmUp
+from adaptune.odometry.base import InProcess, Odometry, Preparations, Registration
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings, KeyframeVgicp
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.space import Float, ParameterSpace
 
 
@@ -81,14 +79,3 @@ def test_what_a_setting_fixes_is_not_tuned():
     assert "downsampling" not in KeyframeGicp.describe(settings).space.names
     assert "iterations" in KeyframeGicp.describe(settings).space.names
     assert KeyframeGicp(settings=settings).parameters["downsampling"] == 0.3
-
-
-def test_a_hand_over_may_prepare_otherwise():
-    made = HandOver(lambda p: InProcess(Cell(p)), {"cell": 1.0}, WarmUp())
-    made.start(made.prepare(scan(0)), np.eye(4))
-    for i in range(1, 5):
-        made.register(made.prepare(scan(i)))
-    made.apply(Selection(1, {"cell": 2.0}))
-    pose, registered = made.register(made.prepare(scan(5)))
-    assert registered
-    assert pose[0, 3] == pytest.approx(0.5)

@@ -5,9 +5,8 @@ import pytest
 from street import N_SCANS, drive, make, scan
 
 from adaptune.bank.bank import Bank
-from adaptune.bank.hand_over import HandOver
 from adaptune.geometry import invert
-from adaptune.odometry import OdometryError, OdometryInstance, Usage, WarmUp
+from adaptune.odometry import OdometryError, OdometryInstance, Usage
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
@@ -16,7 +15,7 @@ from adaptune.selection import Selection
 
 BASELINE = KeyframeGicp.space.baseline
 OTHER = {"max_correspondence_distance": 1.0, "keyframe_interval": 1.0}
-WARM_UP = WarmUp(0.5, 0.5, 1)
+WARM_UP = 0.5
 FACTORY = OdometryFactory("gicp", {}, KeyframeGicp.space, Limits(seconds=60.0))
 
 
@@ -33,13 +32,11 @@ KINDS = {
     "isolated": isolated,
     "process": lambda: make("process"),
     "command": lambda: make("command"),
-    "hand-over": lambda: HandOver(gicp, BASELINE, WARM_UP),
-    "hand-over, isolated": lambda: HandOver(isolated, BASELINE, WARM_UP, 2),
     "bank": lambda: Bank(gicp, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
     "bank, isolated": lambda: Bank(isolated, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0),
     "bank, two cores": lambda: Bank(FACTORY, {4: BASELINE, 9: OTHER}, WARM_UP, 3.0, cores=2),
 }
-ELSEWHERE = {"isolated", "process", "hand-over, isolated", "bank, isolated", "bank, two cores"}
+ELSEWHERE = {"isolated", "process", "bank, isolated", "bank, two cores"}
 every_kind = pytest.mark.parametrize("kind", KINDS)
 
 

@@ -19,8 +19,7 @@ from contained import (
 )
 from needs import reference_image
 
-from adaptune.bank.hand_over import HandOver
-from adaptune.odometry import OdometryError, WarmUp
+from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.docker import rustle as lockstep
 from adaptune.odometry.docker.engine import engine
@@ -164,23 +163,6 @@ def test_a_command_sets_parameters(make, systems):
     assert all(np.isnan(found.T_odom_sensor).all() for found in on(odometry, 1, 4))
     assert len(odometry.faults) == 1
     assert odometry.ended
-
-
-def test_hand_over_between_containers(make):
-    def begin(parameters):
-        return make(parameters)
-
-    odometry = HandOver(begin, VALUES, WarmUp(0.5, 0.5, 1))
-    prepared = [odometry.prepare(scan) for scan in scans()[:16]]
-    odometry.start(prepared[0], np.eye(4))
-    poses = [np.eye(4), *(odometry.register(p).T_odom_sensor for p in prepared[1:8])]
-    odometry.apply(Selection(0, VALUES | OTHER))
-    assert len(containers()) == 1
-    poses += [odometry.register(p).T_odom_sensor for p in prepared[8:]]
-    np.testing.assert_allclose(poses[:8], host_poses()[:8], atol=1e-6)
-    np.testing.assert_allclose(np.diff(np.array(poses)[:, 0, 3]), 0.3, atol=0.05)
-    assert not odometry.faults
-    odometry.close()
 
 
 def test_one_that_dies_is_a_fault_with_its_last_lines(make):
