@@ -172,7 +172,7 @@ class RefusedError(HostError):
     """What user code, or what runs it, refuses in words of its own."""
 
 
-def verdict(code: int) -> str:
+def how_it_ended(code: int) -> str:
     """How a process ended, by its exit code, or minus the signal's number."""
     if code >= 0:
         return f"its process ended with code {code}"
@@ -350,7 +350,7 @@ def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -
                 raise RefusedError(refused)
             return None
         with contextlib.suppress(subprocess.TimeoutExpired):
-            what = f"it cannot be imported: {verdict(process.wait(1.0))}"
+            what = f"it cannot be imported: {how_it_ended(process.wait(1.0))}"
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -496,7 +496,7 @@ def _watch(
             _run(connection, service, do, name, bounds)
         code = keep(child, connection.fileno()).code
         if code:
-            what = bounds.late if code == -signal.SIGALRM else verdict(code)
+            what = bounds.late if code == -signal.SIGALRM else how_it_ended(code)
             fault = {"type": "fault", "message": quoting(what, output)}
             with contextlib.suppress(OSError), connection.makefile("wb") as writer:
                 send(writer, fault)

@@ -15,8 +15,8 @@ from multiprocessing.context import ForkServerProcess
 from typing import Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 
 from adaptune.archive import Frames, Trial
-from adaptune.errors import AdaptuneError
-from adaptune.processes import apart, pin, verdict
+from adaptune.errors import AdaptuneError, in_a_line
+from adaptune.processes import apart, how_it_ended, pin
 from adaptune.space import ParameterSet
 from offline.trial import PreparedSequence, TrialSetup
 
@@ -58,9 +58,10 @@ class TaskResult(NamedTuple):
 
 
 class Death(NamedTuple):
-    """The death of a worker at its task, and its cause."""
+    """The death of a worker at its task."""
 
     cause: str
+    killed: bool = True  # from outside, as systems do where the memory is full
 
 
 Work = Literal["reading", "running", "registering hops of"]
@@ -182,9 +183,11 @@ class _Queue(Generic[W]):
         self.waiting.insert(0, task)
         self._deaths[task.key] += 1
         if self._deaths[task.key] == MOST_DEATHS:
+            help_ = "what they wrote above may say why"
+            if death.killed:
+                help_ = "if they were out of memory, lower offline.memory or offline.workers"
             self.failure = WorkerError(
-                f"{MOST_DEATHS} workers died ({death.cause}) on {task}; if they were out of "
-                f"memory, lower offline.memory or offline.workers"
+                f"{MOST_DEATHS} workers died ({death.cause}) on {task}; {help_}"
             )
 
 
@@ -302,26 +305,33 @@ class Workers:
             except (EOFError, OSError):
                 connection.close()
                 process.join()
-                outcomes.append((w, Death(verdict(process.exitcode or 0))))
+                code = process.exitcode or 0
+                outcomes.append((w, Death(how_it_ended(code), code == -signal.SIGKILL)))
             if not isinstance(outcomes[-1][1], TaskProgress):
                 self._busy.remove(w)
         return outcomes
 
     def _spawn(self, w: int) -> _Worker:
         here, there = self._context.Pipe()
-        given = (there, self.setup, os.getpid() + w, self.memory / self.n)
+        given = (there, os.getpid() + w, self.memory / self.n)
         process = self._context.Process(target=_serve, args=given, daemon=True)
         process.start()
         there.close()
+        with contextlib.suppress(BrokenPipeError):  # `wait` notices it
+            here.send(self.setup)
         return _Worker(process, here)
 
 
-def _serve(connection: Connection, setup: TrialSetup, core: int, memory: float) -> None:
+def _serve(connection: Connection, core: int, memory: float) -> None:
     # Ctrl-C reaches all processes; the driver decides what happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.setsid()  # user code may end its process group
     pin(core)
-    sequences = Sequences(setup, memory)
+    try:
+        sequences = Sequences(connection.recv(), memory)
+    except Exception as error:
+        connection.send(WorkerError(f"a worker cannot import what it needs: {in_a_line(error)}"))
+        return
     report = now_and_then(connection.send)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

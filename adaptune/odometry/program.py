@@ -558,7 +558,7 @@ class Command(WholeRun):
             self._usage = Usage(ended.cpu, ended.memory, (time.perf_counter() - begin) / n)
         if in_time is None:
             return f"it took longer than isolation.seconds = {self._limits.seconds:g} for each scan"
-        return processes.verdict(in_time.code) if in_time.code else None
+        return processes.how_it_ended(in_time.code) if in_time.code else None
 
 
 def read_output(folder: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:

@@ -449,7 +449,7 @@ class Process(UserProgram):
         if self._program is None:
             return what.replace("its process ended", "it ended the conversation")
         if (ended := self._program.wait(0.5)) is not None:
-            what = processes.verdict(ended.code)
+            what = processes.how_it_ended(ended.code)
         return processes.quoting(what, self._written)
 
 

@@ -185,7 +185,7 @@ def test_what_a_program_has_started_ends_with_it(tmp_path):
 DRIVER = """
 import sys, time
 import numpy as np
-from adaptune import hosting
+from adaptune import processes as hosting
 from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan

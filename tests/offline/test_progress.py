@@ -1,10 +1,12 @@
+from importlib import import_module
+
 import pytest
 
 from offline import workers
 from offline.campaign import watched
 from offline.config import load_study
 from offline.train import train
-from offline.workers import Death, Task, TaskProgress, TaskResult, now_and_then, run
+from offline.workers import Death, Task, TaskProgress, TaskResult, Workers, now_and_then, run
 
 
 class TwoWords:
@@ -39,6 +41,28 @@ def test_what_a_dead_worker_had_done_does_not_count():
     pool.said = [half, Death("it was killed"), half]
     list(watched(pool, [Task("one", (0, 1), ({}, {}))], "runs", lambda *call: calls.append(call)))
     assert [done for _, done, *_ in calls] == [1.6, 1.6, 2]
+
+
+@pytest.mark.parametrize("killed", [True, False])
+def test_memory_is_named_only_where_workers_were_killed(killed):
+    pool = TwoWords()
+    pool.said = [Death("its process ended", killed)] * workers.MOST_DEATHS
+    with pytest.raises(workers.WorkerError, match="3 workers died") as caught:
+        list(run(pool, [Task("one", (0, 1), ({}, {}))]))
+    assert ("offline.memory" in str(caught.value)) == killed
+
+
+class Elsewhere:
+    """A setup whose module a worker does not find."""
+
+    def __reduce__(self):
+        return import_module, ("no_module_of_the_worker_s",)
+
+
+def test_a_worker_that_cannot_import_tells_why():
+    with Workers(Elsewhere(), 1, 1e9) as pool, pytest.raises(workers.WorkerError) as caught:
+        list(run(pool, [Task("one", (0, 1), ({}, {}))]))
+    assert "No module named 'no_module_of_the_worker_s'" in str(caught.value)
 
 
 def test_a_second_look_at_a_sequence_is_told_apart():

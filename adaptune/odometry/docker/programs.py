@@ -138,7 +138,7 @@ class DockerCommand(WholeRun):
             time.sleep(_BETWEEN_LOOKS)
         if container.out_of_memory:
             return f"out of isolation.memory = {self._limits.memory:g} GB"
-        return processes.verdict(code) if code else None
+        return processes.how_it_ended(code) if code else None
 
 
 # Programs in Docker images that receive scans and return poses, one after the other.
@@ -253,7 +253,7 @@ class DockerProcess(UserProgram):
             return None
         if self._container.out_of_memory:
             return f"out of isolation.memory = {self._limits.memory:g} GB"
-        return processes.verdict(code)
+        return processes.how_it_ended(code)
 
 
 @cache

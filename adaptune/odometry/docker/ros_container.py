@@ -196,7 +196,7 @@ class RosSystem:
         if (code := self._container.ended()) is None:
             return None
         words = self._container.last_lines()
-        return OdometryError(f"no roscore: {processes.verdict(code)}: {words}")
+        return OdometryError(f"no roscore: {processes.how_it_ended(code)}: {words}")
 
     def state(self) -> dict[str, Any]:
         """What adaptune's node sees, see `ros1_node`; an error where the system has ended.

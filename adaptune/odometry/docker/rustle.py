@@ -407,7 +407,7 @@ class Lockstep(Faulting):
 _BETWEEN_TOPIC_LOOKS = 0.1
 _BETWEEN_STATES = 1.0
 _LONGEST_PAUSE = 10.0
-"""Seconds."""
+"""Seconds; a pause between poses may have been longer, and is then not waited for."""
 _STEADY = 0.9
 """Least share of poses whose stamps are as far from the scans' as those of the others."""
 
@@ -473,6 +473,27 @@ def write_poses(
                 connection = bag.add_connection(topic, kind, typestore=store)
             stamps = [stamp for stamp, *_ in POSES[kind](store.deserialize_ros1(data, kind))]
             bag.write(connection, max(stamps, default=0), data)
+
+
+def drained(recorder: PoseRecorder, over: float, last: int, drain: float) -> bool:
+    """Whether the pose of the last scan is there, or nothing came for a while.
+
+    Parameters
+    ----------
+    recorder
+        Has recorded the poses.
+    over
+        Time at which the bag was over.
+    last
+        Stamp of the last scan.
+    drain
+        Seconds for which nothing has come. They are more where poses came in longer intervals.
+    """
+    # Stamps of a clock of its own say nothing.
+    if last <= recorder.newest() < last + 10**9:
+        return True
+    pause = max(drain, min(3.0 * recorder.longest_pause, _LONGEST_PAUSE))
+    return time.monotonic() - max(recorder.last, over) > pause
 
 
 class PlayedBag(WholeRun):
@@ -541,7 +562,7 @@ class PlayedBag(WholeRun):
             over = time.monotonic()
             # Nodes that sleep by the clock must wake up to finish.
             system.run_clock(_end_of(given.path), self.settings.rate)
-            while not self._drained(recorder, over, int(given.stamps[-1])):
+            while not drained(recorder, over, int(given.stamps[-1]), self.settings.drain):
                 time.sleep(_BETWEEN_TOPIC_LOOKS)
                 self._check_time()
             self._see(system, n)
@@ -553,14 +574,6 @@ class PlayedBag(WholeRun):
         """
         system.state()
         self._usage = system.usage._replace(seconds=system.usage.cpu / n)
-
-    def _drained(self, recorder: PoseRecorder, over: float, last: int) -> bool:
-        """Whether the pose of the last scan is there, or nothing came for a while."""
-        # Stamps of a clock of its own say nothing.
-        if last <= recorder.newest() < last + 10**9:
-            return True
-        pause = min(max(self.settings.drain, 3.0 * recorder.longest_pause), _LONGEST_PAUSE)
-        return bool(time.monotonic() - max(recorder.last, over) > pause)
 
     def _check_time(self) -> None:
         if time.monotonic() > self._end:

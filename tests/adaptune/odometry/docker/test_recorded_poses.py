@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker.rustle import PoseRecorder, check_stamps, write_poses
+from adaptune.odometry.docker.rustle import PoseRecorder, check_stamps, drained, write_poses
 from adaptune.recording.clouds import POSES, usable
 
 PERIOD = 10**8
@@ -121,6 +121,25 @@ def test_pauses_are_measured(link, monkeypatch):
     assert recorder.last == 17.2
     # The time until the first is no pause.
     assert recorder.longest_pause == 1.5
+
+
+@pytest.mark.parametrize(
+    ("drain", "interval", "pause"),
+    [(2.0, 0.1, 2.0), (60.0, 0.1, 60.0), (2.0, 1.5, 4.5), (2.0, 9, 10)],
+)
+def test_a_system_is_waited_for_until_nothing_comes(link, monkeypatch, drain, interval, pause):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    recorder, last = PoseRecorder(link, "/found"), int(SCANS[-1])
+    for i in range(3):
+        now[0] = 100.0 + i * interval
+        link.publish(odometry(i))
+    over = now[0] + 5.0
+    for waited, done in ((-5.0, False), (pause - 0.01, False), (pause + 0.01, True)):
+        now[0] = over + waited
+        assert drained(recorder, over, last, drain) == done
+    link.publish(odometry(39))
+    assert drained(recorder, over, last, drain)
 
 
 def test_messages_that_hold_no_poses_are_refused(link):
