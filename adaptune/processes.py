@@ -89,8 +89,9 @@ class SocketStream:
             self._socket.close()
 
     def limit(self, seconds: float) -> None:
-        """Raise a `TimeoutError` where a message takes longer."""
-        self._socket.settimeout(seconds)
+        """Change the time after which there is a `TimeoutError`, if there is such a time."""
+        if self._socket.gettimeout() is not None:
+            self._socket.settimeout(seconds)
 
     def end(self) -> None:
         """End the conversation, for all processes that share the socket and threads that read."""
@@ -261,8 +262,7 @@ class Service(NamedTuple):
     Attributes
     ----------
     module : str
-        Its function ``load(name)`` imports the user code. Others, of a stream to read, one to write
-        and the name, answer messages until the stream ends.
+        Its function ``load(name)`` imports the user code. Others make an `Answer` from the name.
     environment : dict
         Additional variables.
     """
@@ -357,55 +357,137 @@ def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -
     return what
 
 
-def connect(service: Service, name: str, do: str, bounds: Bounds) -> SocketStream:
-    """A stream to a fresh process, in which a function `do` of the service answers messages."""
-    if server(service, name).process.poll() is not None:
-        server.cache_clear()
-    here, there = socket.socketpair()
-    with there:
-        request = json.dumps([do, bounds]).encode()
-        socket.send_fds(server(service, name).control, [request], [there.fileno()])
-    return SocketStream(here)
+class Forked(NamedTuple):
+    """A fresh process in which a function `do` of a service answers messages."""
+
+    service: Service
+    name: str
+    do: str
+    bounds: Bounds = UNBOUNDED
+
+    def connect(self) -> SocketStream:
+        """Fork it; a `HostError` if the user code cannot be imported."""
+        if server(self.service, self.name).process.poll() is not None:
+            server.cache_clear()
+        here, there = socket.socketpair()
+        with there:
+            request = json.dumps([self.do, self.bounds]).encode()
+            control = server(self.service, self.name).control
+            socket.send_fds(control, [request], [there.fileno()])
+        return SocketStream(here)
+
+    def why(self, what: str) -> str:
+        """What is known of its end: it has said so itself."""
+        return what
+
+    def close(self) -> None:
+        """It ends with its stream."""
 
 
-class Hosted:
-    """A conversation with user code in a process of its own, which the first message begins.
+class Transport(Protocol):
+    """Another process, and the way to it: forked from a server, behind a socket, in a container."""
 
-    Parameters
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    @property
+    def bounds(self) -> Bounds:
+        """Its limits."""
+
+    def connect(self) -> SocketStream:
+        """Begin the process, or reach it."""
+
+    def why(self, what: str) -> str:
+        """What has happened, and how the process ended, if that is known."""
+
+    def close(self) -> None:
+        """End the process."""
+
+
+class Conversation:
+    """Messages to another process, and its answers.
+
+    Attributes
     ----------
-    service, name, do, bounds
-        See `connect`.
+    transport : Transport
+        The other process.
     """
 
-    def __init__(self, service: Service, name: str, do: str, bounds: Bounds = UNBOUNDED):
-        self._to = service, name, do, bounds
+    def __init__(self, transport: Transport):
+        self.transport = transport
         self._stream: SocketStream | None = None
 
-    def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
-        """Send a message and wait for the answer.
+    @property
+    def alive(self) -> bool:
+        """Whether the process was there when it was last used."""
+        return self._stream is not None
+
+    def open(self) -> None:
+        """Begin the process if there is none; raises what `connect` of the transport does."""
+        if self._stream is None:
+            self._stream = self.transport.connect()
+
+    def send(self, header: Mapping[str, Any], **arrays: Any) -> None:
+        """Send a message, if there is a process."""
+        if self._stream is not None:
+            # A process that does not listen any more has said why, or has ended.
+            with contextlib.suppress(OSError):
+                send(self._stream, header, **arrays)
+
+    def ready(self, seconds: float) -> bool:
+        """Whether `receive` has something to give in so many seconds."""
+        return self._stream is None or self._stream.ready(seconds)
+
+    def receive(self) -> Message:
+        """Wait for the next answer.
 
         Raises
         ------
         HostError
-            It names the user code, and says why there is no answer.
+            It says why there is none. The conversation is over then.
         RefusedError
             What the other process refuses.
         """
-        if self._stream is None:
-            self._stream = connect(*self._to)
-        # A process that does not listen any more has said why, or has ended.
-        with contextlib.suppress(OSError):
-            send(self._stream, header, **arrays)
-        what = "its process ended"
-        with contextlib.suppress(OSError, WireError):
-            answer = receive(self._stream)
-            if answer is not None and answer.header.get("type") == "done":
-                return answer
-            if answer is not None and answer.header.get("type") == "refused":
-                raise RefusedError(str(answer.header["message"]))
-            what = what if answer is None else str(answer.header.get("message"))
+        return accepted(self.next_message())
+
+    def next_message(self) -> Message:
+        """Wait for the next answer, which may be a refusal."""
+        what, answer = "its process ended", None
+        try:
+            if self._stream is not None:
+                answer = receive(self._stream)
+                self._stream.limit(self.transport.bounds.seconds)
+        except TimeoutError:
+            what = self.transport.bounds.late
+        except OSError:
+            pass
+        except WireError as error:
+            what = str(error)
+        if answer is not None and answer.header.get("type") != "fault":
+            return answer
+        what = self.transport.why(what) if answer is None else str(answer.header["message"])
         self.close()
-        raise HostError(f"{self._to[1]}: {what}")
+        raise HostError(what)
+
+    def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
+        """Send a message, to a new process if there is none, and wait for the answer.
+
+        Raises
+        ------
+        HostError
+            It names the process, and says why there is no answer.
+        RefusedError
+            What the other process refuses.
+        """
+        self.open()
+        self.send(header, **arrays)
+        try:
+            return self.receive()
+        except RefusedError:
+            raise
+        except HostError as error:
+            raise HostError(f"{self.transport.name}: {error}") from error
 
     def close(self) -> None:
         """End the process."""
@@ -413,32 +495,34 @@ class Hosted:
             with contextlib.suppress(OSError):
                 self._stream.close()
             self._stream = None
+        self.transport.close()
 
     def __del__(self) -> None:
         self.close()
 
 
-def answer_all(
-    reader: Readable, writer: BinaryIO, answer: Callable[[Message], Mapping[str, Any]]
-) -> None:
-    """Answer messages until the stream ends; an `AdaptuneError` is passed on.
+def accepted(answer: Message) -> Message:
+    """An answer; a `RefusedError` if it says that it cannot be done."""
+    if answer.header.get("type") == "refused":
+        raise RefusedError(str(answer.header["message"]))
+    return answer
 
-    Parameters
-    ----------
-    reader, writer
-        The stream.
-    answer
-        Gives what the answer to a message holds; arrays in it are sent as such.
-    """
+
+Answer = Callable[[Message], Mapping[str, Any] | None]
+"""Gives what the answer to a message holds, arrays as such; None if there is no answer."""
+
+
+def answer_all(reader: Readable, writer: Writable, answer: Answer) -> None:
+    """Answer messages until the stream ends; what an `AdaptuneError` says is refused."""
     while (message := receive(reader)) is not None:
         try:
             found = answer(message)
         except AdaptuneError as error:
-            send(writer, {"type": "refused", "message": str(error)})
-            continue
-        arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
-        rest = {key: value for key, value in found.items() if key not in arrays}
-        send(writer, {"type": "done", **rest}, **arrays)
+            found = {"type": "refused", "message": str(error)}
+        if found is not None:
+            arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
+            rest = {key: value for key, value in found.items() if key not in arrays}
+            send(writer, {"type": "done", **rest}, **arrays)
 
 
 # Forks processes in which user code lives, see `adaptune.processes`.
@@ -517,7 +601,7 @@ def _run(
             bound = pages * resource.getpagesize() + int(bounds.memory * 1e9)
             resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
         with connection.makefile("rb") as reader, connection.makefile("wb") as writer:
-            getattr(service, do)(_Timed(reader, bounds.seconds), writer, name)
+            answer_all(_Timed(reader, bounds.seconds), writer, getattr(service, do)(name))
         code = 0
     except MemoryError:
         os.write(2, f"\n{bounds.full}\n".encode())

@@ -5,38 +5,32 @@ members that prepare in the same way. Only odometries that are clean run like th
 its process, it ends the others there, too.
 """
 
-import contextlib
 import itertools
-import resource
 import time
-from collections import OrderedDict, deque
-from collections.abc import Sequence
-from typing import Any, BinaryIO, NamedTuple
+from collections import OrderedDict, defaultdict, deque
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from adaptune import processes
-from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
-from adaptune.odometry.base import (
-    InProcess,
-    OdometryInstance,
-    Preparations,
-    PreparedScan,
-    Registration,
-    Usage,
-)
+from adaptune.odometry.base import InProcess, OdometryInstance, Preparations, PreparedScan, Usage
 from adaptune.odometry.factory import Factory, OdometryFactory
-from adaptune.odometry.registry import make_here
-from adaptune.odometry.remote import SERVICE, Faulting
+from adaptune.odometry.registry import make_here, odometry_class
+from adaptune.odometry.remote import Isolated
 from adaptune.processes import other_core
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.space import ParameterSet
 
 KEPT = 160
 """Scans that a process keeps for members that restart: those of a warm-up, at ten a second."""
+
+
+SERVICE = processes.Service(__name__, tuple(processes.ONE_THREAD.items()))
+"""What a server does with an odometry of which there are several."""
 
 
 class SentScan(NamedTuple):
@@ -44,6 +38,11 @@ class SentScan(NamedTuple):
 
     number: int
     scan: Scan
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds."""
+        return self.scan.stamp
 
 
 class MemberProcess:
@@ -60,9 +59,9 @@ class MemberProcess:
     def __init__(self, name: str, bounds: processes.Bounds):
         self.generation = 0  # of how many processes this is the last
         self.ending = ""  # what is known of how the last one ended
-        self._name = name
-        self._bounds = bounds
-        self._stream: processes.SocketStream | None = None
+        self.conversation = processes.Conversation(
+            processes.Forked(SERVICE, name, "members", bounds)
+        )
         self._numbers = itertools.count()
         self._held: OrderedDict[int, None] = OrderedDict()
         self._answers: dict[int, deque[processes.Message]] = {}
@@ -73,24 +72,10 @@ class MemberProcess:
         """Whether it works: a scan that it is sent would wait."""
         return self._owed > 0
 
-    @property
-    def alive(self) -> bool:
-        """Whether it was there when it was last used."""
-        return self._stream is not None
-
-    def connect(self) -> None:
-        """Begin a new process if there is none.
-
-        Raises
-        ------
-        OdometryError
-            If the odometry cannot be imported.
-        """
-        if self._stream is None:
-            try:
-                self._stream = processes.connect(SERVICE, self._name, "members", self._bounds)
-            except processes.HostError as error:
-                raise OdometryError(str(error)) from error
+    def open(self) -> None:
+        """Begin a new process if there is none; a `HostError` if the odometry is not imported."""
+        if not self.conversation.alive:
+            self.conversation.open()
             self.generation += 1
             self._held.clear()
             self._answers, self._owed = {}, 0
@@ -104,58 +89,86 @@ class MemberProcess:
 
     def need(self, sent: SentScan) -> None:
         """Send a scan that the process does not have."""
-        if self._stream is not None and sent.number not in self._held:
+        if self.conversation.alive and sent.number not in self._held:
             _keep(self._held, sent.number, None)
-            header = {"type": "scan", "number": sent.number, "stamp": sent.scan.stamp}
-            self._send(header, **wire.scan_arrays(sent.scan))
+            header = {"type": "scan", "number": sent.number, "stamp": sent.stamp}
+            self.conversation.send(header, **wire.scan_arrays(sent.scan))
 
     def ask(self, header: dict[str, Any], **arrays: Any) -> None:
         """Send a member what it has to answer."""
         self._owed += 1
-        self._send(header, **arrays)
+        self.conversation.send(header, **arrays)
 
-    def _send(self, header: dict[str, Any], **arrays: Any) -> None:
-        if self._stream is not None:
-            # A process that does not listen any more has said why, or has ended.
-            with contextlib.suppress(OSError):
-                processes.send(self._stream, header, **arrays)
+    def answer(self, member: int, seconds: float | None = None) -> processes.Message | None:
+        """Wait for a member's answer, which stays, at most so long; None if there is none."""
+        end = None if seconds is None else time.perf_counter() + seconds
+        while not (mine := self._answers.get(member)) and self.conversation.alive:
+            if end is not None and not self.conversation.ready(end - time.perf_counter()):
+                break
+            try:
+                found = self.conversation.next_message()
+            except processes.HostError as error:
+                self.ending, self._owed = str(error), 0
+            else:
+                self._owed -= 1
+                self._answers.setdefault(found.header["member"], deque()).append(found)
+        return mine[0] if mine else None
 
-    def ready(self, member: int, seconds: float) -> bool:
-        """Whether `receive` would not wait longer than so many seconds."""
-        end = time.perf_counter() + seconds
-        while not self._answers.get(member) and self._stream is not None:
-            if not self._stream.ready(end - time.perf_counter()):
-                return False
-            self._take_answer(self._stream)
-        return True
-
-    def receive(self, member: int) -> processes.Message | None:
-        """Wait for a member's answer; None if the process ends before."""
-        while not self._answers.get(member) and self._stream is not None:
-            self._take_answer(self._stream)
-        mine = self._answers.get(member)
-        return mine.popleft() if mine else None
-
-    def _take_answer(self, stream: processes.SocketStream) -> None:
-        answer = None
-        with contextlib.suppress(OSError, processes.WireError):
-            answer = processes.receive(stream)
-        if answer is None or answer.header["type"] == "fault":
-            self.ending = "its process ended" if answer is None else answer.header["message"]
-            self.close()
-        else:
-            self._owed -= 1
-            self._answers.setdefault(answer.header["member"], deque()).append(answer)
+    def receive(self, member: int) -> processes.Message:
+        """Take a member's answer; a `HostError` if the process ends before."""
+        if self.answer(member) is None:
+            raise processes.HostError(self.ending)
+        return self._answers[member].popleft()
 
     def close(self) -> None:
         """End the process."""
-        if self._stream is not None:
-            with contextlib.suppress(OSError):
-                self._stream.close()
-            self._stream, self._owed = None, 0
+        self.conversation.close()
+        self._owed = 0
 
 
-class Member(Faulting):
+class _Channel(processes.Conversation):
+    """The part of a process's conversation that is one member's."""
+
+    def __init__(self, process: MemberProcess, number: int):
+        self._process, self._number = process, number
+        self._generation: int | None = None
+
+    @property
+    def alive(self) -> bool:
+        return self._generation is not None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the process that the member was in has ended."""
+        process = self._process
+        return not process.conversation.alive or self._generation != process.generation
+
+    def open(self) -> None:
+        self._process.open()
+        self._generation = self._process.generation
+
+    def send(self, header: Mapping[str, Any], **arrays: Any) -> None:
+        if not self.lost:
+            self._process.ask({**header, "member": self._number}, **arrays)
+
+    def ready(self, seconds: float) -> bool:
+        return self.lost or self._process.answer(self._number, seconds) is not None
+
+    def receive(self) -> processes.Message:
+        if self._generation != self._process.generation:
+            raise processes.HostError(self._process.ending)
+        return processes.accepted(self._process.receive(self._number))
+
+    def close(self) -> None:
+        self._generation = None
+        if self._number == 0:
+            self._process.close()
+
+    def __del__(self) -> None:
+        pass  # the process ends with its last member
+
+
+class Member(Isolated):
     """A member of a bank in another process.
 
     Parameters
@@ -170,8 +183,6 @@ class Member(Faulting):
         All of them.
     """
 
-    apart = True
-
     def __init__(
         self,
         process: MemberProcess,
@@ -179,25 +190,20 @@ class Member(Faulting):
         factory: OdometryFactory,
         parameters: ParameterSet,
     ):
-        super().__init__(factory.name, parameters)
-        self._process = process
-        self._number = number
-        self._hello = {
-            "odometry": factory.name,
-            "settings": factory.settings.model_dump(mode="json"),
-        }
-        self._generation: int | None = None
-        self._cpu = self._memory = 0.0
+        super().__init__(factory.name, parameters, factory.settings, factory.limits)
+        self._process, self._number = process, number
+        self._conversation: _Channel = _Channel(process, number)
+        self._fresh = False
 
     @property
     def ended(self) -> bool:
-        return not self._process.alive or self._generation != self._process.generation
+        return self._conversation.lost
 
     @property
     def usage(self) -> Usage:
         # The first one reports the memory of all.
         memory = None if self._number else self._memory
-        return Usage(self._cpu, memory, elsewhere=self._cpu)
+        return super().usage._replace(memory=memory)
 
     @property
     def preparation(self) -> MemberProcess:
@@ -207,68 +213,15 @@ class Member(Faulting):
     def busy(self) -> bool:
         return self._process.busy
 
-    def ready(self, seconds: float) -> bool:
-        return self.ended or self._process.ready(self._number, seconds)
-
-    def prepare(self, scan: Scan) -> SentScan:
+    def prepare(self, scan: Scan) -> Any:
         return self._process.sent(scan)
 
-    def start(
-        self, prepared: SentScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None:
-        self._last_motion.start(T_odom_sensor, T_previous_current)
-        if self.given_up:
-            return
-        self._process.connect()
-        if self.ended:
-            self._generation = self._process.generation
-            self._ask({"type": "hello", **self._hello, "parameters": self.parameters})
+    def _pose_fault(self, T_odom_sensor: Poses) -> None:
+        pass  # it is none of a member in this process either
+
+    def _scan(self, prepared: SentScan) -> tuple[dict[str, Any], dict[str, Any]]:
         self._process.need(prepared)
-        motion = T_previous_current
-        header = {"type": "start", "scan": prepared.number}
-        self._ask(header, pose=T_odom_sensor, motion=motion)
-
-    def submit(self, prepared: SentScan) -> None:
-        if not self.ended:
-            self._process.need(prepared)
-            header = {"type": "register", "scan": prepared.number, "member": self._number}
-            self._process.ask(header)
-
-    def collect(self) -> Registration:
-        registration = Registration(np.full((4, 4), np.nan), registered=False)
-        if (answer := self._receive()) is not None:
-            T_odom_sensor = answer.arrays["pose"].copy()
-            registration = Registration(T_odom_sensor, bool(answer.header["registered"]))
-        self._last_motion.move(registration.T_odom_sensor)
-        return registration
-
-    def apply(self, selection: Selection) -> None:
-        self.parameters |= selection.parameters
-        self._ask({"type": "configure", "parameters": selection.parameters})
-
-    def close(self) -> None:
-        self._generation = None
-        if self._number == 0:
-            self._process.close()
-
-    def _ask(self, header: dict[str, Any], **arrays: Any) -> None:
-        if not self.ended:
-            self._process.ask({**header, "member": self._number}, **arrays)
-            self._receive()
-
-    def _receive(self) -> processes.Message | None:
-        """Wait for the answer; None, and a fault, if the process has ended."""
-        if self._generation is None:
-            return None
-        answer = self._process.receive(self._number)
-        if answer is None:
-            self.note_fault(self._process.ending)
-            return None
-        if answer.header["type"] == "refused":
-            raise OdometryError(f"{self.name}: {answer.header['message']}")
-        self._cpu += answer.header["cpu"]
-        self._memory = max(self._memory, answer.header["memory"])
-        return answer
+        return {"stamp": prepared.stamp, "scan": prepared.number}, {}
 
 
 def _keep(held: OrderedDict[int, Any], number: int, what: Any) -> None:
@@ -278,57 +231,52 @@ def _keep(held: OrderedDict[int, Any], number: int, what: Any) -> None:
         held.popitem(last=False)
 
 
-def serve(reader: processes.Readable, writer: BinaryIO) -> None:
-    """Be the other process: answer messages with members until the stream ends."""
-    members: dict[int, InProcess] = {}
+# What runs in the other process.
+
+
+def load(name: str) -> None:
+    """Import the odometry."""
+    odometry_class(name)
+
+
+def members(_: str) -> processes.Answer:
+    """Answer messages with members, as `adaptune.odometry.wire` does with one odometry.
+
+    Scans come once, in messages without an answer; others name a scan by its number.
+    """
+    made: dict[int, Any] = {}
     scans: OrderedDict[int, PreparedScan] = OrderedDict()
     preparations = Preparations()
-    used = 0.0
-    while (message := processes.receive(reader)) is not None:
+    spent, used = defaultdict[int, float](float), 0.0  # CPU seconds of each member, and of all
+
+    def done(message: processes.Message) -> dict[str, Any]:
         header = message.header
-        if header["type"] == "scan":
+        if header["type"] == "hello":
+            given = header["odometry"], header["parameters"], header["settings"]
+            made[header["member"]], _ = make_here(*given)
+            return {}
+        member = made[header["member"]]
+        prepared = scans[header["scan"]].by(member) if "scan" in header else None
+        return wire.answered(member, message, prepared)
+
+    def answer(message: processes.Message) -> dict[str, Any] | None:
+        nonlocal used
+        if message.header["type"] == "scan":
             scan = preparations.of(wire.to_scan(message))
-            _keep(scans, header["number"], scan)
-            for member in members.values():
+            _keep(scans, message.header["number"], scan)
+            for member in made.values():
                 scan.by(member)
-            continue
-        arrays, answer = {}, {"type": "done", "member": header["member"]}
+            return None
         try:
-            found = _answer(members, scans, message)
+            found = done(message)
         except AdaptuneError as error:
-            answer |= {"type": "refused", "message": str(error)}
-        else:
-            if found is not None:
-                answer["registered"] = found.registered
-                arrays["pose"] = np.asarray(found.T_odom_sensor, np.float64)
-        now = resource.getrusage(resource.RUSAGE_SELF)
-        cpu = now.ru_utime + now.ru_stime
-        processes.send(
-            writer, answer | {"cpu": cpu - used, "memory": now.ru_maxrss * 1024e-6}, **arrays
-        )
-        used = cpu
+            found = {"type": "refused", "message": str(error)}
+        number, now = message.header["member"], wire.used()
+        spent[number] += now["cpu"] - used
+        used = now["cpu"]
+        return {**found, **now, "cpu": spent[number], "member": number}
 
-
-def _answer(
-    members: dict[int, InProcess], scans: OrderedDict[int, PreparedScan], message: processes.Message
-) -> Registration | None:
-    header, arrays = message
-    number, kind = header["member"], header["type"]
-    if kind == "hello":
-        made: Any = make_here(header["odometry"], header["parameters"], header["settings"])
-        members[number] = InProcess(made[0])
-        return None
-    member = members[number]
-    if kind == "configure":
-        member.odometry.configure(header["parameters"])
-        return None
-    prepared = scans[header["scan"]].by(member)
-    if kind == "register":
-        return member.register(prepared)
-    # Arrays from the stream are read-only; an odometry may change its poses.
-    motion = arrays["motion"].copy() if "motion" in arrays else None
-    member.start(prepared, arrays["pose"].copy(), motion)
-    return None
+    return answer
 
 
 def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[OdometryInstance]:
@@ -362,5 +310,5 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
         process = MemberProcess(factories[0][0].name, whole)
         for number, (i, (factory, own)) in enumerate(zip(share, factories, strict=True)):
             made[i] = Member(process, number, factory, own)
-        process.connect()
+        process.open()
     return made

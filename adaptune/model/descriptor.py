@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,20 +127,16 @@ def load(name: str) -> None:
     descriptor(name)
 
 
-def serve(reader: processes.Readable, writer: BinaryIO, name: str) -> None:
+def answers(name: str) -> processes.Answer:
     """Describe scan after scan."""
     describe = descriptor(name)
-
-    def answer(message: processes.Message) -> dict[str, Any]:
-        return {"described": np.asarray(describe(wire.to_scan(message)), np.float32)}
-
-    processes.answer_all(reader, writer, answer)
+    return lambda message: {"described": np.asarray(describe(wire.to_scan(message)), np.float32)}
 
 
-def _elsewhere(name: str) -> Descriptor:
+def _hosted(name: str) -> Descriptor:
     """Function of a descriptor of the user that runs in a process of its own."""
     bounds = processes.Bounds(_SECONDS, late=f"a scan took longer than {_SECONDS:g} s")
-    process = processes.Hosted(_SERVICE, where(name), "serve", bounds)
+    process = processes.Conversation(processes.Forked(_SERVICE, where(name), "answers", bounds))
 
     def describe(scan: Scan) -> NDArray[np.float32]:
         try:
@@ -165,7 +161,7 @@ class Describer:
 
     def __init__(self, names: Iterable[str]):
         self._functions = {
-            name: descriptor(name) if name in DESCRIPTORS else _elsewhere(name) for name in names
+            name: descriptor(name) if name in DESCRIPTORS else _hosted(name) for name in names
         }
         self.blocks: dict[str, int] = {}
         # This also loads compiled code before the first scan.

@@ -303,9 +303,8 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
 
 @cache
 def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
-    process = processes.Hosted(
-        SERVICE, name, "describe", processes.Bounds(processes.IMPORT_SECONDS)
-    )
+    bounds = processes.Bounds(processes.IMPORT_SECONDS)
+    process = processes.Conversation(processes.Forked(SERVICE, name, "describe", bounds))
     try:
         message = {"type": "describe", "settings": json.loads(settings), "folder": folder}
         return process.ask(message).header

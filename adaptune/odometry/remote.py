@@ -4,13 +4,12 @@ A small server imports the odometry once and forks a fresh process for every sta
 milliseconds, and global state of the odometry ends with its process.
 """
 
-import contextlib
 import logging
 import socket
 import tempfile
 from collections.abc import Sequence
 from functools import cache
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_validator
@@ -114,7 +113,7 @@ class Faulting(OdometryInstance):
 
 
 class Isolated(Faulting):
-    """An odometry that lives in another process, a new one with every start.
+    """An odometry in another process, by default a new one with every start.
 
     If that process ends, or returns an invalid pose, this is a *fault*: the pose of that scan is
     NaN, and so are all that follow until a new start. A fault quotes the last lines that the
@@ -125,30 +124,40 @@ class Isolated(Faulting):
     name
         The odometry.
     parameters, settings
-        See `Odometry`.
+        See `Odometry`; or the settings as the other process receives them.
     limits
         What each process may use.
+    transport
+        The other process, if it is not forked from a server that has imported the odometry. It
+        stays from start to start, and needs to be a new one only after a fault.
     """
 
     apart = True
-    _fresh = True  # each start needs a new process
 
-    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, limits: Limits):
+    def __init__(
+        self,
+        name: str,
+        parameters: ParameterSet,
+        settings: BaseModel | dict[str, Any],
+        limits: Limits,
+        transport: processes.Transport | None = None,
+    ):
         super().__init__(name, parameters)
         self._cpu = self._cpu_before = self._memory = 0.0  # as the other processes report
-        self._hello: dict[str, Any] = {
-            "odometry": name,
-            "settings": settings.model_dump(mode="json"),
-        }
-        self._limits = limits
-        self._stream: processes.SocketStream | None = None
+        plain = settings if isinstance(settings, dict) else settings.model_dump(mode="json")
+        self._settings = plain
+        self._odometry = name if transport is None else None  # a program is one odometry
+        self._fresh = transport is None  # each start needs a new process
+        if transport is None:
+            # Nothing else limits TBB's threads, and it sums in the order in which they finish.
+            bounds = limits.bounds._replace(core=next_core())
+            transport = processes.Forked(SERVICE, name, "converse", bounds)
+        self._conversation = processes.Conversation(transport)
         self._busy = False
-        # Nothing else limits TBB's threads, and it sums in the order in which they finish.
-        self._core = next_core()
 
     @property
     def ended(self) -> bool:
-        return self._stream is None
+        return not self._conversation.alive
 
     @property
     def usage(self) -> Usage:
@@ -159,7 +168,7 @@ class Isolated(Faulting):
         return self._busy
 
     def ready(self, seconds: float) -> bool:
-        return self._stream is None or self._stream.ready(seconds)
+        return self._conversation.ready(seconds)
 
     def prepare(self, scan: Scan) -> Scan:
         return scan  # the other process prepares
@@ -170,30 +179,42 @@ class Isolated(Faulting):
         self._last_motion.start(T_odom_sensor, T_previous_current)
         if self._fresh:
             self.close()
-        if self._stream is None:
-            if self.given_up:
-                return
-            try:
-                self._stream = self._connect()
-            except UnavailableError:
-                raise
-            except OdometryError as error:
-                # One that has run can be gone for good.
-                if not self.faults:
-                    raise
-                self.note_fault(str(error))
-                return
-            self._ask(wire.hello(**self._hello, parameters=self.parameters))
+        if self.ended and (self.given_up or self.begin() is None):
+            return
+        header, arrays = self._scan(prepared)
         self._ask(
-            {"type": "start", "stamp": prepared.stamp},
-            **wire.scan_arrays(prepared),
-            pose=T_odom_sensor,
-            motion=T_previous_current,
+            {**header, "type": "start"}, **arrays, pose=T_odom_sensor, motion=T_previous_current
         )
 
-    def submit(self, prepared: Scan) -> None:
+    def begin(self) -> processes.Message | None:
+        """Begin a process that is this odometry; its answer, None if there is a fault.
+
+        Raises
+        ------
+        OdometryError
+            If there has never been such a process.
+        """
+        self._cpu_before = self._cpu
+        try:
+            self._conversation.open()
+        except UnavailableError:
+            raise
+        except (OdometryError, processes.HostError) as error:
+            # One that has run can be gone for good.
+            if not self.faults:
+                raise OdometryError(str(error)) from error
+            self.note_fault(str(error))
+            return None
+        return self._ask(wire.hello(self._odometry, self.parameters, self._settings))
+
+    def _scan(self, prepared: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        """A prepared scan as a message."""
+        return {"stamp": prepared.stamp}, wire.scan_arrays(prepared)
+
+    def submit(self, prepared: Any) -> None:
         self._submitted, self._busy = prepared.stamp, True
-        self._send({"type": "register", "stamp": prepared.stamp}, **wire.scan_arrays(prepared))
+        header, arrays = self._scan(prepared)
+        self._conversation.send({**header, "type": "register"}, **arrays)
 
     def collect(self) -> Registration:
         registration = self._registration()
@@ -210,7 +231,7 @@ class Isolated(Faulting):
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
             cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
-            wrong = pose_fault(T_odom_sensor)
+            wrong = self._pose_fault(T_odom_sensor)
             if late:
                 wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
             wrong = wrong and f"a pose {wrong}"
@@ -224,6 +245,9 @@ class Isolated(Faulting):
         self._memory = max(self._memory, memory)
         return Registration(T_odom_sensor.copy(), bool(registered))
 
+    def _pose_fault(self, T_odom_sensor: Poses) -> str | None:
+        return pose_fault(T_odom_sensor)
+
     def apply(self, selection: Selection) -> None:
         self.configure(selection.parameters)
 
@@ -233,60 +257,23 @@ class Isolated(Faulting):
         self._ask({"type": "configure", "parameters": parameters})
 
     def close(self) -> None:
-        if self._stream is not None:
-            with contextlib.suppress(OSError):
-                self._stream.close()
-            self._stream = None
-            self._cpu_before = self._cpu
-
-    def __del__(self) -> None:
-        self.close()
+        self._conversation.close()
 
     def _ask(self, header: dict[str, Any], **arrays: Any) -> processes.Message | None:
-        self._send(header, **arrays)
+        self._conversation.send(header, **arrays)
         return self._receive()
 
-    def _send(self, header: dict[str, Any], **arrays: Any) -> None:
-        if self._stream is not None:
-            # A process that does not listen any more has said why, or has ended.
-            with contextlib.suppress(OSError):
-                processes.send(self._stream, header, **arrays)
-
     def _receive(self) -> processes.Message | None:
-        """Wait for the answer; None if there is none."""
-        if self._stream is None:
+        """Wait for the answer; None if there is none, with a fault if the process has ended."""
+        if not self._conversation.alive:
             return None
-        answer, what = None, "its process ended"
         try:
-            answer = processes.receive(self._stream)
-        except TimeoutError:
-            what = f"a scan took longer than isolation.seconds = {self._limits.seconds:g}"
-        except OSError:
-            pass
-        except processes.WireError as error:
-            what = str(error)
-        if answer is None:
-            self.note_fault(self._verdict(what))
-            return None
-        kind, message = map(answer.header.get, ("type", "message"))
-        if kind == "refused":
-            raise OdometryError(f"{self.name}: {message}")
-        if kind == "fault":
-            self.note_fault(str(message))
-            return None
-        return answer
-
-    def _connect(self) -> processes.SocketStream:
-        """A stream to a new process, which first receives a hello."""
-        bounds = self._limits.bounds._replace(core=self._core)
-        try:
-            return processes.connect(SERVICE, self.name, "converse", bounds)
+            return self._conversation.receive()
+        except processes.RefusedError as error:
+            raise OdometryError(f"{self.name}: {error}") from error
         except processes.HostError as error:
-            raise OdometryError(str(error)) from error
-
-    def _verdict(self, what: str) -> str:
-        """Add to `what` how the process ended; here the process itself reports that."""
-        return what
+            self.note_fault(str(error))
+            return None
 
 
 def pose_fault(T_odom_sensor: Poses) -> str | None:
@@ -347,14 +334,81 @@ class ProcessSettings(BaseSettings):
         return self
 
 
+class ProgramTransport:
+    """A program of the user on this machine, which is started, or listens at an address."""
+
+    def __init__(self, settings: ProcessSettings, limits: Limits):
+        self.name = settings.command[0] if settings.command else str(settings.address)
+        self.bounds = limits.bounds
+        self._command, self._address = settings.command, settings.address
+        # A program may use several cores, unless this process must not.
+        self._core = next_core() if available() == 1 else None
+        self._program: processes.Program | None = None
+        self._written: Any = None
+
+    def connect(self) -> processes.SocketStream:
+        connection = self._begin() if self._address is None else _reached(self._address)
+        connection.settimeout(max(self.bounds.seconds, FIRST_ANSWER))
+        return processes.SocketStream(connection)
+
+    def _begin(self) -> socket.socket:
+        here, there = socket.socketpair()
+        self._written = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
+        with there:
+            self._program = processes.Program(
+                self._command or (),
+                self.bounds.memory,
+                self._core,
+                stdin=there.fileno(),
+                stdout=there.fileno(),
+                stderr=self._written,
+            )
+        return here
+
+    def why(self, what: str) -> str:
+        """Add how the program ended, if it did, and the last lines that it wrote."""
+        if self._program is None:
+            return what.replace("its process ended", "it ended the conversation")
+        if (ended := self._program.wait(0.5)) is not None:
+            what = processes.how_it_ended(ended.code)
+        return processes.quoting(what, self._written)
+
+    def close(self) -> None:
+        if self._program is not None:
+            self._program.close()
+            self._program = None
+
+
+def _reached(address: str) -> socket.socket:
+    family, where = parse_address(address)
+    connection = socket.socket(family)
+    try:
+        connection.connect(where)
+    except OSError as error:
+        connection.close()
+        what = f"nothing listens at {address} ({error.strerror})"
+        raise OdometryError(f"{what}: start the program there first") from error
+    return connection
+
+
 class UserProgram(Isolated):
     """An odometry in a program of the user, wherever that runs.
 
-    Each instance has its own program or connection. It keeps that from start to start, and needs a
-    new one only after a fault.
+    Each instance has its own program or connection.
+
+    Parameters
+    ----------
+    parameters, limits
+        See `Isolated`.
+    settings
+        How to reach the program.
     """
 
-    _fresh = False
+    transport_type: ClassVar[Any]
+
+    def __init__(self, parameters: ParameterSet, settings: Any, limits: Limits):
+        transport = self.transport_type(settings, limits)
+        super().__init__(transport.name, parameters, settings.settings, limits, transport)
 
     @classmethod
     def instance(
@@ -365,92 +419,19 @@ class UserProgram(Isolated):
         read: object = None,  # noqa: ARG003
     ) -> Self:
         """Make an instance, as all programs of the user are made; it reads no recording."""
-        make: Any = cls
-        made: Self = make(parameters, settings, limits)
-        return made
-
-    def _receive(self) -> processes.Message | None:
-        """Wait for the answer; only the first may take longer than a scan."""
-        answer = super()._receive()
-        if self._stream is not None:
-            self._stream.limit(self._limits.seconds)
-        return answer
+        return cls(parameters, settings, limits)
 
 
 class Process(UserProgram):
-    """An odometry in a program of the user on this machine.
-
-    Parameters
-    ----------
-    parameters, limits
-        See `Isolated`.
-    settings
-        How to reach the program.
-    """
+    """An odometry in a program of the user on this machine."""
 
     settings_type = ProcessSettings
-
-    def __init__(self, parameters: ParameterSet, settings: ProcessSettings, limits: Limits):
-        name = settings.command[0] if settings.command else str(settings.address)
-        super().__init__(name, parameters, settings, limits)
-        self._hello = {"odometry": None, "settings": settings.settings}
-        self._reach = settings
-        self._socket: socket.socket | None = None
-        self._program: processes.Program | None = None
-        self._written: Any = None
+    transport_type = ProgramTransport
 
     @staticmethod
     def describe(settings: ProcessSettings) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""
         return _describe(settings.model_dump_json())
-
-    def close(self) -> None:
-        super().close()
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-        if self._program is not None:
-            self._program.close()
-            self._program = None
-
-    def _connect(self) -> processes.SocketStream:
-        address = self._reach.address
-        if address is None:
-            self._socket = self._begin(self._reach.command or ())
-        else:
-            family, where = parse_address(address)
-            self._socket = socket.socket(family)
-            try:
-                self._socket.connect(where)
-            except OSError as error:
-                self._socket.close()
-                what = f"nothing listens at {address} ({error.strerror})"
-                raise OdometryError(f"{what}: start the program there first") from error
-        self._socket.settimeout(max(self._limits.seconds, FIRST_ANSWER))
-        return processes.SocketStream(self._socket)
-
-    def _begin(self, command: tuple[str, ...]) -> socket.socket:
-        here, there = socket.socketpair()
-        self._written = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
-        with there:
-            self._program = processes.Program(
-                command,
-                self._limits.memory,
-                stdin=there.fileno(),
-                stdout=there.fileno(),
-                stderr=self._written,
-                # A program may use several cores, unless this process must not.
-                core=self._core if available() == 1 else None,
-            )
-        return here
-
-    def _verdict(self, what: str) -> str:
-        """Add how the program ended, if it did, and the last lines that it wrote."""
-        if self._program is None:
-            return what.replace("its process ended", "it ended the conversation")
-        if (ended := self._program.wait(0.5)) is not None:
-            what = processes.how_it_ended(ended.code)
-        return processes.quoting(what, self._written)
 
 
 @cache
@@ -458,12 +439,10 @@ def _describe(settings: str) -> Description:
     return announced_by(Process({}, ProcessSettings.model_validate_json(settings), Limits()))
 
 
-def announced_by(program: UserProgram) -> Description:
+def announced_by(program: Isolated) -> Description:
     """What a program reports about itself; it is ended then."""
     try:
-        program._stream = program._connect()
-        answer = program._ask(wire.hello(**program._hello, parameters={}))
-        if answer is None:
+        if (answer := program.begin()) is None:
             raise OdometryError(program.faults[-1])
         return wire.announced(answer)
     finally:

@@ -11,7 +11,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from adaptune import processes
-from adaptune.bank import members as member_process
 from adaptune.errors import OdometryError
 from adaptune.odometry import wire
 from adaptune.odometry.base import Description, Registration
@@ -24,7 +23,7 @@ from adaptune.space import ParameterSet
 _log = logging.getLogger(__name__)
 
 
-class _Elsewhere(Isolated):
+class _Guarding(Isolated):
     """An odometry in a process of its own; where it ends, there is a `wire.FaultError`."""
 
     def register(self, prepared: Scan) -> Registration:
@@ -35,10 +34,13 @@ class _Elsewhere(Isolated):
 
 
 def serve(reader: processes.Readable, writer: BinaryIO, name: str | None = None) -> None:
-    """Do `wire.serve`, but let an odometry that is not clean run in a process of its own."""
+    """Serve an odometry, or each that a hello names, until the stream ends.
+
+    One that is not clean runs in a process of its own.
+    """
     if name is not None:
         _check(name)
-    wire.serve(reader, writer, name, _make)
+    processes.answer_all(reader, writer, wire.conversation(name, _make))
 
 
 def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[wire.Served, Description]:
@@ -46,7 +48,7 @@ def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[wire.Serv
     if declared.clean and not is_user_class(name):
         return make_here(name, parameters, settings)
     checked, described = declared.sound(name)
-    return _Elsewhere(name, parameters, checked, Limits()), described
+    return _Guarding(name, parameters, checked, Limits()), described
 
 
 def _check(name: str) -> None:
@@ -106,19 +108,14 @@ def load(name: str) -> None:
     odometry_class(name)
 
 
-def converse(reader: processes.Readable, writer: BinaryIO, name: str) -> None:
+def converse(name: str) -> processes.Answer:
     """Be an instance."""
-    wire.serve(reader, writer, name, make_here)
+    return wire.conversation(name, make_here)
 
 
-def members(reader: processes.Readable, writer: BinaryIO, _: str) -> None:
-    """Be members of a bank."""
-    member_process.serve(reader, writer)
-
-
-def describe(reader: processes.Readable, writer: BinaryIO, name: str) -> None:
+def describe(name: str) -> processes.Answer:
     """Answer what `adaptune.odometry.factory.declare` asks."""
-    processes.answer_all(reader, writer, partial(_declared, name))
+    return partial(_declared, name)
 
 
 def _declared(name: str, message: processes.Message) -> dict[str, Any]:

@@ -42,7 +42,7 @@ from pydantic import ValidationError
 from adaptune.errors import AdaptuneError, nearest
 from adaptune.geometry import Poses
 from adaptune.odometry import Description, OdometryError, Registration
-from adaptune.processes import Message, Readable, Writable, receive, send
+from adaptune.processes import Answer, Message
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import in_one_line
@@ -120,33 +120,32 @@ def announced(answer: Message) -> Description:
         raise OdometryError(f"its answer to hello does not describe it: {what}") from error
 
 
-def serve(reader: Readable, writer: Writable, name: str | None, make: Make) -> None:
-    """Answer messages with an odometry until the stream ends; anything else is a `WireError`.
+def conversation(name: str | None, make: Make) -> Answer:
+    """Answer messages with an odometry.
 
     Parameters
     ----------
-    reader, writer
-        Nothing else may read or write them.
     name
         The only odometry to serve; otherwise each hello names one.
     make
         Makes it.
     """
     odometry: Served | None = None
-    while (message := receive(reader)) is not None:
+
+    def answer(message: Message) -> dict[str, Any]:
+        nonlocal odometry
+        _check(message)
+        if message.header["type"] == "hello":
+            odometry, about = _make(message.header, name, make)
+            return {"version": VERSION, **about}
+        if odometry is None:
+            raise OdometryError("the first message must be a hello")
         try:
-            _check(message)
-            if message.header["type"] == "hello":
-                odometry, about = _make(message.header, name, make)
-                send(writer, {"type": "done", "version": VERSION, **about})
-            elif odometry is None:
-                raise OdometryError("the first message must be a hello")
-            else:
-                _answer(odometry, message, writer)
+            return answered(odometry, message)
         except FaultError as fault:
-            send(writer, {"type": "fault", "message": str(fault)})
-        except AdaptuneError as error:
-            send(writer, {"type": "refused", "message": str(error)})
+            return {"type": "fault", "message": str(fault)}
+
+    return answer
 
 
 def _check(message: Message) -> None:
@@ -188,21 +187,29 @@ def unpacked(found: Any) -> Registration:
         raise TypeError(f"register returned {found!r:.100}, not a Registration") from error
 
 
-def _answer(odometry: Served, message: Message, writer: Writable) -> None:
+def answered(odometry: Served, message: Message, prepared: Any = None) -> dict[str, Any]:
+    """Do what a message asks of an odometry; the answer.
+
+    The scan is the message's, if it has not been prepared.
+    """
     header, arrays = message
-    if header["type"] == "register":
-        found = odometry.register(odometry.prepare(to_scan(message)))
-        T_odom_sensor, registered = unpacked(found)
-        pose: Poses = np.asarray(T_odom_sensor, np.float64)
-        answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        usage = {"cpu": used.ru_utime + used.ru_stime, "memory": used.ru_maxrss * 1024e-6}
-        send(writer, answer | usage, pose=pose)
-        return
+    if header["type"] == "configure":
+        odometry.configure(header["parameters"])
+        return {}
+    if prepared is None:
+        prepared = odometry.prepare(to_scan(message))
     if header["type"] == "start":
         # Arrays from the stream are read-only; an odometry may change its poses.
         motion = arrays["motion"].copy() if "motion" in arrays else None
-        odometry.start(odometry.prepare(to_scan(message)), arrays["pose"].copy(), motion)
-    else:
-        odometry.configure(header["parameters"])
-    send(writer, {"type": "done"})
+        odometry.start(prepared, arrays["pose"].copy(), motion)
+        return {}
+    T_odom_sensor, registered = unpacked(odometry.register(prepared))
+    pose: Poses = np.asarray(T_odom_sensor, np.float64)
+    answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
+    return answer | used() | {"pose": pose}
+
+
+def used() -> dict[str, float]:
+    """CPU seconds of this process, and its peak of memory in megabytes."""
+    found = resource.getrusage(resource.RUSAGE_SELF)
+    return {"cpu": found.ru_utime + found.ru_stime, "memory": found.ru_maxrss * 1024e-6}

@@ -6,15 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from operator import itemgetter
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import optuna
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from adaptune import processes
-from adaptune.processes import Message, Readable
+from adaptune.processes import Answer, Conversation, Forked, HostError, Message
 from adaptune.space import (
     ODOMETRY,
     Categorical,
@@ -529,7 +528,7 @@ class HostedSampler(Sampler):
 
     def __init__(self, space: ParameterSpace, config: Any):
         super().__init__(space, config)
-        self._process = processes.Hosted(SERVICE, config.sampler, "propose")
+        self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
         self._about = {
             "space": space.dump(),
             "config": config.model_dump(mode="json", exclude={"storage"}),
@@ -538,7 +537,7 @@ class HostedSampler(Sampler):
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         try:
             answer = self._process.ask(self._about | {"history": history})
-        except processes.HostError as error:
+        except HostError as error:
             trials = f"trials {numbers.start} to {numbers.stop - 1}"
             raise SamplerError(f"offline.sampler, at {trials}: {error}") from error
         sets: list[ParameterSet] = answer.header["sets"]
@@ -553,17 +552,17 @@ def load(name: str) -> None:
     optuna_class(name)
 
 
-def make(reader: Readable, writer: BinaryIO, name: str) -> None:
+def make(name: str) -> Answer:
     """Make a sampler and say how that went."""
 
     def answer(message: Message) -> dict[str, Any]:
         optuna_sampler(name, message.header["settings"], message.header["seed"])
         return {}
 
-    processes.answer_all(reader, writer, answer)
+    return answer
 
 
-def propose(reader: Readable, writer: BinaryIO, _: str) -> None:
+def propose(_: str) -> Answer:
     """Propose one batch after another."""
     from offline.config import OfflineConfig
 
@@ -581,4 +580,4 @@ def propose(reader: Readable, writer: BinaryIO, _: str) -> None:
         ]
         return {"sets": made[key].propose(history)}
 
-    processes.answer_all(reader, writer, answer)
+    return answer

@@ -481,7 +481,7 @@ def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
     """
     seconds = processes.IMPORT_SECONDS
     bounds = processes.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
-    process = processes.Hosted(SERVICE, name, "make", bounds)
+    process = processes.Conversation(processes.Forked(SERVICE, name, "make", bounds))
     try:
         process.ask({"settings": dict(settings), "seed": seed})
     except processes.HostError as error:

@@ -165,76 +165,45 @@ class DockerProcessSettings(ContainerSettings):
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
-class DockerProcess(UserProgram):
-    """An odometry in a container, which it keeps from start to start; a new one after a fault.
+class ContainerTransport:
+    """A program in a container, which listens at a socket that the container shares."""
 
-    Parameters
-    ----------
-    parameters, limits
-        See `Isolated`.
-    settings
-        The image.
-    """
-
-    settings_type = DockerProcessSettings
-
-    def __init__(self, parameters: ParameterSet, settings: DockerProcessSettings, limits: Limits):
-        super().__init__(settings.image, parameters, settings, limits)
-        self._hello = {"odometry": None, "settings": settings.settings}
+    def __init__(self, settings: DockerProcessSettings, limits: Limits):
+        self.name, self.bounds = settings.image, limits.bounds
         self._settings = settings
         self._container: Container | None = None
         self._folder: Path | None = None
 
-    @staticmethod
-    def describe(settings: DockerProcessSettings) -> Description:
-        """What the program reports about itself; an error if it cannot be reached."""
-        return _describe(settings.model_dump_json(), image_digest(settings.image))
-
-    def close(self) -> None:
-        super().close()
-        if self._container is not None:
-            self._container.close()
-            self._container = None
-        if self._folder is not None:
-            remove_shared(self._folder, self.name, default_user(self._settings))
-            self._folder = None
-
-    def _connect(self) -> processes.SocketStream:
+    def connect(self) -> processes.SocketStream:
+        """Begin the container, and connect as soon as the program listens."""
         self._folder = folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
         folder.chmod(0o777)  # for any user of the image
         inside = f"{_FOLDER}/odometry.sock"
         self._container = Container(
             self._settings,
-            self._limits.memory,
+            self.bounds.memory,
             [replace(argument, {"socket": inside}) for argument in self._settings.command],
             [Mount(folder, _FOLDER, writable=True)],
             user=default_user(self._settings),
             environment={"ADAPTUNE_SOCKET": inside},
         )
-        connection = self._reach(folder / "odometry.sock")
-        connection.settimeout(max(self._limits.seconds, FIRST_ANSWER))
-        return processes.SocketStream(connection)
-
-    def _reach(self, path: Path) -> socket.socket:
-        """Connect as soon as the program listens."""
-        assert self._container is not None
         begin, what = time.monotonic(), "it does not listen at its socket"
         while time.monotonic() - begin < FIRST_ANSWER:
             connection = socket.socket(socket.AF_UNIX)
             with contextlib.suppress(OSError):
-                connection.connect(str(path))
-                return connection
+                connection.connect(str(folder / "odometry.sock"))
+                connection.settimeout(max(self.bounds.seconds, FIRST_ANSWER))
+                return processes.SocketStream(connection)
             connection.close()
             if (ended := self._ended()) is not None:
                 what = f"{ended} before it listened at its socket"
                 break
             time.sleep(_BETWEEN_SOCKET_LOOKS)
-        words = self._container.last_lines()
+        what = f"{self.name}: {self._quoting(what)}"
         self.close()
-        what = f"{self.name}: {what}"
-        raise OdometryError(f"{what}: {words}" if words else what)
+        raise OdometryError(what)
 
-    def _verdict(self, what: str) -> str:
+    def why(self, what: str) -> str:
         """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._container is None:
             return what
@@ -243,6 +212,10 @@ class DockerProcess(UserProgram):
                 what = ended
                 break
             time.sleep(0.05)
+        return self._quoting(what)
+
+    def _quoting(self, what: str) -> str:
+        assert self._container is not None
         words = self._container.last_lines()
         return f"{what}: {words}" if words else what
 
@@ -251,9 +224,28 @@ class DockerProcess(UserProgram):
         assert self._container is not None
         if (code := self._container.ended()) is None:
             return None
-        if self._container.out_of_memory:
-            return f"out of isolation.memory = {self._limits.memory:g} GB"
-        return processes.how_it_ended(code)
+        return self.bounds.full if self._container.out_of_memory else processes.how_it_ended(code)
+
+    def close(self) -> None:
+        """Remove the container, and the folder of the socket."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+        if self._folder is not None:
+            remove_shared(self._folder, self.name, default_user(self._settings))
+            self._folder = None
+
+
+class DockerProcess(UserProgram):
+    """An odometry in a container, which it keeps from start to start; a new one after a fault."""
+
+    settings_type = DockerProcessSettings
+    transport_type = ContainerTransport
+
+    @staticmethod
+    def describe(settings: DockerProcessSettings) -> Description:
+        """What the program reports about itself; an error if it cannot be reached."""
+        return _describe(settings.model_dump_json(), image_digest(settings.image))
 
 
 @cache

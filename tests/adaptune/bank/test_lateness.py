@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from adaptune.bank.bank import Bank, Lateness
+from adaptune.bank.members import SERVICE
 from adaptune.odometry.base import LastMotion, OdometryInstance, Registration
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
-from adaptune.odometry.remote import SERVICE, Limits
+from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.processes import server
 from adaptune.recording.scan import Scan

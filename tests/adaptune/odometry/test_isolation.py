@@ -176,7 +176,7 @@ def exchange(*messages):
     for header, arrays in messages:
         processes.send(sent, header, **arrays)
     sent.seek(0)
-    wire.serve(sent, answered, None, make_here)
+    processes.answer_all(sent, answered, wire.conversation(None, make_here))
     answered.seek(0)
     answers = []
     while (message := processes.receive(answered)) is not None:
