@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from adaptune import plugins, processes
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.odometry import wire
+from adaptune.odometry.factory import python_content
 from adaptune.recording.scan import Scan
 
 # The motion of the sensor, computed from the poses of the scans before.
@@ -117,6 +117,12 @@ def check_descriptor(name: str) -> None:
             processes.server(_SERVICE, path)
         except processes.HostError as error:
             raise DescriptorError(str(error)) from error
+
+
+def descriptor_content(names: Iterable[str]) -> dict[str, str]:
+    """What the descriptors of these names depend on; nothing for those of adaptune."""
+    own = (name for name in names if name not in DESCRIPTORS)
+    return {k: v for name in own for k, v in python_content(name, ENTRY_POINTS).items()}
 
 
 # What runs in a process of its own for a descriptor of the user, see `adaptune.processes`.

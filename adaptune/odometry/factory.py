@@ -7,13 +7,13 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, RootModel
@@ -21,8 +21,6 @@ from pydantic import BaseModel, ConfigDict, RootModel
 from adaptune import processes
 from adaptune.errors import AdaptuneError, OdometryError, in_a_line
 from adaptune.geometry import Poses
-from adaptune.model.descriptor import DESCRIPTORS
-from adaptune.model.descriptor import ENTRY_POINTS as DESCRIPTOR_ENTRY_POINTS
 from adaptune.odometry.base import (
     Description,
     InProcess,
@@ -31,7 +29,6 @@ from adaptune.odometry.base import (
     Registration,
     Usage,
 )
-from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.registry import (
     CONTAINERS,
     ENTRY_POINTS,
@@ -44,11 +41,13 @@ from adaptune.odometry.registry import (
 )
 from adaptune.odometry.remote import SERVICE, Faulting, Isolated, Limits, pose_fault
 from adaptune.odometry.wire import unpacked
-from adaptune.recording.cache import fingerprint
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from adaptune.strict import Mistake, validated
+
+if TYPE_CHECKING:
+    from adaptune.odometry.program import ProgramInput
 
 # A class of the user in this process: where it goes wrong, this is a fault and nothing else.
 
@@ -314,11 +313,10 @@ def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
         process.close()
 
 
-# What an odometry or a descriptor is, by its content: versions, sources, programs.
+# What an odometry is, by its content: versions, sources, programs.
 #
 # Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
-# an
-# address are not part of it.
+# an address are not part of it.
 
 
 Content = dict[str, str]
@@ -342,20 +340,23 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     if name in ODOMETRIES:
         package = package_of(name)
         return {f"version of {package}": _version(package)}
-    return _python(name, ENTRY_POINTS, module)
+    return python_content(name, ENTRY_POINTS, module)
 
 
-def descriptor_content(names: Iterable[str]) -> Content:
-    """What the descriptors of these names depend on; nothing for those of adaptune."""
-    found: Content = {}
-    for name in names:
-        if name not in DESCRIPTORS:
-            found |= _python(name, DESCRIPTOR_ENTRY_POINTS)
-    return found
+def python_content(name: str, group: str, written_in: str = "") -> Content:
+    """Source of a module, and version of the distribution that it is from.
 
+    Parameters
+    ----------
+    name
+        ``module:attribute``, or what a distribution calls it in an entry-point group.
+    group
+        The group.
+    written_in
+        Another module whose source counts.
+    """
+    from adaptune.recording.cache import fingerprint
 
-def _python(name: str, group: str, written_in: str = "") -> Content:
-    """Source of a module, and version of the distribution that it is from."""
     versions: Content = {}
     if ":" not in name:
         for point in metadata.entry_points(group=group, name=name):
@@ -388,6 +389,8 @@ def module_file(name: str) -> Path | None:
 
 
 def _program(settings: Any) -> Content:
+    from adaptune.recording.cache import fingerprint
+
     if (image := getattr(settings, "image", None)) is not None:
         from adaptune.odometry.docker.engine import image_digest
 
@@ -440,7 +443,7 @@ class OdometryFactory:
     settings: Any
     space: ParameterSpace
     limits: Limits
-    program_input: Callable[[str], ProgramInput] | None = None
+    program_input: Callable[[str], "ProgramInput"] | None = None
     user_code: bool = False
     description: Description = field(init=False)
     module: str = field(init=False)
@@ -476,7 +479,7 @@ class OdometryFactory:
         """The same where classes of the user may, or may not, run in this process."""
         return replace(self, user_code=user_code)
 
-    def reading(self, program_input: Callable[[str], ProgramInput]) -> "OdometryFactory":
+    def reading(self, program_input: Callable[[str], "ProgramInput"]) -> "OdometryFactory":
         """The same with another source of whole recordings, if it reads any."""
         return self if self.program_input is None else replace(self, program_input=program_input)
 

@@ -8,7 +8,6 @@ import numpy as np
 import small_gicp
 from pydantic import Field
 
-from adaptune import files
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
 from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, Odometry, Registration
 from adaptune.recording.scan import Scan
@@ -240,7 +239,9 @@ class KeyframeNdt(KeyframeOdometry):
     )
 
     def prepare(self, scan: Scan) -> PreparedCloud:
-        o3d = files.load()
+        from adaptune.files import load
+
+        o3d = load()
         points = o3d.utility.Vector3dVector(crop(scan, self.settings.min_range))
         cloud = o3d.geometry.PointCloud(points).voxel_down_sample(self.parameters["downsampling"])
         size = len(cloud.points)
@@ -249,7 +250,9 @@ class KeyframeNdt(KeyframeOdometry):
     def align(
         self, target: PreparedCloud, source: PreparedCloud, T_target_guess: Poses
     ) -> Alignment:
-        registration = files.load().pipelines.registration
+        from adaptune.files import load
+
+        registration = load().pipelines.registration
         option = registration.NormalDistributionsTransformOption(
             voxel_size=self.parameters["resolution"], max_iteration=self.parameters["iterations"]
         )

@@ -14,7 +14,7 @@ from adaptune import __version__
 from adaptune.archive import Archive
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
-from adaptune.odometry.factory import descriptor_content
+from adaptune.model.descriptor import descriptor_content
 from adaptune.recording.cache import MANY, status_key
 from adaptune.strict import ConfigurationError
 from adaptune.study.study import Study, differences

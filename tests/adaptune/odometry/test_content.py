@@ -3,7 +3,8 @@ from importlib import metadata
 
 import pytest
 
-from adaptune.odometry.factory import descriptor_content, module_file, odometry_content
+from adaptune.model.descriptor import descriptor_content
+from adaptune.odometry.factory import module_file, odometry_content
 from adaptune.odometry.program import CommandSettings
 from adaptune.odometry.remote import ProcessSettings
 

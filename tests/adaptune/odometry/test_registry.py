@@ -1,3 +1,4 @@
+import subprocess
 import sys
 from importlib import metadata
 
@@ -84,3 +85,20 @@ def test_versions_of_what_an_odometry_runs_on(name, package):
     found = versions(name)
     assert set(found) == {"adaptune", "numpy", package} - {None}
     assert found["numpy"] == metadata.version("numpy")
+
+
+def test_what_serves_an_odometry_imports_little():
+    """The processes of odometries are forked from one that has imported this."""
+    program = (
+        "import sys; before = set(sys.modules); "
+        "import adaptune.odometry.serving, adaptune.odometry.keyframe; "
+        "found = [m for m in set(sys.modules) - before if '.' not in m]; "
+        "print(*(m for m in found if 'site-packages' in str(sys.modules[m])))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, check=True, text=True
+    )
+    assert set(done.stdout.split()) <= {
+        *("annotated_types", "numpy", "pydantic", "pydantic_core", "scipy", "small_gicp"),
+        *("typing_extensions", "typing_inspection", "yaml"),  # what the reference image has
+    }
