@@ -83,7 +83,7 @@ class _Campaign:
         while at_work := [s for s in stage.searches if s.begin(hours + clock.hours(batch))]:
             self._tally.begin(at_work)
             begun = False
-            for m in rungs(self._config.pruning, batch, len(at_work[0].sequences)):
+            for m in rungs(self._config.pruning == "wilcoxon", batch, len(at_work[0].sequences)):
                 missing = [Missing(search.missing(m), search.parameters) for search in at_work]
                 if tasks := self._tasks(missing):
                     begun = True

@@ -50,6 +50,12 @@ class Limit(StrictModel):
     max: float = Field(gt=0, le=1e9)
 
 
+def _rule(pruning: Any) -> Any:
+    if pruning in ("halving", "hyperband"):
+        raise ValueError(f"{pruning} is gone, for it never saved more than wilcoxon; give that")
+    return pruning
+
+
 def _url(storage: str) -> str:
     if "://" not in storage:
         raise ValueError("give the URL of a database, as postgresql://user@host/database")
@@ -87,7 +93,7 @@ class OfflineConfig(StrictModel):
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
-    pruning: Literal["none", "halving", "hyperband", "wilcoxon"] = "none"
+    pruning: Annotated[Literal["none", "wilcoxon"], BeforeValidator(_rule)] = "none"
     preset: Literal["paper"] | None = None
 
     @model_validator(mode="after")

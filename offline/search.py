@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cached_property, partial
 from itertools import count, islice
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,31 +25,13 @@ from offline.samplers.samplers import Sampler
 # Pruning: which trials of a batch continue on more sequences, and which stop.
 #
 # The first batch runs in full. It shows which sequences are hard, and these come first from then
-# on:
-# sets fail on them, if anywhere. Trials of later batches run on growing shares of the sequences.
-# The
-# model also uses what a trial saw before it stopped. The choice depends on the batches before and
-# on
-# the batch so far, and on nothing else.
-#
-# - ``halving``: the best third continues on three times as many sequences (successive halving,
-#   Jamieson and Talwalkar, AISTATS 2016): the best third of all trials that came so far.
-# - ``hyperband``: the same, but batches begin with three, nine... sequences in turn (Li et al.,
-# JMLR
-#   2018), for studies in which a few sequences say little about the others.
-# - ``wilcoxon``: one sequence after the other. A trial stops if a signed-rank test finds it worse
-#   than the best trial on the same sequences (Optuna's pruner).
-#
-# All rules stop a trial that cannot win any more. Values are never negative, so a trial whose sum
-# over some sequences exceeds the best trial's sum over all sequences is worse.
+# on: sets fail on them, if anywhere. Trials of later batches run on one sequence after the other.
+# One stops if it cannot win any more, or if a signed-rank test finds it worse than the best trial
+# on the same sequences (Optuna's `WilcoxonPruner`). The model also uses what a trial saw before it
+# stopped. Values are never negative, so a trial whose sum over some sequences exceeds the best
+# trial's sum over all sequences cannot win.
 
 
-Pruning = Literal["none", "halving", "hyperband", "wilcoxon"]
-
-REDUCTION = 3
-"""One of so many trials continues, on so many times the sequences."""
-FEWEST = 3
-"""The least number of sequences that may stand for the others."""
 SIGNIFICANCE = 0.1
 """A difference counts as more than chance if the test's p is below this."""
 
@@ -57,29 +39,16 @@ Values = Sequence[float]
 """A trial's objective on the sequences on which it was run, in their order."""
 
 
-def rungs(pruning: Pruning, batch: int, n: int) -> list[int]:
+def rungs(pruning: bool, batch: int, n: int) -> list[int]:
     """Numbers of sequences after which trials of a batch may stop; the last one is `n`, all."""
-    if pruning == "none" or batch == 0:
-        return [n]
-    if pruning == "wilcoxon":
-        return [*range(2, n), n] if n > 2 else [n]
-    sizes = [n]
-    while sizes[0] > FEWEST:
-        sizes.insert(0, max(FEWEST, -(-sizes[0] // REDUCTION)))
-    return sizes[batch % len(sizes) :] if pruning == "hyperband" else sizes
+    return [*range(2, n), n] if pruning and batch and n > 2 else [n]
 
 
-def survivors(
-    pruning: Pruning, m: int, batch: Mapping[int, Values], before: Mapping[int, Values]
-) -> list[int]:
+def survivors(batch: Mapping[int, Values], before: Mapping[int, Values]) -> list[int]:
     """Numbers of the trials of a batch that continue.
 
     Parameters
     ----------
-    pruning
-        The rule.
-    m
-        Number of sequences on which the trials of the batch were run.
     batch, before
         Values by trial number: of the trials of this batch that are left, and of all trials before.
         Only trials that keep all limits.
@@ -88,12 +57,7 @@ def survivors(
         return list(batch)
     n_sequences = max(map(len, before.values()))
     best = min((v for v in before.values() if len(v) == n_sequences), key=sum)
-    can_win = {n: values for n, values in batch.items() if sum(values) <= sum(best)}
-    if pruning == "wilcoxon":
-        return [n for n, values in can_win.items() if not _worse(values, best)]
-    means = {n: float(np.mean(v[:m])) for n, v in {**before, **batch}.items() if len(v) >= m}
-    best_ones = sorted(means, key=lambda n: (means[n], n))[: -(-len(means) // REDUCTION)]
-    return [n for n in can_win if n in best_ones]
+    return [n for n, own in batch.items() if sum(own) <= sum(best) and not _worse(own, best)]
 
 
 def _worse(values: Values, best: Values) -> bool:
@@ -330,7 +294,7 @@ class Search:
         stop = first + size if self._limit is None else min(first + size, self._limit)
         self.numbers = self._next_numbers(stop - first)
         self._sets = {n: self._known[n] for n in self.numbers if n in self._known}
-        if first and self._config.pruning != "none":
+        if first and self._config.pruning == "wilcoxon":
             self.order = self._hardest_first()
         if len(self._sets) < len(self.numbers):
             proposed = self._sampler.propose(sampler_results(self.verdicts))
@@ -360,7 +324,7 @@ class Search:
         if m < len(self.order):
             before = self._values(self.done, self.order)
             batch = self._values(self._alive, self.order[:m])
-            self._alive = survivors(self._config.pruning, m, batch, before)
+            self._alive = survivors(batch, before)
 
     def close(self) -> None:
         """Close the batch, whose trials have all finished or stopped."""

@@ -278,7 +278,7 @@ def test_from_end_to_end(study_file, tmp_path):
 
 def test_pruning_needs_sets_that_are_shared(study_file):
     with pytest.raises(ConfigurationError, match="pruning spares trials further sequences"):
-        load_study(study_file, ["offline.sets=own", "offline.pruning=halving"])
+        load_study(study_file, ["offline.sets=own", "offline.pruning=wilcoxon"])
 
 
 def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
