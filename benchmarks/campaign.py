@@ -52,7 +52,7 @@ STUDY = """\
 odometry: {{name: gicp, settings: {{downsampling: 0.5}}}}
 courses: {{cave: {{scenes: [cave], length: {length:.0f}, sensor: hdl32e, seed: 1}}}}
 training: [cave]
-offline: {{sampler: sobol, trials: {trials}}}
+offline: {{initial: {trials}, trials: {trials}}}
 """
 N_FRAMES = 600
 

@@ -1,7 +1,7 @@
 """What selection gains on simulated sequences that were left out.
 
     python benchmarks/gain.py runs/gain --seeds 10 11    # hours on one core; resumes
-    python benchmarks/gain.py runs/gain --seeds 10 --odometries gicp --ablate | --kinds | ...
+    python benchmarks/gain.py runs/gain --seeds 10 --odometries gicp --kinds | --own-error
 
 Each seed is another world of 24 sequences: 4 caves, 4 streets, 4 open, 4 gardens, of 120 m each,
 and 8 mixed ones of three scenes, each 0.4 times as long. On all of them keyframe GICP and NDT run
@@ -16,9 +16,8 @@ import itertools
 import os
 from pathlib import Path
 
-from gain_ablation import ablate, less
-from gain_data import ODOMETRIES, describe, factory_of, labelled, training_courses, trials
-from gain_modes import by_descriptor, by_kind, own_errors, validate
+from gain_data import ODOMETRIES, factory_of, labelled, training_courses, trials
+from gain_modes import by_kind, own_errors, validate
 
 from offline.labelled import LabelledData
 from offline.leave_one_out import BANK_SIZE
@@ -26,14 +25,10 @@ from offline.leave_one_out import BANK_SIZE
 
 def compare(data: LabelledData, arguments: argparse.Namespace) -> None:
     """Leave each sequence out in turn, in the way that is asked for."""
-    if arguments.less:
-        less(data)
-    elif arguments.kinds:
+    if arguments.kinds:
         by_kind(data, arguments.bank)
     elif arguments.own_error:
         own_errors(data)
-    elif arguments.ablate:
-        ablate(data, arguments.bank)
     else:
         validate(data, arguments.bank)
 
@@ -49,11 +44,8 @@ def main() -> None:
     parser.add_argument("--odometries", nargs="+", default=ODOMETRIES, choices=ODOMETRIES)
     parser.add_argument("--bank", type=int, default=BANK_SIZE, help="members of the bank")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--ablate", action="store_true", help="without one thing after the other")
-    what.add_argument("--less", action="store_true", help="with fewer frames, or runs")
     what.add_argument("--kinds", action="store_true", help="with a whole kind of scene left out")
     what.add_argument("--own-error", action="store_true", help="how right the own error is")
-    what.add_argument("--descriptors", action="store_true", help="with other descriptors")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     # Open3D's NDT differs in its last bits from run to run on more than one core.
@@ -62,11 +54,7 @@ def main() -> None:
         courses = training_courses(seed, arguments.length)
         paths = trials(arguments.folder, odometry, courses, seed)
         data = labelled(paths, factory_of(odometry).space)
-        if arguments.descriptors:
-            described = describe(arguments.folder, courses, seed)
-            by_descriptor(data, paths, described, arguments.bank)
-        else:
-            compare(data, arguments)
+        compare(data, arguments)
 
 
 if __name__ == "__main__":

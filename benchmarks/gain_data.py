@@ -13,12 +13,8 @@ from adaptune.archive import Frames
 from adaptune.files import replacing
 from adaptune.live.hops import Hops
 from adaptune.model.descriptor import (
-    DESCRIPTORS,
-    MOTION,
     averaged,
-    descriptor,
     lowest_elevation,
-    speed_and_turn_rate,
 )
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.odometry.factory import OdometryFactory
@@ -95,7 +91,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
         np.array([lowest_elevation(scan) for scan in scans], np.float32),
     )
     factory, settings = factory_of(odometry), TrialSettings()
-    config = OfflineConfig(sampler="sobol", batch=N_SETS, seed=seed)
+    config = OfflineConfig(initial=N_SETS, batch=N_SETS, seed=seed)
     sets = make_sampler(factory.space, config).propose([])
     frames = with_measured_hops(scans, frames)
     course_scans: Any = SharedCourse(path.stem, scans, frames)
@@ -174,23 +170,3 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
         vectors=dict(enumerate(np.moveaxis(found["vectors"][known], 1, 0))),
         simulation=simulation,
     )
-
-
-def describe(folder: Path, courses: dict[str, Course], seed: int) -> list[Path]:
-    """Describe a scan each second by every descriptor, and return the files."""
-    paths = []
-    for name, course in courses.items():
-        path = folder / f"descriptors-{seed}-{course.length:.0f}-{name}.npz"
-        paths.append(path)
-        if path.exists():
-            with np.load(path) as found:
-                if set(DESCRIPTORS) <= set(found.files):
-                    continue
-        scans = list(simulate(course))[::PERIOD]
-        of = {d: np.array([descriptor(d)(s) for s in scans], np.float32) for d in DESCRIPTORS}
-        stamps, poses = zip(*((scan.stamp, scan.T_world_sensor) for scan in scans), strict=True)
-        of[MOTION] = speed_and_turn_rate(np.array(stamps), np.array(poses)).astype(np.float32)
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **of)  # type: ignore[arg-type]
-        print(f"{name} is described", flush=True)
-    return paths

@@ -1,17 +1,14 @@
 """What is compared on the sequences that `gain.py` leaves out, and the printed table."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from gain_data import KINDS, PERIOD, WINDOW, training_courses
+from gain_data import KINDS, training_courses
 from numpy.typing import NDArray
 
 from adaptune.live.evidence import Link, OwnErrors
 from adaptune.live.hops import Hop
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
-from adaptune.model.descriptor import DESCRIPTORS, averaged
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.bank_simulation import chained
 from offline.labelled import LabelledData, LabelledSequence, periods
@@ -118,34 +115,6 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
         )
         for mode, weights in modes.items()
     }
-
-
-def by_descriptor(data: LabelledData, paths: list[Path], described: list[Path], size: int) -> None:
-    """Leave each sequence out in turn, with one way to describe scans after the other.
-
-    Between two full seconds a scan counts as described like the last one, in all ways alike. Its
-    motion is known at once.
-    """
-    pairs = (("ndt", name) for name in DESCRIPTORS if name != "ndt")
-    for names in (*((name,) for name in DESCRIPTORS), *pairs):
-        sequences = []
-        for sequence, path, file in zip(data.sequences, paths, described, strict=True):
-            with np.load(path) as found, np.load(file) as its:
-                known = ~np.isnan(found["errors"]).any(axis=1)
-                stamps = found["stamps"]
-                blocks = [its[name][np.arange(len(stamps)) // PERIOD] for name in names]
-            of_frames = averaged(np.hstack(blocks), stamps, WINDOW, 1.0)
-            assert sequence.simulation is not None
-            changed = replace(
-                sequence,
-                descriptors=of_frames[known],
-                blocks={n: block.shape[1] for n, block in zip(names, blocks, strict=True)},
-                simulation=replace(sequence.simulation, descriptors=of_frames),
-            )
-            sequences.append(changed)
-        print(f"by {' and '.join(names)}: ", end="")
-        validation = leave_one_out(data._replace(sequences=sequences), {}, bank=size)
-        print_summary(validation, ["adaptive"])
 
 
 def print_summary(validation: Validation, modes: Iterable[str]) -> None:

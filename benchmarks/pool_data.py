@@ -23,7 +23,7 @@ from adaptune.simulation.record import simulate
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, ParameterSpace
 from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 from offline.labelled import LabelledData, LabelledSequence
-from offline.samplers.samplers import sobol_points
+from offline.samplers import sobol_points
 from offline.trial import TrialSettings, run_trials, with_measured_hops
 
 POINTS: dict[str, tuple[int, ...]] = {

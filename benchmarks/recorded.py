@@ -104,7 +104,7 @@ def definition(
         "training": [name for name, _ in training],
         "test": [name for name, _ in test],
         "sub_trajectory": direction.sub_trajectory,
-        "offline": {"sampler": "sobol", "trials": n_sets, "seed": seed, "workers": 1},
+        "offline": {"initial": n_sets, "trials": n_sets, "seed": seed, "workers": 1},
         # All modes but `paper`, with a bank, though the benchmark is bound to one core.
         "online": {
             "rules": ["adaptive"],

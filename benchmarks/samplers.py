@@ -114,7 +114,7 @@ def against_random(
     """Print a row for each sampler."""
     best = {
         sampler: np.array([best_so_far(spaces(seed), error, sampler, seed)[-1] for seed in SEEDS])
-        for sampler in ("random", "sobol", "annealing", "tpe")
+        for sampler in ("random", "annealing", "tpe")
     }
     for sampler, found in best.items():
         wins = ""

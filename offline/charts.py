@@ -166,7 +166,7 @@ def reannealings(study: OfflineStudy) -> dict[int, list[int]]:
 
 
 def _reannealed(search: Search, study: OfflineStudy, finished: Mapping[str, Any]) -> list[int]:
-    from offline.samplers.samplers import AskedSampler
+    from offline.samplers import AskedSampler
 
     config, batch = study.config.offline, study.config.offline.batch
     of_search = {n for name in search.sequences for n in finished[name]}

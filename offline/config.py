@@ -13,7 +13,7 @@ from adaptune.space import ParameterSpace
 from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
-from offline.samplers.settings import (
+from offline.sampler_settings import (
     FORGETFUL,
     NAMES,
     SETTINGS,
@@ -160,8 +160,8 @@ class OfflineConfig(StrictModel):
         """Find samplers that cannot search among several odometries."""
         n = 1 if space is None else len(space.baselines)
         grid = "grid" in self.sampler_settings
-        if n > 1 and (self.sampler not in (*FORGETFUL, "sobol", "random") or grid):
-            message = "with several odometries, choose tpe, gp, sobol or random, without a grid"
+        if n > 1 and (self.sampler not in (*FORGETFUL, "random") or grid):
+            message = "with several odometries, choose tpe, gp or random, without a grid"
             yield Mistake(("sampler",), message)
         if self.trials is not None and self.trials < n:
             message = f"{n} odometries need {n} trials at least, to try the parameters of each"

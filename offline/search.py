@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cached_property, partial
 from itertools import count, islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.config import OfflineConfig, OfflineStudyConfig
 from offline.objective import Verdict, best_by_trials, judge, sampler_results, weighted
-from offline.samplers import make_sampler
-from offline.samplers.samplers import Sampler
+
+if TYPE_CHECKING:
+    from offline.samplers import Sampler
 
 # Pruning: which trials of a batch continue on more sequences, and which stop.
 #
@@ -241,7 +242,7 @@ class Search:
 
     def __init__(
         self,
-        sampler: Callable[[], Sampler],
+        sampler: Callable[[], "Sampler"],
         config: OfflineConfig,
         sequences: Sequence[str],
         finished: Finished,
@@ -263,7 +264,7 @@ class Search:
         self._sets: dict[int, ParameterSet] = {}
 
     @cached_property
-    def _sampler(self) -> Sampler:
+    def _sampler(self) -> "Sampler":
         # Where nothing is to be proposed, it is not needed, and takes long to import.
         return self.make_sampler()
 
@@ -407,10 +408,16 @@ def make_stages(
 ) -> list[Stage]:
     """Make the searches of a study over some sequences, in their order."""
     config = study.offline
+
+    def sampler_of(config: OfflineConfig) -> "Sampler":
+        from offline.samplers import make_sampler  # Optuna takes a second to import
+
+        return make_sampler(space, config)
+
     finished, known = {name: archive.finished(name) for name in names}, archive.sets()
     stages = []
     if config.sets != "own":
-        sampler = partial(make_sampler, space, config)
+        sampler = partial(sampler_of, config)
         shared = Search(sampler, config, names, finished, known)
         stages.append(Stage([shared], alone=False))
     if config.sets != "shared":
@@ -418,7 +425,7 @@ def make_stages(
         for name in names:
             seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
             seed = {"seed": int(seeds.generate_state(1)[0])}
-            sampler = partial(make_sampler, space, config.model_copy(update=seed))
+            sampler = partial(sampler_of, config.model_copy(update=seed))
             own.append(Search(sampler, config, [name], finished, known, slots[name]))
         stages.append(Stage(own, alone=True))
     return stages

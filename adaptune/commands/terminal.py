@@ -242,7 +242,7 @@ def _complete_override(incomplete: str) -> list[str]:
     """Keys and values for `-o`, when the shell asks."""
     from adaptune.study.config import complete
     from offline.config import OfflineStudyConfig
-    from offline.samplers.settings import NAMES
+    from offline.sampler_settings import NAMES
 
     return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
 

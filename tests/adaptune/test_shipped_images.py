@@ -11,7 +11,7 @@ from adaptune.odometry.template import Template
 from adaptune.space import ParameterSpace
 from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
-from offline.samplers.samplers import AskedSampler
+from offline.samplers import AskedSampler
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 IMAGES = ("faster_lio_botanic_garden", "fast_livo2_botanic_garden", "lego_loam_kitti")

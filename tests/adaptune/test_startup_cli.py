@@ -30,7 +30,7 @@ def test_help_imports_neither_numpy_nor_a_stage():
 
 
 @pytest.mark.parametrize(
-    "module", ["adaptune.study.config", "offline.config", "offline.samplers.settings"]
+    "module", ["adaptune.study.config", "offline.config", "offline.sampler_settings"]
 )
 def test_configuration_models_import_nothing_heavy(module):
     names = imported(f"import {module}")

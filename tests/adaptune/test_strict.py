@@ -9,7 +9,7 @@ from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.space import Value
 from adaptune.strict import StrictModel, plain_words
 from offline.config import OfflineStudyConfig
-from offline.samplers.settings import SETTINGS
+from offline.sampler_settings import SETTINGS
 
 
 class Inner(StrictModel):

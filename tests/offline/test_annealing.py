@@ -1,4 +1,3 @@
-import itertools
 import math
 import warnings
 
@@ -8,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.testing import pytest_samplers
 from scipy import stats
 
-from offline.samplers.annealing import AnnealingSampler, Chain, reflected, step_from
-from offline.samplers.settings import AnnealingSettings, Step
+from offline.annealing import AnnealingSampler, Chain, reflected, step_from
+from offline.sampler_settings import AnnealingSettings, Step
 
 SPACE = {
     "x": FloatDistribution(-5.0, 5.0),
@@ -47,10 +47,22 @@ def history(study):
 # As a sampler of Optuna's.
 
 
-def test_finds_the_least():
-    study = optimize(150, AnnealingSampler(seed=2))
-    assert study.best_value < 0.5
-    assert all(-5.0 <= t.params["x"] <= 5.0 for t in study.trials)
+class _Cases:
+    @pytest.fixture
+    def sampler(self):
+        return AnnealingSampler
+
+
+class TestBasic(_Cases, pytest_samplers.BasicSamplerTestCase):
+    pass
+
+
+class TestRelative(_Cases, pytest_samplers.RelativeSamplerTestCase):
+    pass
+
+
+class TestSingleOnly(_Cases, pytest_samplers.SingleOnlySamplerTestCase):
+    pass
 
 
 def test_a_loaded_study_goes_on_as_if_it_had_never_stopped():
@@ -115,12 +127,6 @@ def test_stops_when_all_chains_have_stalled():
 def test_a_step_of_an_unknown_parameter_is_an_error():
     with pytest.raises(ValueError, match=r"steps of 'xx': there is no such parameter; did you"):
         optimize(5, AnnealingSampler(settings(steps={"xx": {"sigma": 1.0}})))
-
-
-def test_refuses_several_objectives():
-    study = optuna.create_study(directions=["minimize"] * 2, sampler=AnnealingSampler())
-    with pytest.raises(ValueError, match="multi-objective"):
-        study.optimize(lambda t: (objective(t), t.suggest_float("x", -5, 5)), n_trials=5)
 
 
 def test_failed_and_infinite_trials_do_no_harm():
@@ -284,25 +290,6 @@ def test_steps_stay_in_range(name, seed, mu, sigma, temperature):
 )
 def test_reflects_at_both_bounds(x, inside):
     assert reflected(x, 10) == inside
-
-
-def test_mean_of_many_steps_is_that_of_the_middle():
-    """Reflection keeps a walk without errors uniform: no bound attracts it."""
-    x, xs, rng = 0.3, [], np.random.default_rng(5)
-    for _ in range(20_000):
-        x = step_from(x, FloatDistribution(0.0, 1.0), Step(sigma=0.4), 1.0, rng)
-        xs.append(x)
-    counts, _ = np.histogram(xs, bins=5, range=(0, 1))
-    np.testing.assert_allclose(counts / len(xs), 0.2, atol=0.02)
-
-
-def test_every_combination_of_a_small_space_is_reached():
-    space = {"n": IntDistribution(0, 3), "c": SPACE["c"]}
-    study = optuna.create_study(sampler=AnnealingSampler(seed=0))
-    for _ in range(300):
-        study.tell(study.ask(space), 1.0)
-    seen = {(t.params["n"], t.params["c"]) for t in study.trials}
-    assert seen == set(itertools.product(range(4), ("red", "green", "blue")))
 
 
 # Bounds and starts of the walk.

@@ -36,7 +36,7 @@ def run(config, n_batches, known=()):
     return history
 
 
-@pytest.fixture(params=["tpe", "sobol", "random"])
+@pytest.fixture(params=["tpe", "random"])
 def config(request):
     return OfflineConfig(sampler=request.param, batch=8, initial=12, seed=5)
 
@@ -61,7 +61,7 @@ def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
 
 
 def test_batches_smaller_than_the_pool_still_begin_with_every_baseline():
-    small = OfflineConfig(sampler="sobol", batch=2, initial=4, seed=5)
+    small = OfflineConfig(sampler="random", batch=2, initial=4, seed=5)
     assert [s for s, _ in run(small, 2)[:3]] == SPACE.baselines
 
 
@@ -88,7 +88,7 @@ def test_where_one_has_nothing_left_the_others_go_on():
             "many": ParameterSpace.of(x=Float(low=0.0, high=1.0, baseline=0.5)),
         }
     )
-    sampler = make_sampler(space, OfflineConfig(sampler="sobol", batch=8, initial=8))
+    sampler = make_sampler(space, OfflineConfig(sampler="random", batch=8, initial=8))
     history = []
     for _ in range(2):
         history += [(s, 1.0) for s in sampler.propose(history)]
@@ -120,8 +120,6 @@ def test_batches_are_split_by_rank_and_nobody_is_left_out(n, batch, errors):
     sampler = make_sampler(space, OfflineConfig(sampler="random", batch=batch, initial=batch))
     history = [(s, of[s[ODOMETRY]]) for s in sampler.propose([])]
     proposed = [s[ODOMETRY] for s in sampler.propose(history)]
-    # A search for a bank takes half of them.
-    assert set(proposed[: max(n, batch // 2)]) == set(of)
     counts = collections.Counter(proposed)
     assert counts.total() == batch
     ranked = [counts[label] for label in sorted(of, key=of.__getitem__)]
@@ -144,17 +142,9 @@ def test_a_finite_pool_is_tried_to_its_end(config, batch):
     assert len(history) == len({repr(s) for s, _ in history}) == 23
 
 
-def test_begins_with_the_sobol_points_of_each():
-    """Also where the initial points cannot be divided evenly."""
-    of = [OfflineConfig(sampler=s, batch=7, initial=14, seed=5) for s in ("tpe", "sobol")]
-    a, b = (run(config, 3) for config in of)
-    assert a[:14] == b[:14]
-    assert a[14:] != b[14:]
-
-
 def test_alike_odometries_begin_with_other_points():
     space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
-    sets = make_sampler(space, OfflineConfig(sampler="sobol", batch=16)).propose([])[2:]
+    sets = make_sampler(space, OfflineConfig(sampler="random", batch=16)).propose([])[2:]
     voxels = [{s["voxel"] for s in sets if s[ODOMETRY] == label} for label in space.spaces]
     assert len(voxels[0]) == len(voxels[1]) == 7
     assert not voxels[0] & voxels[1]

@@ -9,9 +9,8 @@ from adaptune import processes
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
-from offline.samplers import make_sampler
-from offline.samplers.samplers import AskedSampler, HostedSampler
-from offline.samplers.settings import SamplerError
+from offline.sampler_settings import SamplerError
+from offline.samplers import AskedSampler, HostedSampler, make_sampler
 
 MINE = """
 import os, sys, time
@@ -92,7 +91,7 @@ def test_it_proposes_what_it_would_propose_here(monkeypatch):
     assert isinstance(hosted, HostedSampler)
     found = propose_all(hosted, 4)
     monkeypatch.setattr(
-        "offline.samplers.asked.optuna_sampler",
+        "offline.samplers.optuna_sampler",
         lambda _n, s, seed: optuna.samplers.RandomSampler(seed=seed, **s),
     )
     here = propose_all(AskedSampler(SPACE, config("Fine", limits={"cpu": {"max": 50}})), 4)

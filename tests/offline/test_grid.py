@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 from offline.config import OfflineConfig
+from offline.sampler_settings import Grid, Span, make_grid
 from offline.samplers import make_sampler
-from offline.samplers.settings import Grid, Span, make_grid
 
 SPACE = ParameterSpace(
     {

@@ -1,9 +1,9 @@
-"""What all samplers share: batches, and no set twice."""
+"""Samplers: what proposes the next parameter sets, in batches, and no set twice."""
 
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from operator import itemgetter
 from typing import Any
@@ -23,10 +23,10 @@ from adaptune.space import (
     ParameterSpace,
     PooledSpace,
 )
+from offline.annealing import AnnealingSampler
 from offline.config import OfflineConfig
 from offline.objective import SamplerResult, exceeded, penalised
-from offline.samplers.annealing import AnnealingSampler
-from offline.samplers.settings import (
+from offline.sampler_settings import (
     FORGETFUL,
     SERVICE,
     AnnealingSettings,
@@ -34,6 +34,7 @@ from offline.samplers.settings import (
     GridSettings,
     RandomSettings,
     SamplerError,
+    is_user_sampler,
     make_grid,
     optuna_class,
     optuna_sampler,
@@ -123,19 +124,29 @@ def key(parameters: ParameterSet) -> str:
 
 
 _SHUFFLED = 1 << 20
+"""Points of a grid that are shuffled as a whole; of larger ones, points are drawn."""
 
 
-class PointSampler(Sampler):
-    """Proposes one set for every trial number, or another one if that set was tried before."""
+class RandomSampler(Sampler):
+    """Uniform in the unit cube, or points of a grid in random order.
+
+    Each set follows from the number of its trial. One that was tried before is drawn again.
+    """
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        axes = RandomSettings.model_validate(config.sampler_settings).grid
+        self._grid = None if axes is None else make_grid(space, axes)
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        if self._grid is not None:
+            order = _shuffled(self._grid.size, self.config.seed, numbers.stop)
+            return _walk(self._grid, order, self.space.baseline, numbers)
         tried = Tried(result.parameters for result in history)
         sets: list[ParameterSet] = []
-        points = [self.space.baseline] if numbers.start == 0 else []
-        points += self._points(range(numbers.start + len(points), numbers.stop))
-        for number, drawn in zip(numbers, points, strict=True):
-            point: ParameterSet | None = drawn
-            if drawn in tried:
+        for number in numbers:
+            point: ParameterSet | None = self._point(number)
+            if point in tried:
                 rng = np.random.default_rng((self.config.seed, number, 1))
                 point = tried.another(self.space, rng)
             if point is None:
@@ -144,46 +155,12 @@ class PointSampler(Sampler):
             sets.append(point)
         return sets
 
-    @abstractmethod
-    def _points(self, numbers: range) -> list[ParameterSet]: ...
-
-
-class SobolSampler(PointSampler):
-    """Points of a scrambled Sobol sequence."""
-
-    def _points(self, numbers: range) -> list[ParameterSet]:
-        return sobol_points(self.space, self.config.seed, numbers)
-
-
-def sobol_points(space: ParameterSpace, seed: int, numbers: range) -> list[ParameterSet]:
-    """Points `numbers` of a scrambled Sobol sequence."""
-    if not numbers:
-        return []
-    sobol = qmc.Sobol(len(space), rng=np.random.default_rng((seed, 0)))
-    if numbers.start:
-        sobol.fast_forward(numbers.start)
-    # One by one: scipy warns if the number of points is not a power of two.
-    return space.from_unit(np.concatenate([sobol.random(1) for _ in numbers]))
-
-
-class RandomSampler(PointSampler):
-    """Uniform in the unit cube, or points of a grid in random order."""
-
-    def __init__(self, space: ParameterSpace, config: OfflineConfig):
-        super().__init__(space, config)
-        axes = RandomSettings.model_validate(config.sampler_settings).grid
-        self._grid = None if axes is None else make_grid(space, axes)
-
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        if self._grid is None:
-            return super()._propose(numbers, history)
-        order = _shuffled(self._grid.size, self.config.seed, numbers.stop)
-        return _walk(self._grid, order, self.space.baseline, numbers)
-
-    def _points(self, numbers: range) -> list[ParameterSet]:
-        seed, size = self.config.seed, len(self.space)
-        drawn = [np.random.default_rng((seed, n)).random(size) for n in numbers]
-        return self.space.from_unit(np.array(drawn).reshape(len(drawn), size))
+    def _point(self, number: int) -> ParameterSet:
+        if number == 0:
+            return self.space.baseline
+        drawn = np.random.default_rng((self.config.seed, number)).random((1, len(self.space)))
+        (point,) = self.space.from_unit(drawn)
+        return point
 
 
 class GridSampler(Sampler):
@@ -234,6 +211,17 @@ CONSTRAINED = (
 _ATTEMPTS = 32
 _ROUNDED = 1e-6
 """By how much a proposal may exceed its range."""
+
+
+def sobol_points(space: ParameterSpace, seed: int, numbers: range) -> list[ParameterSet]:
+    """Points `numbers` of a scrambled Sobol sequence."""
+    if not numbers:
+        return []
+    sobol = qmc.Sobol(len(space), rng=np.random.default_rng((seed, 0)))
+    if numbers.start:
+        sobol.fast_forward(numbers.start)
+    # One by one: scipy warns if the number of points is not a power of two.
+    return space.from_unit(np.concatenate([sobol.random(1) for _ in numbers]))
 
 
 class AskedSampler(Sampler):
@@ -419,10 +407,6 @@ def _distribution(parameter: Float | Integer | Categorical) -> Any:
 # Proposals for several odometries: a sampler for each, which share the batches.
 
 
-Make = Callable[[ParameterSpace, OfflineConfig], Sampler]
-"""Makes a sampler for one odometry."""
-
-
 class PooledSampler(Sampler):
     """A sampler for each odometry, over its own parameters and with the results of its own sets.
 
@@ -434,14 +418,14 @@ class PooledSampler(Sampler):
 
     space: PooledSpace
 
-    def __init__(self, space: PooledSpace, config: OfflineConfig, make: Make):
+    def __init__(self, space: PooledSpace, config: OfflineConfig):
         super().__init__(space, config)
         n = len(space.spaces)
         self._n_initial = max(config.initial, n)
         turns = [len(range(i, self._n_initial, n)) for i in range(n)]
         of_each = zip(space.spaces.items(), turns, _seeds(config, n), strict=True)
         self._samplers = {
-            label: make(own, config.model_copy(update={"initial": initial, "seed": seed}))
+            label: make_sampler(own, config.model_copy(update={"initial": initial, "seed": seed}))
             for (label, own), initial, seed in of_each
         }
         self.constrained = all(sampler.constrained for sampler in self._samplers.values())
@@ -526,7 +510,7 @@ class HostedSampler(Sampler):
 
     constrained = True  # the other process sees to constraints
 
-    def __init__(self, space: ParameterSpace, config: Any):
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
         super().__init__(space, config)
         self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
         self._about = {
@@ -544,7 +528,20 @@ class HostedSampler(Sampler):
         return sets
 
 
-# What follows runs in the other process.
+def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
+    """Make the sampler that a configuration names."""
+    if isinstance(space, PooledSpace):
+        return PooledSampler(space, config)
+    if config.sampler == "grid":
+        return GridSampler(space, config)
+    if config.sampler == "random":
+        return RandomSampler(space, config)
+    if is_user_sampler(config.sampler):
+        return HostedSampler(space, config)
+    return AskedSampler(space, config)
+
+
+# What follows runs in the process of a sampler of the user.
 
 
 def load(name: str) -> None:
@@ -564,8 +561,6 @@ def make(name: str) -> Answer:
 
 def propose(_: str) -> Answer:
     """Propose one batch after another."""
-    from offline.config import OfflineConfig
-
     made: dict[str, AskedSampler] = {}
 
     def answer(message: Message) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from adaptune.errors import nearest
-from offline.samplers.settings import AnnealingSettings, Step
+from offline.sampler_settings import AnnealingSettings, Step
 
 SIGMA = 0.05
 """Standard deviation of a step, as a share of the range."""
@@ -205,6 +205,7 @@ class AnnealingSampler(BaseSampler):
         param_distribution: BaseDistribution,
     ) -> Any:
         """Draw uniformly."""
+        self._raise_error_if_multi_objective(study)
         word = np.random.SeedSequence((self.seed, trial.number, *param_name.encode()))
         sampler = RandomSampler(seed=int(word.generate_state(1)[0]))
         return sampler.sample_independent(study, trial, param_name, param_distribution)

@@ -31,14 +31,14 @@ OPTUNA = {
     "tpe": "optuna.samplers:TPESampler",
 }
 """Optuna's samplers; their settings are the keywords of the class."""
-NAMES = ("annealing", "grid", "random", "sobol", *OPTUNA)
+NAMES = ("annealing", "grid", "random", *OPTUNA)
 SINGLE = ("annealing", "cmaes")
 """Samplers that minimise one objective only."""
 FORGETFUL = ("tpe", "gp")
 """Samplers that keep no notes: they continue from any list of trials."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
-SERVICE = processes.Service("offline.samplers.samplers")
+SERVICE = processes.Service("offline.samplers")
 """What a server does with a sampler of the user."""
 
 
@@ -120,6 +120,8 @@ def optuna_class(name: str) -> type[Any]:
         raise SamplerError(
             f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
         )
+    if name == "sobol":
+        raise SamplerError("sobol is gone; choose qmc, Optuna's, or tpe, which begins with points")
     if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
@@ -164,7 +166,6 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
     "random": RandomSettings,
-    "sobol": type("SobolSettings", (StrictModel,), {"__doc__": "`sobol` has no settings."}),
 }
 """Settings of adaptune's own samplers."""
 
