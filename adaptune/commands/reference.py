@@ -80,12 +80,6 @@ Length = Annotated[
         show_default="25, or what fits",
     ),
 ]
-Check = Annotated[
-    bool,
-    typer.Option(
-        "--check", help="Compare a study's given references with estimated ones, by its trials."
-    ),
-]
 
 
 def reference(
@@ -96,19 +90,15 @@ def reference(
     given: Given = None,
     prior: Prior = None,
     length: Length = None,
-    check: Check = False,
 ) -> None:
     """Estimate the reference of a recording from its scans, without ground truth.
 
     It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study, it
     estimates the references of all sequences that have none, or `reference: estimated`.
-
-    With `--check`, it estimates those of the training sequences that have a given reference, and
-    shows whether the trials would have been judged alike.
     """
     if target.suffix not in _STUDIES:
-        if check or override:
-            raise AdaptuneError(f"{target}: --check and -o are for studies; give a study's YAML")
+        if override:
+            raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
         with _on_one_core():
             _of_recording(target, folder or Path(), (points, given, prior), length)
         return
@@ -120,13 +110,8 @@ def reference(
             f"docs/reference-study.md"
         )
     loaded = load(target, override, folder)
-    if check:
-        _check(loaded)
-    else:
-        _of_study(loaded)
-    following = "trials" if check else "offline"
-    why = "the trials themselves" if check else "run trials, fit the error model"
-    say_next_of_study(why, following, target, override, folder)
+    _of_study(loaded)
+    say_next_of_study("run trials, fit the error model", "offline", target, override, folder)
 
 
 @contextmanager
@@ -235,7 +220,7 @@ def _of_study(study: "OfflineStudy") -> None:
     if not names:
         raise AdaptuneError(
             f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
-            f"is to be estimated, or compare with --check"
+            f"is to be estimated"
         )
     study.open()
     with progress() as show:
@@ -257,26 +242,3 @@ def _of_study(study: "OfflineStudy") -> None:
         say(f"Files: {study.folder / 'references'}/")
     if refused:
         raise AdaptuneError("\n".join(refused.values()))
-
-
-def _check(study: "OfflineStudy") -> None:
-    """Compare given references with estimated ones by the study's trials."""
-    from adaptune.report import tables
-    from adaptune.study.inputs import warn_of_stale
-    from offline.check_reference import check_reference
-
-    study.open()
-    warn_of_stale(study)
-    with progress() as show:
-        rows = check_reference(study, show)
-    tables.write_rows(study.folder, "reference_check", rows)
-    console.print(
-        tables.table(
-            f"Estimated beside given references, over {study.config.sub_trajectory:g} m",
-            rows,
-            "Errors of the estimate by the given reference and by its own halves; of the given one "
-            "by registrations of scans. Rank correlation of the sets' mean errors by both. Errors "
-            "by the given reference: of the set that the estimate picks, and of the best.",
-        )
-    )
-    say(f"Table: {study.folder / 'reference_check'}.*, estimates: {study.folder / 'references'}/")

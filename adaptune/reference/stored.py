@@ -164,10 +164,6 @@ LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 _BEYOND = 1.5
 """By how much a length may exceed the longest that is noted."""
 
-CHECK = ".check"
-"""Ends the name of an estimate that is compared with a given reference, and used for nothing
-else."""
-
 
 class StoredEstimate(NamedTuple):
     """What is known about an estimated reference in a file.
