@@ -15,8 +15,8 @@ from adaptune.odometry.remote import MOST_FAULTS
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from offline.config import OfflineConfig, OfflineStudy
-from offline.objective import Verdict, judge, label, mean_value, weighted
-from offline.search import Clock, Finished, Search, Stage, assess, best_of_each, make_stages, rungs
+from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
+from offline.search import Clock, Finished, Search, assess, make_searches, rungs
 from offline.storage import MirrorRow, open_mirror
 from offline.workers import Pool, Task, TaskProgress, TaskResult, run
 
@@ -46,7 +46,7 @@ def run_batches(
 
 
 class _Campaign:
-    """Runs the searches of a study, one stage after the other."""
+    """Runs the searches of a study, side by side."""
 
     def __init__(
         self, study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
@@ -55,32 +55,21 @@ class _Campaign:
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
-        self._stages = make_stages(study.config, study.odometry.space, self._names, archive)
+        self._searches = make_searches(self._config, study.odometry.space, self._names, archive)
         known = archive.sets()
         self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
         described = study.config.descriptor.names
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
         ]
-        self._tally = _Tally(progress, self._finished, self._stages)
+        self._tally = _Tally(progress, self._finished, self._searches)
         # For each trial number, the sequences that count.
         self._counted: dict[int, Sequence[str]] = {}
 
     def run(self) -> dict[int, Verdict]:
-        hours = 0.0
-        best: dict[int, Verdict] = {}
-        for stage in self._stages:
-            hours += self._run_stage(stage, hours)
-            best |= best_of_each(self._config, stage) if stage.alone else {}
-        self._mirror_trials()
-        self._tally.catch_up()
-        self._run_everywhere(best)
-        return {n: self._verdict(n) for n in sorted(self._counted)}
-
-    def _run_stage(self, stage: Stage, hours: float) -> float:
-        clock = Clock(self._study.folder / ("elapsed-own.json" if stage.alone else "elapsed.json"))
+        clock = Clock(self._study.folder / "elapsed.json")
         batch = 0
-        while at_work := [s for s in stage.searches if s.begin(hours + clock.hours(batch))]:
+        while at_work := [s for s in self._searches if s.begin(clock.hours(batch))]:
             self._tally.begin(at_work)
             begun = False
             for m in rungs(self._config.pruning == "wilcoxon", batch, len(at_work[0].sequences)):
@@ -96,19 +85,39 @@ class _Campaign:
                 self._counted |= dict.fromkeys(search.numbers, search.sequences)
                 search.close()
             self._counted[0] = self._names
-            self._tally.best = _best(self._config, stage)
+            self._tally.best = self._best()
             if begun:
                 self._mirror_trials()
                 self._tally.catch_up()
                 _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._tally.best)
             batch += 1
-        for search in stage.searches:
-            where = f" on {search.sequences[0]}" if stage.alone else ""
+        for search in self._searches:
+            where = f" on {search.sequences[0]}" if self._config.sets == "own" else ""
             _log.info("the search%s ends: %s", where, search.end)
-        return clock.hours(batch)
+        self._mirror_trials()
+        self._tally.catch_up()
+        if self._config.sets == "own":
+            self._run_everywhere()
+        return {n: self._verdict(n) for n in sorted(self._counted)}
 
-    def _run_everywhere(self, best: Mapping[int, Verdict]) -> None:
+    def _best(self) -> str:
+        """The best value so far, or its mean where each search has a sequence of its own."""
+        best = [search.verdicts[search.best] for search in self._searches]
+        value = float(np.mean([verdict.values[0] for verdict in best]))
+        what = f"best {label(self._config.objective[0])} {value:.3f}"
+        if self._config.sets == "own":
+            return f"{what} in the mean of {len(best)} sequences"
+        (search,) = self._searches
+        feasible = "" if best[0].feasible else ", which does not keep the limits"
+        return f"{what} (trial {search.number(search.best)}){feasible}"
+
+    def _run_everywhere(self) -> None:
         """Run the best set of each sequence on the others, to choose the fixed one among them."""
+        best = {}
+        for search in self._searches:
+            if any(verdict.feasible for verdict in search.verdicts):
+                number = best_by_trials(self._config, search.done)
+                best[number] = search.done[number]
         missing = {name: [n for n in best if n not in self._finished[name]] for name in self._names}
         tasks = self._tasks([Missing(missing, lambda n: best[n].parameters)])
         what = "best sets of each on the others"
@@ -188,10 +197,10 @@ def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: in
 class _Tally:
     """The progress of trials."""
 
-    def __init__(self, progress: Progress, finished: Finished, stages: Sequence[Stage]):
+    def __init__(self, progress: Progress, finished: Finished, searches: Sequence[Search]):
         self.best = ""
         self._progress, self._finished = progress, finished
-        self._searches = [search for stage in stages for search in stage.searches]
+        self._searches = searches
         self._done = self._failed = self._running = 0
         self._under_way = _UnderWay(progress)
 
@@ -260,18 +269,6 @@ class _UnderWay:
     def end(self, task: Task) -> None:
         """Forget a task."""
         self._runs.pop(task.key, None)
-
-
-def _best(config: OfflineConfig, stage: Stage) -> str:
-    """The best value so far, or its mean where each search has a sequence of its own."""
-    best = [search.verdicts[search.best] for search in stage.searches]
-    value = float(np.mean([verdict.values[0] for verdict in best]))
-    what = f"best {label(config.objective[0])} {value:.3f}"
-    if stage.alone:
-        return f"{what} in the mean of {len(best)} sequences"
-    (search,) = stage.searches
-    feasible = "" if best[0].feasible else ", which does not keep the limits"
-    return f"{what} (trial {search.number(search.best)}){feasible}"
 
 
 def watch_tasks(

@@ -26,7 +26,7 @@ from adaptune.study.study import Study
 from offline import trial_charts
 from offline.config import OfflineStudy
 from offline.objective import sampler_results
-from offline.search import Search, assess, make_stages
+from offline.search import Search, assess, make_searches
 from offline.trial_charts import TrialTable, importance_chart, importances, read_trials
 from offline.tuning import figures
 
@@ -156,10 +156,10 @@ def reannealings(study: OfflineStudy) -> dict[int, list[int]]:
     if study.config.offline.sampler != "annealing":
         return {}
     archive = Archive(study.folder / "trials")
-    stages = make_stages(study.config, study.odometry.space, study.training, archive)
+    config, space = study.config.offline, study.odometry.space
     finished = {name: archive.finished(name) for name in study.training}
     found = {}
-    for search in (search for stage in stages for search in stage.searches):
+    for search in make_searches(config, space, study.training, archive):
         slot = search.number(1) // OF_SLOT
         found[slot] = _reannealed(search, study, finished)
     return found

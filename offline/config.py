@@ -56,6 +56,12 @@ def _rule(pruning: Any) -> Any:
     return pruning
 
 
+def _sets(sets: Any) -> Any:
+    if sets == "both":
+        raise ValueError("both is gone; give shared, or own")
+    return sets
+
+
 def _url(storage: str) -> str:
     if "://" not in storage:
         raise ValueError("give the URL of a database, as postgresql://user@host/database")
@@ -73,7 +79,7 @@ class OfflineConfig(StrictModel):
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = Field(default_factory=dict)
-    sets: Literal["shared", "own", "both"] = "shared"
+    sets: Annotated[Literal["shared", "own"], BeforeValidator(_sets)] = "shared"
     trials: int | None = Field(None, ge=1, le=10**6)
     hours: float | None = Field(None, gt=0, le=1e5)
     stagnation: int | None = Field(None, ge=1, le=10**6)
@@ -103,7 +109,7 @@ class OfflineConfig(StrictModel):
         if self.pruning != "none" and self.sets == "own":
             raise ValueError(
                 "pruning spares trials further sequences, and with sets: own each runs on one; "
-                "set pruning: none, or sets: shared or both"
+                "set pruning: none, or sets: shared"
             )
         return self
 

@@ -1,4 +1,4 @@
-"""Searches for parameter sets: one over all training sequences, one for each, or both."""
+"""Searches for parameter sets: one over all training sequences, or one for each."""
 
 import json
 import time
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cached_property, partial
 from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
-from offline.config import OfflineConfig, OfflineStudyConfig
-from offline.objective import Verdict, best_by_trials, judge, sampler_results, weighted
+from offline.config import OfflineConfig
+from offline.objective import Verdict, judge, sampler_results, weighted
 
 if TYPE_CHECKING:
     from offline.samplers import Sampler
@@ -396,18 +396,10 @@ def _rank(verdict: Verdict) -> tuple[bool, float, float]:
     return not verdict.complete, verdict.excess, verdict.values[0]
 
 
-class Stage(NamedTuple):
-    """Searches that run side by side."""
-
-    searches: list[Search]
-    alone: bool  # whether each search uses one sequence alone
-
-
-def make_stages(
-    study: OfflineStudyConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
-) -> list[Stage]:
-    """Make the searches of a study over some sequences, in their order."""
-    config = study.offline
+def make_searches(
+    config: OfflineConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
+) -> list[Search]:
+    """Make the searches over some sequences, in their order: one over all, or one for each."""
 
     def sampler_of(config: OfflineConfig) -> "Sampler":
         from offline.samplers import make_sampler  # Optuna takes a second to import
@@ -415,30 +407,15 @@ def make_stages(
         return make_sampler(space, config)
 
     finished, known = {name: archive.finished(name) for name in names}, archive.sets()
-    stages = []
-    if config.sets != "own":
-        sampler = partial(sampler_of, config)
-        shared = Search(sampler, config, names, finished, known)
-        stages.append(Stage([shared], alone=False))
-    if config.sets != "shared":
-        slots, own = archive.slots(names), []
-        for name in names:
-            seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
-            seed = {"seed": int(seeds.generate_state(1)[0])}
-            sampler = partial(sampler_of, config.model_copy(update=seed))
-            own.append(Search(sampler, config, [name], finished, known, slots[name]))
-        stages.append(Stage(own, alone=True))
-    return stages
-
-
-def best_of_each(config: OfflineConfig, stage: Stage) -> dict[int, Verdict]:
-    """The best set of each search that keeps the limits, by trial number."""
-    best = {}
-    for search in stage.searches:
-        if any(verdict.feasible for verdict in search.verdicts):
-            number = best_by_trials(config, search.done)
-            best[number] = search.done[number]
-    return best
+    if config.sets == "shared":
+        return [Search(partial(sampler_of, config), config, names, finished, known)]
+    slots, searches = archive.slots(names), []
+    for name in names:
+        seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
+        seed = {"seed": int(seeds.generate_state(1)[0])}
+        sampler = partial(sampler_of, config.model_copy(update=seed))
+        searches.append(Search(sampler, config, [name], finished, known, slots[name]))
+    return searches
 
 
 def owner(slots: Mapping[str, int], number: int) -> str | None:

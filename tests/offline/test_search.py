@@ -20,7 +20,7 @@ from offline.labelled import labelled_data
 from offline.leave_one_out import leave_one_out
 from offline.objective import best_by_trials
 from offline.samplers import make_sampler
-from offline.search import Search, make_stages, owner
+from offline.search import Search, make_searches, owner
 from offline.train import train
 
 NAMES = ["one", "two", "three"]
@@ -63,9 +63,9 @@ def run(study):
     return verdicts, seen, archive
 
 
-def stages_of(study):
+def searches_of(study):
     space, archive = study.odometry.space, Archive(study.folder / "trials")
-    return make_stages(study.config, space, study.training, archive)
+    return make_searches(study.config.offline, space, study.training, archive)
 
 
 def owner_of(archive, number):
@@ -77,12 +77,11 @@ def sets(archive):
     return {(name, n): s.parameters for name in NAMES for n, s in archive.finished(name).items()}
 
 
-@pytest.mark.parametrize("kind", ["shared", "own", "both"])
+@pytest.mark.parametrize("kind", ["shared", "own"])
 def test_every_number_is_of_one_search(study_of, kind):
     study = study_of(sets=kind)
-    stages = stages_of(study)
-    searches = [search for stage in stages for search in stage.searches]
-    assert len(searches) == {"shared": 1, "own": 3, "both": 4}[kind]
+    searches = searches_of(study)
+    assert len(searches) == {"shared": 1, "own": 3}[kind]
     assert len({search.number(i) for search in searches for i in range(1, 20)}) == 19 * len(
         searches
     )
@@ -123,29 +122,19 @@ def test_each_sequence_searches_for_itself(study_of):
     )
 
 
-def test_both_make_what_each_would_make_alone(study_of):
-    of_both = sets(run(study_of(sets="both"))[2])
-    shared, own = (sets(run(study_of(sets=kind))[2]) for kind in ("shared", "own"))
-    for slot, name in enumerate(NAMES, start=1):
-        assert all(of_both[name, i] == shared[name, i] for i in range(1, 11))
-        own_numbers = [100_000 * slot + i for i in range(1, 11)]
-        assert all(of_both[name, n] == own[name, n] for n in own_numbers)
-
-
 SAMPLERS = {
     "tpe": "{}",
     "annealing": "{chains: 1}",
     "nsga2": "{}",
     "cmaes": "{}",
     "qmc": "{}",
-    "sobol": "{}",
     "random": "{}",
     "grid": "{grid: {max_correspondence_distance: [1, 1, 4], keyframe_interval: [1, 2, 5]}}",
 }
 
 
 @pytest.mark.parametrize(
-    ("sampler", "kind"), [("tpe", "both"), *((sampler, "own") for sampler in SAMPLERS)]
+    ("sampler", "kind"), [("tpe", "shared"), *((sampler, "own") for sampler in SAMPLERS)]
 )
 def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind):
     given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
@@ -164,7 +153,7 @@ def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind):
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-@pytest.mark.parametrize("kind", ["shared", "both"])
+@pytest.mark.parametrize("kind", ["shared", "own"])
 def test_sequences_are_added_and_removed(study_of, sampler, kind):
     """Sets that have run are not proposed again, and numbers stay."""
     given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
@@ -182,7 +171,7 @@ def test_sequences_are_added_and_removed(study_of, sampler, kind):
     assert before.items() <= after.items()
     new = {(name, n) for name, n in ran if name != "three" and n < 300_000}
     # Only the best set of each sequence may be another one now, and runs everywhere.
-    assert new <= ({(n, t) for n in NAMES for t in verdicts} if kind == "both" else set())
+    assert new <= ({(n, t) for n in NAMES for t in verdicts} if kind == "own" else set())
     shared = [n for n in verdicts if n < 100_000]
     assert shared == [n for n in first if n < 100_000]
     assert all(after["three", n] == before["one", n] for n in shared)
@@ -210,9 +199,9 @@ def test_a_search_that_is_over_waits_for_the_others(study_of):
 
 def test_views_search_for_themselves(study_of):
     study = study_of(sets="own", augment="[{reverse: true}]")
-    (stage,) = stages_of(study)
-    assert [search.sequences for search in stage.searches] == [[name] for name in study.training]
-    assert len(stage.searches) == 6
+    searches = searches_of(study)
+    assert [search.sequences for search in searches] == [[name] for name in study.training]
+    assert len(searches) == 6
 
 
 def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
