@@ -27,39 +27,20 @@ FELT = 0.25
 def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:
     """Errors of a trial as vectors, see `sub_trajectory_vectors`.
 
-    Their lengths are the trial's errors. Where a trial was run in pieces
-    (``offline.runs: episodes``) or several times, their directions are those of the joined pieces,
-    or of the first run.
+    Their lengths are the trial's errors. Where a trial was run several times, their directions are
+    those of the first run.
 
     Returns
     -------
     ndarray of shape (n_frames, 3)
     """
-    T_odom_sensor = _joined(frames, trial)
-    vectors = sub_trajectory_vectors(frames.T_ref_sensor, T_odom_sensor, length, trial.restarted)
+    T_ref_sensor, T_odom_sensor = frames.T_ref_sensor, trial.T_odom_sensor
+    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, trial.restarted)
     vectors[np.isinf(trial.errors)] = np.inf
     lengths = np.linalg.norm(vectors, axis=1)
     finite = np.isfinite(lengths) & (lengths > 0.0)
     vectors[finite] *= (trial.errors[finite] / lengths[finite])[:, None]
     return vectors.astype(np.float32)
-
-
-def _restarts(frames: Frames, trial: Trial) -> NDArray[np.bool_]:
-    """At which frames but the first a trial started again at the reference."""
-    restarts = (trial.T_odom_sensor == frames.T_ref_sensor).all(axis=(1, 2))
-    restarts[0] = False
-    return np.asarray(restarts)
-
-
-def _joined(frames: Frames, trial: Trial) -> Poses:
-    """Poses of a trial, joined by the reference's motion where a piece of it began."""
-    T_odom_sensor = trial.T_odom_sensor.copy()
-    for i in np.flatnonzero(_restarts(frames, trial) & ~trial.restarted):
-        T_ref_step = invert(frames.T_ref_sensor[i - 1]) @ frames.T_ref_sensor[i]
-        T_joined = T_odom_sensor[i - 1] @ T_ref_step @ invert(T_odom_sensor[i])
-        if np.isfinite(T_joined).all():
-            T_odom_sensor[i:] = T_joined @ T_odom_sensor[i:]
-    return T_odom_sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +62,6 @@ class BankSimulation:
     )
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
-    def _steps(self, members: tuple[int, ...]) -> Poses:
-        """Motions of members; where nobody's is known, the reference's stands in."""
-        T_previous_current = self.motions(members)
-        unknown = np.flatnonzero(np.asarray(np.isnan(T_previous_current[..., 0, 0])).all(axis=1))
-        if len(unknown):
-            T_previous_current = T_previous_current.copy()
-            T_ref = invert(self.T_ref_sensor[unknown]) @ self.T_ref_sensor[unknown + 1]
-            T_previous_current[unknown] = T_ref[:, None]
-        return T_previous_current
-
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         """What is measured of members before the first frame of each period."""
         if members not in self._live:
@@ -102,7 +73,7 @@ class BankSimulation:
         start, end, T_start_end, projection = self.hops
         if not len(start):
             return [None] * len(first)
-        T_previous_current = self._steps(members)
+        T_previous_current = self.motions(members)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
         T_odom_sensor = chained(np.where(known[..., None, None], T_previous_current, np.eye(4)))
         moved = invert(T_odom_sensor[start]) @ T_odom_sensor[end]
@@ -127,7 +98,7 @@ class BankSimulation:
         """
         key = votes.members, votes.weights.tobytes()
         if key not in self._agreeing:
-            T_previous_current = self._steps(votes.members)
+            T_previous_current = self.motions(votes.members)
             agreement = Agreement(len(votes.members), self.lost_track)
             agreeing = np.zeros(T_previous_current.shape[:2], bool)
             of_steps = self._of_steps(votes)
@@ -169,7 +140,7 @@ class BankSimulation:
         votes
             The weights with which they vote about who agrees; `weights` when left out.
         """
-        T_previous_current = self._steps(weights.members)
+        T_previous_current = self.motions(weights.members)
         agreeing = self.agreeing(weights if votes is None else votes)
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
@@ -191,8 +162,7 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
 
     Where a trial lost track, its motion was not recorded, and it started again at the reference. In
     a bank nobody knows at once: here it stands still for `NOTICED` seconds, as all others do that
-    lose track there, and then goes on. Where a piece of a trial began
-    (``offline.runs: episodes``) the motion is unknown.
+    lose track there, and then goes on.
 
     Parameters
     ----------
@@ -204,14 +174,11 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     Returns
     -------
     ndarray of shape (n_frames - 1, n_trials, 4, 4)
-        NaN where it is unknown.
     """
     motions = np.empty((len(frames.stamps) - 1, len(trials), 4, 4))
     for k, trial in enumerate(trials):
         T = steps(trial.T_odom_sensor)
-        restarts, lost = _restarts(frames, trial)[1:], trial.restarted[1:]
-        T[restarts & ~lost] = np.nan
-        T[_for_a_while(lost, frames.stamps)] = np.eye(4)
+        T[_for_a_while(trial.restarted[1:], frames.stamps)] = np.eye(4)
         motions[:, k] = T
     return motions
 

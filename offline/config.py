@@ -62,6 +62,12 @@ def _sets(sets: Any) -> Any:
     return sets
 
 
+def _runs(runs: Any) -> Any:
+    if runs == "episodes":
+        raise ValueError("episodes is gone; give restart, or whole")
+    return runs
+
+
 def _url(storage: str) -> str:
     if "://" not in storage:
         raise ValueError("give the URL of a database, as postgresql://user@host/database")
@@ -95,7 +101,7 @@ class OfflineConfig(StrictModel):
         {"rte": 1.0},
     )
     limits: dict[Metric, Limit] = Field(default_factory=dict)
-    runs: Literal["restart", "whole", "episodes"] = "restart"
+    runs: Annotated[Literal["restart", "whole"], BeforeValidator(_runs)] = "restart"
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()

@@ -149,7 +149,7 @@ class _Reader:
 
 
 class TrialRun:
-    """A run of an odometry on a piece of a sequence, from frame `begin` to before `end`.
+    """A run of an odometry on a sequence, restarted at the reference where it loses track.
 
     An exception of the odometry is a fault, after which there is no pose.
     """
@@ -159,11 +159,8 @@ class TrialRun:
         make: Callable[[], OdometryInstance],
         frames: Frames,
         lost_track: float | None,
-        begin: int,
-        end: int,
     ):
         n = len(frames.stamps)
-        self.begin, self.end = begin, end
         self.T_odom_sensor = np.empty((n, 4, 4))
         self.restarted = np.zeros(n, bool)
         self.registered = np.ones(n, bool)
@@ -212,7 +209,7 @@ class TrialRun:
         return self._odometry
 
     def _step(self, i: int, scan: SharedScan) -> None:
-        if i == self.begin:
+        if i == 0:
             T = self._T_ref_sensor[i]
             T = np.eye(4) if np.isnan(T[0, 0]) else T
             odometry = self._started()
@@ -245,10 +242,10 @@ class TrialRun:
             self.T_odom_sensor[i], self.restarted[i] = self._T_ref_sensor[i], True
             self.lost_steps[i] = np.eye(4)
         else:
-            self.T_odom_sensor[i] = np.eye(4) if i == self.begin else self.T_odom_sensor[i - 1]
+            self.T_odom_sensor[i] = np.eye(4) if i == 0 else self.T_odom_sensor[i - 1]
 
     def _lost(self, i: int, T_step: Poses | None) -> bool:
-        if i == self.begin:
+        if i == 0:
             return False
         T_ref_step = self._T_ref_steps[i - 1]
         if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
@@ -263,7 +260,7 @@ class DrivenRun(TrialRun):
     """A run from end to end as a replay drives it: with the health check, without reference."""
 
     def __init__(self, make: Callable[[], OdometryInstance], frames: Frames, health: HealthCheck):
-        super().__init__(make, frames, None, 0, len(frames.stamps))
+        super().__init__(make, frames, None)
         self.unhealthy = Counter[str]()
         self._stamps, self._health = frames.stamps.tolist(), health
 
@@ -327,8 +324,6 @@ MIN_POINTS = 20
 """No odometry can use a scan with fewer points."""
 _AROUND = 1.0
 """Seconds by which a reference's clock may differ from the scans' while its length is looked at."""
-EPISODE = 4.0
-"""Sub-trajectories from the beginning of an episode to the beginning of the next."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +334,7 @@ class TrialSettings:
     lost_track: float = 3.0
     health: HealthCheck = field(default_factory=HealthCheck)
     descriptors: tuple[str, ...] = ("ndt",)
-    runs: Literal["restart", "whole", "episodes"] = "restart"
+    runs: Literal["restart", "whole"] = "restart"
     repeats: int = 1
     baseline_runs: int | None = None  # as many as `repeats`, if not given
     metrics: frozenset[str] = frozenset({"rte"})
@@ -520,32 +515,6 @@ def reference_poses(
     return T_ref_sensor
 
 
-def episodes(T_ref_sensor: Poses, length: float) -> list[tuple[int, int]]:
-    """Overlapping pieces of a sequence: every sub-trajectory lies within one of them.
-
-    Parameters
-    ----------
-    T_ref_sensor
-        Reference poses of shape (n, 4, 4).
-    length
-        Metres of a sub-trajectory. Pieces begin `EPISODE` times that apart.
-
-    Returns
-    -------
-    list of (begin, end)
-        Frames from `begin` to before `end`.
-    """
-    distance = travelled(T_ref_sensor)
-    n = len(distance)
-    starts = np.arange(0.0, max(distance[-1], 1e-9), EPISODE * length)
-    begins = np.unique(np.searchsorted(distance, starts)).tolist()
-    ends = [
-        min(n, int(np.searchsorted(distance, distance[last - 1] + length, side="right")) + 1)
-        for last in [*begins[1:], n]
-    ]
-    return list(zip(begins, ends, strict=True))
-
-
 def run_trials(
     settings: TrialSettings,
     odometry: Factory,
@@ -562,29 +531,24 @@ def run_trials(
     drives it: without reference, and restarted by the health check.
     """
     frames = scans.frames
-    pieces = [(0, len(frames.stamps))]
-    if settings.runs == "episodes":
-        pieces = episodes(frames.T_ref_sensor, settings.sub_trajectory)
     lost_track = settings.lost_track if settings.runs == "restart" else None
 
-    def repeat(parameters: ParameterSet) -> list[TrialRun]:
+    def repeat(parameters: ParameterSet) -> TrialRun:
         make = partial(odometry, parameters, scans.name, isolated=settings.isolated)
         if whole:
-            return [DrivenRun(make, frames, settings.health)]
-        return [TrialRun(make, frames, lost_track, *piece) for piece in pieces]
+            return DrivenRun(make, frames, settings.health)
+        return TrialRun(make, frames, lost_track)
 
-    # For every set every repeat, and for every repeat every piece.
     runs = [[repeat(s) for _ in range(_n_runs(settings, odometry, s))] for s in sets]
-    each = [run for of_set in runs for of_repeat in of_set for run in of_repeat]
+    each = [run for of_set in runs for run in of_set]
     with ExitStack() as ended:
         for run in each:
             ended.callback(run.close)
         for i, scan in enumerate(_watched(scans, len(frames.stamps), advance)):
             for run in each:
-                if run.begin <= i < run.end:
-                    run.step(i, scan)
+                run.step(i, scan)
     return [
-        _mean(s, [_trial(settings, s, scans, pieces) for pieces in of_set])
+        _mean(s, [_trial(settings, s, scans, run) for run in of_set])
         for s, of_set in zip(sets, runs, strict=True)
     ]
 
@@ -596,70 +560,42 @@ def _n_runs(settings: TrialSettings, odometry: Factory, parameters: ParameterSet
 
 
 def _trial(
-    settings: TrialSettings,
-    parameters: ParameterSet,
-    scans: PreparedSequence,
-    pieces: Sequence[TrialRun],
+    settings: TrialSettings, parameters: ParameterSet, scans: PreparedSequence, run: TrialRun
 ) -> Trial:
-    """Make one trial of pieces: each frame belongs to the last piece that begins before it."""
-    frames = scans.frames
-    n = len(frames.stamps)
-    T_odom_sensor = np.empty((n, 4, 4))
-    errors, seconds = np.empty(n), np.empty(n)
-    restarted, registered = np.zeros(n, bool), np.ones(n, bool)
-    lost_steps: dict[int, Poses] = {}
-    cpu = 0.0
-    for run, after in zip(pieces, [*pieces[1:], None], strict=True):
-        own = slice(run.begin, n if after is None else after.begin)
-        T_odom_sensor[own] = run.T_odom_sensor[own]
-        piece = slice(run.begin, run.end)
-        errors[own] = sub_trajectory_rte(
-            frames.T_ref_sensor[piece],
-            run.T_odom_sensor[piece],
-            settings.sub_trajectory,
-            run.restarted[piece],
-        )[: own.stop - own.start]
-        restarted[own], registered[own] = run.restarted[own], run.registered[own]
-        apart = run.usage.seconds
-        seconds[own] = run.seconds[own] if apart is None else apart
-        lost_steps |= run.lost_steps
-        cpu += run.usage.cpu * (own.stop - own.start) / (run.end - run.begin)
-        if after is not None:
-            T = run.T_odom_sensor
-            lost_steps[after.begin] = invert(T[after.begin - 1]) @ T[after.begin]
+    """Make a trial of a run."""
+    frames, T_odom_sensor = scans.frames, run.T_odom_sensor
+    length, T_ref_sensor = settings.sub_trajectory, frames.T_ref_sensor
     T_steps = steps(T_odom_sensor)
-    for i, T_step in lost_steps.items():
+    for i, T_step in run.lost_steps.items():
         T_steps[i - 1] = T_step
-    driven = pieces[0] if isinstance(pieces[0], DrivenRun) else None
+    apart = run.usage.seconds
+    driven = run if isinstance(run, DrivenRun) else None
     return Trial(
         parameters,
         T_odom_sensor,
-        errors,
-        restarted,
-        registered,
-        seconds,
-        tuple(fault for run in pieces for fault in run.faults),
-        trajectory_metrics(frames, T_odom_sensor, lost_steps),
-        _usage(cpu, scans, pieces),
+        sub_trajectory_rte(T_ref_sensor, T_odom_sensor, length, run.restarted),
+        run.restarted,
+        run.registered,
+        run.seconds if apart is None else apart,
+        run.faults,
+        trajectory_metrics(frames, T_odom_sensor, run.lost_steps),
+        _usage(scans, run),
         unhealthy=dict(driven.unhealthy)
         if driven
-        else unhealthy(settings.health, T_steps, frames.stamps, registered),
+        else unhealthy(settings.health, T_steps, frames.stamps, run.registered),
         health=settings.health.model_dump() if driven else {},
     )
 
 
-def _usage(cpu: float, scans: PreparedSequence, pieces: Sequence[TrialRun]) -> dict[str, float]:
+def _usage(scans: PreparedSequence, run: TrialRun) -> dict[str, float]:
     """What a trial used, see `Trial`."""
-    stamps = scans.frames.stamps
-    usage = {
-        "cpu": 100.0 * cpu / ((stamps[-1] - stamps[0]) * 1e-9),
-        REGISTER_MS: 1e3 * cpu / len(stamps),
-        PREPARE_MS: pieces[0].prepare_ms(scans.shared),
+    stamps, usage = scans.frames.stamps, run.usage
+    used = {
+        "cpu": 100.0 * usage.cpu / ((stamps[-1] - stamps[0]) * 1e-9),
+        REGISTER_MS: 1e3 * usage.cpu / len(stamps),
+        PREPARE_MS: run.prepare_ms(scans.shared),
     }
-    memory = [run.usage.memory for run in pieces]
-    if known := [megabytes for megabytes in memory if megabytes is not None]:
-        usage["memory"] = max(known)
-    return usage
+    return used if usage.memory is None else used | {"memory": usage.memory}
 
 
 def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:

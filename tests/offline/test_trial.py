@@ -1,5 +1,4 @@
 import dataclasses
-import itertools
 
 import drives
 import numpy as np
@@ -8,12 +7,12 @@ from setups import made_of, setup_of
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import invert
-from adaptune.metrics import sub_trajectory_rte, window_ends
+from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry import Registration
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.recording import SequenceConfig
 from offline.config import load_study
-from offline.trial import TrialSettings, episodes
+from offline.trial import TrialSettings
 from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -228,41 +227,6 @@ def test_the_baseline_may_have_more_runs(study):
         sequence, [baseline, GOOD | {"keyframe_interval": 2.0}, baseline], whole=True
     )
     assert [len(trial.repeats) for trial in trials] == [2, 0, 2]
-
-
-@pytest.mark.parametrize("length", [1.0, 2.5, 3.0, 50.0])
-def test_every_sub_trajectory_lies_in_an_episode(study, length):
-    T = setup_of(study).prepare("one", 1e9).frames.T_ref_sensor
-    pieces = episodes(T, length)
-    assert pieces[0][0] == 0
-    assert pieces[-1][1] == len(T)
-    assert (len(pieces) == 1) == (4 * length > 11.7)
-    ends = window_ends(T, length)
-    for (begin, end), (after, _) in itertools.pairwise([*pieces, (len(T), 0)]):
-        assert begin < after <= end
-        assert ends[begin:after].max() < end
-
-
-def test_episodes_begin_anew_and_do_not_hide_what_happens_between(study):
-    instances = []
-    slipping = made_of(Slipping, study, instances)
-    setup = setup_of(study, slipping, sub_trajectory=1.0, runs="episodes")
-    sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [GOOD])
-    pieces = episodes(sequence.frames.T_ref_sensor, 1.0)
-    assert [b.starts[0][0] for b in instances[1:]] == [0] * len(pieces)
-    for begin, _ in pieces:
-        np.testing.assert_array_equal(
-            trial.T_odom_sensor[begin], sequence.frames.T_ref_sensor[begin]
-        )
-    assert not trial.restarted.any()
-    # Each piece slips at its own tenth scan by 0.31 m, which is an error, not a failure.
-    assert np.isfinite(
-        trial.errors[: window_ends(sequence.frames.T_ref_sensor, 1.0).argmax()]
-    ).all()
-    assert trial.errors[8] > 20.0
-    slipped = 0.31 * np.sqrt(len([b for b, e in pieces if e > b + 10]) / 39)
-    assert trial.metrics["rpe"] == pytest.approx(slipped, rel=0.2)
 
 
 def test_whole_runs_as_trials(study):
