@@ -28,6 +28,7 @@ from adaptune.study.references import (
     estimates_beside_intervals,
     estimates_of,
 )
+from adaptune.study.study import BANK, ONE_SET, expected_in_words
 from offline.campaign import (
     Progress,
     WholeRuns,
@@ -80,6 +81,7 @@ class Training(NamedTuple):
     remark: str | None  # see `rivalry`
     references: Sequence[str] = ()  # see `estimates_beside_intervals`
     repeated: Sequence[str] = ()  # see `baseline_words`
+    changed: Sequence[str] = ()  # see `changes`
 
     @property
     def words(self) -> list[str]:
@@ -91,19 +93,12 @@ class Training(NamedTuple):
         sets, n = self.model.sets, len(self.rows)
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
+        first = [*self.changed, *self.references, *self.doubts, *self.repeated]
         if self.fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [
-                *self.references,
-                *self.doubts,
-                *self.repeated,
-                f"{beaten}; the fixed set is the baseline.",
-                baseline,
-            ]
+            return [*first, f"{beaten}; the fixed set is the baseline.", baseline]
         return [
-            *self.references,
-            *self.doubts,
-            *self.repeated,
+            *first,
             f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[self.fixed])}{self._cost}",
             baseline,
@@ -181,7 +176,8 @@ def train(
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
-    model = _fitted(study, archive, verdicts, fixed)
+    before = _stored_model(study)
+    model = _fitted(study, archive, verdicts, fixed, before)
     finished = _finished(study, archive, verdicts)
     means = {name: _means(trials, verdicts) for name, trials in finished.items()}
     write_text(study.folder / "fixed.yaml", files.dump(verdicts[fixed].parameters))
@@ -193,7 +189,42 @@ def train(
     tables.write_rows(study.folder, "training", rows)
     judged = estimates_beside_intervals(study, study.training)
     spread = baseline_words(config, [trials[0] for trials in finished.values()])
-    return Training(model, means, fixed, rows, remark, judged, spread)
+    changed = [] if before is None else changes(before, model)
+    return Training(model, means, fixed, rows, remark, judged, spread, changed)
+
+
+def _stored_model(study: OfflineStudy) -> ErrorModel | None:
+    try:
+        return ErrorModel.load(study.model_path)
+    except ModelError:
+        return None
+
+
+def changes(before: ErrorModel, after: ErrorModel) -> list[str]:
+    """What differs from the model before, a sentence each: sequences, fixed set, what is driven."""
+    said = []
+    if new := [name for name in after.sequences if name not in before.sequences]:
+        said.append(f"Trained on {', '.join(new)}, too.")
+    if before.fixed != after.fixed:
+        said.append(f"The fixed set was trial {before.fixed}, is trial {after.fixed}.")
+    (was, was_expected), (now, now_expected) = _driven(before), _driven(after)
+    if was != now:
+        said.append(f"Driven: was {was}, is {now}.")
+    if was_expected != now_expected:
+        said.append(f"Expected before: {was_expected}. Now: {now_expected}.")
+    return said
+
+
+def _driven(model: ErrorModel) -> tuple[str, str]:
+    """What a model drives, and what is expected of it, in words."""
+    way = BANK if model.bank_adapts else ONE_SET if model.paired.adapt else None
+    of = {
+        BANK: f"the bank of trials {', '.join(map(str, model.bank))}",
+        ONE_SET: "one set at a time",
+        None: "the fixed set",
+    }
+    expected = model.expected.get(way) if way else None
+    return of[way], "no gain" if expected is None else expected_in_words(expected)
 
 
 def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:
@@ -264,9 +295,13 @@ def trial_workers(
 
 
 def _fitted(
-    study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict], fixed: int
+    study: OfflineStudy,
+    archive: Archive,
+    verdicts: Mapping[int, Verdict],
+    fixed: int,
+    before: ErrorModel | None,
 ) -> ErrorModel:
-    """The study's error model: as it is stored, if that was fitted to just this, or fitted now."""
+    """The study's error model: the one before, if that was fitted to just this, or fitted now."""
     settings = study.config.offline.model_dump(
         mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
     )
@@ -275,10 +310,6 @@ def _fitted(
     if judged := estimates_as_data(study, study.training):
         provenance |= {"estimated_references": judged}
     provenance |= {"evidence": _evidence(study, archive, verdicts, fixed, provenance)}
-    try:
-        before = ErrorModel.load(study.model_path)
-    except ModelError:
-        before = None
     if before is not None and before.provenance == provenance:
         return before
     model = _fit(study, archive, verdicts, fixed, provenance)

@@ -34,7 +34,6 @@ SLOW = [
     "adaptune/odometry/test_protocol.py",
     "adaptune/recording/test_survey.py",
     "adaptune/recording/test_inspect.py",
-    "offline/test_learn.py",
     "offline/test_resume.py",
     "adaptune/odometry/test_command.py",
     "offline/test_objective.py",

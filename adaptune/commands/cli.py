@@ -26,7 +26,6 @@ app = typer.Typer(
         "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
         "    adaptune reference my.bag              # a reference without ground truth\n\n"
         "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
-        "    adaptune learn    configs/demo.yaml my.bag    # learn from another drive\n\n"
         "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
         "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
@@ -43,7 +42,7 @@ app.add_typer(models, name="model")
 for _command in (
     *(tools.inspect, tools.cache, tools.serve),
     *(offline.simulate, reference.reference),
-    *(offline.offline, offline.learn, offline.trials, offline.validate, offline.oracle),
+    *(offline.offline, offline.trials, offline.validate, offline.oracle),
     *(online.online, online.compare, online.record),
     *(report.report, importing.import_rustle),
 ):

@@ -266,18 +266,6 @@ def n_trials(study: Study, name: str) -> int:
     return len(list((study.folder / "trials" / name).glob("*[0-9].npz")))
 
 
-def trained_recording(study: Study, name: str) -> list[str] | None:
-    """Fingerprints of the recording that the stored trials under a name were run on; None if none.
-
-    Raises
-    ------
-    ConfigurationError
-        If the note beside them is damaged.
-    """
-    note = _read(study, name)
-    return None if note is None else list(note.get("recording") or [])
-
-
 def _other_descriptors(study: Study, name: str) -> bool:
     note, now = _read(study, name), described_by(study)
     known = {} if note is None else note["descriptors"]

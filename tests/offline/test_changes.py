@@ -1,0 +1,31 @@
+"""What `adaptune offline` says of a model that differs from the one before."""
+
+from dataclasses import replace
+
+from random_models import random_model
+
+from adaptune.model import PairedSettings
+from offline.train import changes
+
+EXPECTED = {"geometric": 0.8, "low": 0.7, "high": 0.9, "worst_tenth": 1.1}
+EXPECTED |= {"n_stretches": 12, "n_recordings": 7}
+
+
+def test_nothing_is_said_where_nothing_differs():
+    assert changes(random_model(), random_model()) == []
+
+
+def test_what_differs_is_said():
+    before = replace(random_model(), paired=PairedSettings(adapt=False))
+    after = replace(
+        before,
+        sequences=[*before.sequences, "garden"],
+        fixed=before.sets.trials[-1],
+        paired=PairedSettings(adapt=True),
+        expected={"one_set": EXPECTED},
+    )
+    sequences, fixed, driven, expected = changes(before, after)
+    assert sequences == "Trained on garden, too."
+    assert fixed == f"The fixed set was trial {before.fixed}, is trial {after.fixed}."
+    assert driven == "Driven: was the fixed set, is one set at a time."
+    assert expected.startswith("Expected before: no gain. Now: expected gain 20 %")
