@@ -67,5 +67,8 @@ DELETED = {
     "online.switching.catch_up_scans": _NO_HAND_OVER,
     "online.switching.full_rate": _NO_HAND_OVER,
     "online.switching.stride": _NO_HAND_OVER,
+    "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
+    "offline.target": "is gone; give trials, hours or stagnation",
+    "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
 }
 """Keys of earlier versions that are gone, and what became of them."""

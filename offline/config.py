@@ -74,12 +74,6 @@ def _url(storage: str) -> str:
     return expand(storage)
 
 
-PRESETS: dict[str, dict[str, Any]] = {
-    "paper": {"sampler": "tpe", "trials": 256, "sets": "own", "runs": "whole"}
-}
-"""The values that a preset of the offline stage sets. The study's own values replace them."""
-
-
 class OfflineConfig(StrictModel):
     """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
@@ -89,13 +83,11 @@ class OfflineConfig(StrictModel):
     trials: int | None = Field(None, ge=1, le=10**6)
     hours: float | None = Field(None, gt=0, le=1e5)
     stagnation: int | None = Field(None, ge=1, le=10**6)
-    target: float | None = Field(None, gt=0, le=1e9)
     initial: int = Field(32, ge=1, le=10_000)
     batch: int = Field(16, ge=1, le=1000)
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
     memory: float = Field(4.0, gt=0, le=1e6)
-    max_frames: int | None = Field(None, ge=1, le=10**9)
     storage: Annotated[str, AfterValidator(_url)] | None = None
     objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
         {"rte": 1.0},
@@ -106,7 +98,6 @@ class OfflineConfig(StrictModel):
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Annotated[Literal["none", "wilcoxon"], BeforeValidator(_rule)] = "none"
-    preset: Literal["paper"] | None = None
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:
@@ -125,12 +116,6 @@ class OfflineConfig(StrictModel):
             raise ValueError(f"baseline_runs must be {self.repeats} (repeats) or more")
         return self
 
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_in(cls, given: Any) -> Any:
-        preset = PRESETS.get(str(given.get("preset")), {}) if isinstance(given, dict) else {}
-        return preset | given if preset else given
-
     @field_serializer("storage")
     def _hide_password(self, storage: str | None) -> str | None:
         return storage and re.sub(r"(://[^:/@]*):[^@]*@", r"\1@", storage)
@@ -143,7 +128,7 @@ class OfflineConfig(StrictModel):
     @property
     def budgeted(self) -> bool:
         """Whether the study sets a budget."""
-        return any((self.trials, self.hours, self.stagnation, self.target))
+        return any((self.trials, self.hours, self.stagnation))
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """Find mistakes in the sampler and its settings."""

@@ -340,8 +340,8 @@ def check_grid(
     if not bounded and grid.size > LARGEST:
         yield Mistake(
             ("grid",),
-            f"has {grid.size:,} points, and the study sets no budget; give offline.trials, hours, "
-            f"stagnation or target, or a coarser grid (up to {LARGEST:,} points)",
+            f"has {grid.size:,} points, and the study sets no budget; give offline.trials, hours "
+            f"or stagnation, or a coarser grid (up to {LARGEST:,} points)",
         )
     elif grid.size >= 2**62:
         yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")

@@ -145,15 +145,16 @@ class RandomSampler(Sampler):
         tried = Tried(result.parameters for result in history)
         sets: list[ParameterSet] = []
         for number in numbers:
-            point: ParameterSet | None = self._point(number)
-            if point in tried:
-                rng = np.random.default_rng((self.config.seed, number, 1))
-                point = tried.another(self.space, rng)
+            drawn = self._point(number)
+            point = drawn if drawn not in tried else tried.another(self.space, self._rng(number))
             if point is None:
                 break
             tried.add(point)
             sets.append(point)
         return sets
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.default_rng((self.config.seed, number, 1))
 
     def _point(self, number: int) -> ParameterSet:
         if number == 0:

@@ -88,7 +88,7 @@ def estimate(values: Values, baseline: Values) -> float:
 
 TRIALS = 64
 """Trials of a search without a budget."""
-BUDGETS = ("trials", "hours", "stagnation", "target")
+BUDGETS = ("trials", "hours", "stagnation")
 """Settings that may change when a study is resumed."""
 
 
@@ -129,10 +129,6 @@ def spent(
         return f"{hours:.2f} hours have passed"
     if not verdicts:
         return None
-    if config.target is not None and (
-        verdicts[best].feasible and verdicts[best].values[0] <= config.target
-    ):
-        return f"trial {number} has reached the target of {config.target:g}"
     since = len(verdicts) - 1 - best
     if config.stagnation is not None and since >= config.stagnation:
         return f"none of {since} trials was better than trial {number}"
@@ -159,7 +155,7 @@ def all_done(config: OfflineConfig, folder: Path, numbers: Iterable[int]) -> boo
         return False
     if limit is None or config.sampler == "grid":
         return True
-    if any((config.hours, config.stagnation, config.target)):
+    if config.hours or config.stagnation:
         return True
     # Every search shares trial 0.
     searches = Counter(n // OF_SLOT for n in numbers if n)

@@ -376,8 +376,7 @@ def _fit(
     )
     length = study.config.sub_trajectory
     model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
-    model = tuned(model, data, study.config.online.switching)
-    return model.thinned(study.config.offline.max_frames)
+    return tuned(model, data, study.config.online.switching)
 
 
 def _trial_rows(

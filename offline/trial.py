@@ -568,7 +568,8 @@ def _trial(
     T_steps = steps(T_odom_sensor)
     for i, T_step in run.lost_steps.items():
         T_steps[i - 1] = T_step
-    apart = run.usage.seconds
+    if (apart := run.usage.seconds) is not None:
+        run.seconds[:] = apart
     driven = run if isinstance(run, DrivenRun) else None
     return Trial(
         parameters,
@@ -576,7 +577,7 @@ def _trial(
         sub_trajectory_rte(T_ref_sensor, T_odom_sensor, length, run.restarted),
         run.restarted,
         run.registered,
-        run.seconds if apart is None else apart,
+        run.seconds,
         run.faults,
         trajectory_metrics(frames, T_odom_sensor, run.lost_steps),
         _usage(scans, run),

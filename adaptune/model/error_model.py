@@ -330,44 +330,6 @@ class ErrorModel:
         spending = Spending(self.costs, self.budget)
         return tuple(t for t in self.sets if t == self.fixed or spending.allows([t]))
 
-    def thinned(self, max_frames: int | None) -> Self:
-        """Keep fewer frames, so that a selection costs less.
-
-        Each stretch keeps its share, at least one frame, evenly in time: so mean errors stay what
-        they are. (Frames that cover what all of them look like would be rare ones.) The paired rule
-        and the bank then use as much fewer near frames.
-
-        Parameters
-        ----------
-        max_frames
-            Number of frames over all sequences, but one of each stretch at least; all if None.
-        """
-        n_frames = len(self.sequence)
-        if max_frames is None or n_frames <= max_frames:
-            return self
-        kept = []
-        number = stretch_numbers(self.sequence, self.stretch)
-        for s in np.unique(number):
-            members = np.flatnonzero(number == s)
-            share = max(1, max_frames * len(members) // n_frames)
-            kept.append(members[(2 * np.arange(share) + 1) * len(members) // (2 * share)])
-        frames = np.sort(np.concatenate(kept))
-        share_kept = len(frames) / n_frames
-
-        def fewer(n_near: int) -> dict[str, int]:
-            return {"n_frames": max(1, round(n_near * share_kept))}
-
-        return replace(
-            self,
-            paired=self.paired.model_copy(update=fewer(self.paired.n_frames)),
-            bank_settings=self.bank_settings.model_copy(update=fewer(self.bank_settings.n_frames)),
-            descriptors=self.descriptors[frames],
-            sequence=self.sequence[frames],
-            stretch=self.stretch[frames],
-            errors=self.errors[frames],
-            vectors=self.vectors[frames] if self.bank else self.vectors,
-        )
-
     def trial(self, named: int | ParameterSet) -> int | None:
         """Trial number of a set that is named by it, or by its values that are not the baseline's.
 

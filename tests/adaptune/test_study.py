@@ -115,7 +115,6 @@ def test_reads_a_study(study_file, tmp_path):
         ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
         ("offline.hours=0", ["offline.hours", "not 0"]),
         ("offline.stagnation=0", ["offline.stagnation", "not 0"]),
-        ("offline.target=-1", ["offline.target", "not -1"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("offline.trials=0", ["offline.trials", "not 0"]),
         ("online.rules=[best]", ["online.rules.0", "best"]),

@@ -192,13 +192,6 @@ def test_a_view_that_cannot_be_is_told(study_file, tmp_path):
         train(study)
 
 
-def test_the_preset_of_the_paper(study_file):
-    offline = load_study(study_file, ["offline={preset: paper, trials: 9}"]).config.offline
-    assert (offline.runs, offline.sampler, offline.trials) == ("whole", "tpe", 9)
-    assert offline.sets == "own"
-    assert load_study(study_file, ["offline={preset: paper}"]).config.offline.trials == 256
-
-
 def test_what_the_only_task_raises_is_told(study_file, tmp_path):
     changed = ["training=[one]", "descriptor=[ndt, intensity]", "offline.batch=1"]
     study = load_study(study_file, [*changed, "offline.initial=1"], tmp_path / "study")

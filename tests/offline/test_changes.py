@@ -5,6 +5,7 @@ from dataclasses import replace
 from random_models import random_model
 
 from adaptune.model import PairedSettings
+from adaptune.study.study import ONE_SET
 from offline.train import changes
 
 EXPECTED = {"geometric": 0.8, "low": 0.7, "high": 0.9, "worst_tenth": 1.1}
@@ -16,13 +17,13 @@ def test_nothing_is_said_where_nothing_differs():
 
 
 def test_what_differs_is_said():
-    before = replace(random_model(), paired=PairedSettings(adapt=False))
+    before = replace(random_model(), bank=[], paired=PairedSettings(adapt=False))
     after = replace(
         before,
         sequences=[*before.sequences, "garden"],
         fixed=before.sets.trials[-1],
         paired=PairedSettings(adapt=True),
-        expected={"one_set": EXPECTED},
+        expected={ONE_SET: EXPECTED},
     )
     sequences, fixed, driven, expected = changes(before, after)
     assert sequences == "Trained on garden, too."

@@ -188,12 +188,10 @@ def test_sequences_are_added_and_removed(study_of, sampler, kind):
 
 
 def test_a_search_that_is_over_waits_for_the_others(study_of):
-    study = study_of(sets="own", target=1.2, trials=60)
+    study = study_of(sets="own", stagnation=12, trials=60)
     verdicts, seen, archive = run(study)
     n = {name: sum(owner_of(archive, k) == name for k in seen) for name in NAMES}
-    # The third is never below 2.
-    assert n["three"] == 59
-    assert max(n["one"], n["two"]) < 59
+    assert len(set(n.values())) > 1
     assert list(verdicts) == list(seen)
 
 

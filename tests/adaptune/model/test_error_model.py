@@ -12,7 +12,7 @@ from model_files import assert_same, refused, rewrite, saved
 from random_models import random_model
 from safetensors.numpy import save_file
 
-from adaptune.model import RULES, BankSettings, ErrorModel, ModelError, make_rule
+from adaptune.model import RULES, ErrorModel, ModelError, make_rule
 from adaptune.model.error_model import FORMAT
 
 
@@ -33,36 +33,6 @@ def test_views_are_of_one_place():
     np.testing.assert_array_equal(data.vectors, model.vectors[:, ::-1])
     apart = random_model()
     assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
-
-
-@given(st.integers(1, 60), st.integers(1, 60), st.integers(1, 70))
-def test_frames_that_are_kept_lie_evenly_in_time(n, m, most):
-    model = dataclasses.replace(
-        random_model(n_frames=n + m),
-        sequence=np.repeat([0, 1], [n, m]),
-        errors=np.tile(np.arange(n + m, dtype=np.float32)[:, None], 6),
-    )
-    assert model.thinned(None) is model
-    few = model.thinned(most)
-    few.check()
-    kept = few.errors[:, 0].astype(int)
-    near = max(1, round(300 * len(kept) / (n + m)))
-    assert few.paired == model.paired.model_copy(update={"n_frames": near})
-    settings = BankSettings(n_frames=1000)
-    wide = dataclasses.replace(model, bank_settings=settings).thinned(most)
-    if wide is not model and len(kept) < n + m:
-        assert wide.bank_settings.n_frames == max(1, round(1000 * len(kept) / (n + m)))
-    np.testing.assert_array_equal(few.sequence, model.sequence[kept])
-    np.testing.assert_array_equal(few.descriptors, model.descriptors[kept])
-    if most >= n + m:
-        assert few is model
-        return
-    for s, length in enumerate((n, m)):
-        share = max(1, most * length // (n + m))
-        own = kept[few.sequence == s] - s * n
-        assert len(own) == share
-        gaps = np.diff([-own[0] - 1, *own, 2 * length - own[-1]])
-        assert gaps.max() - gaps.min() <= 2
 
 
 def test_a_model_survives_bit_for_bit(tmp_path):
