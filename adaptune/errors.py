@@ -69,6 +69,7 @@ DELETED = {
     "online.switching.stride": _NO_HAND_OVER,
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
+    "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
 }
 """Keys of earlier versions that are gone, and what became of them."""

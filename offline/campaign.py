@@ -17,7 +17,7 @@ from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
 from offline.search import Clock, Finished, Search, assess, make_searches, rungs
-from offline.storage import MirrorRow, open_mirror
+from offline.storage import Mirror, MirrorRow
 from offline.workers import Pool, Task, TaskProgress, TaskResult, run
 
 Progress = Callable[[str, float, int, str], None]
@@ -56,8 +56,8 @@ class _Campaign:
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
         self._searches = make_searches(self._config, study.odometry.space, self._names, archive)
-        known = archive.sets()
-        self._mirror = open_mirror(study.folder, self._config, study.odometry.space, known)
+        n_objectives = len(self._config.objective)
+        self._mirror = Mirror(study.folder, n_objectives, study.odometry.space)
         described = study.config.descriptor.names
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)

@@ -1,14 +1,13 @@
 """The configuration of a study with the settings of the offline stage."""
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, field_serializer, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from adaptune.errors import nearest
-from adaptune.recording.config import MOST_VIEWS, ViewConfig, expand
+from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import ParameterSpace
 from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
@@ -68,12 +67,6 @@ def _runs(runs: Any) -> Any:
     return runs
 
 
-def _url(storage: str) -> str:
-    if "://" not in storage:
-        raise ValueError("give the URL of a database, as postgresql://user@host/database")
-    return expand(storage)
-
-
 class OfflineConfig(StrictModel):
     """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
@@ -88,7 +81,6 @@ class OfflineConfig(StrictModel):
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
     memory: float = Field(4.0, gt=0, le=1e6)
-    storage: Annotated[str, AfterValidator(_url)] | None = None
     objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
         {"rte": 1.0},
     )
@@ -115,10 +107,6 @@ class OfflineConfig(StrictModel):
         if self.baseline_runs is not None and self.baseline_runs < self.repeats:
             raise ValueError(f"baseline_runs must be {self.repeats} (repeats) or more")
         return self
-
-    @field_serializer("storage")
-    def _hide_password(self, storage: str | None) -> str | None:
-        return storage and re.sub(r"(://[^:/@]*):[^@]*@", r"\1@", storage)
 
     @property
     def metrics(self) -> set[str]:

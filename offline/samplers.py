@@ -516,7 +516,7 @@ class HostedSampler(Sampler):
         self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
         self._about = {
             "space": space.dump(),
-            "config": config.model_dump(mode="json", exclude={"storage"}),
+            "config": config.model_dump(mode="json"),
         }
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:

@@ -302,9 +302,7 @@ def _fitted(
     before: ErrorModel | None,
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
-    settings = study.config.offline.model_dump(
-        mode="json", exclude={*BUDGETS, "workers", "memory", "storage"}
-    )
+    settings = study.config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers", "memory"})
     provenance = {"versions": study.odometry.versions} | settings
     provenance |= {"inputs": digest(study)}
     if judged := estimates_as_data(study, study.training):

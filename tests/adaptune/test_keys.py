@@ -17,7 +17,7 @@ HEAVY = ("scipy", "numba", "open3d", "optuna", "matplotlib", "rosbags", "sklearn
     [
         ("offline.tr", ["offline.trials="]),
         ("online.switching.c", ["online.switching.cores="]),
-        ("offline.sets=", ["offline.sets=shared", "offline.sets=own", "offline.sets=both"]),
+        ("offline.sets=", ["offline.sets=shared", "offline.sets=own"]),
         ("online.switching.mechanism=l", ["online.switching.mechanism=live"]),
         ("offline.trials=", []),
         ("offline.sampler=gr", ["offline.sampler=grid"]),

@@ -7,8 +7,6 @@ import sys
 import time
 
 import kills
-import optuna
-import postgres
 import pytest
 from setups import setup_of
 
@@ -97,15 +95,10 @@ def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler, monk
 
 
 def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, workers, local):
-    """On three worker processes, with a real PostgreSQL."""
+    """On three worker processes."""
     assert len(workers) == 3
-    with postgres.running() as (_, template):
-        url = template.format("postgres")
-        study = load_study(study_file, [f"offline.storage={url}"], tmp_path / "study")
-        train(study, cluster=scheduler[0])
-        storage = url.replace("://", "+pg8000://")
-        mirror = optuna.load_study(study_name="study", storage=storage)
-        assert [t.user_attrs["adaptune trial"] for t in mirror.trials] == list(range(10))
+    study = load_study(study_file, [], tmp_path / "study")
+    train(study, cluster=scheduler[0])
     assert kills.contents(study.folder) == local
 
 
