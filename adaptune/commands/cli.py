@@ -32,7 +32,7 @@ app = typer.Typer(
         "    adaptune oracle   configs/demo.yaml    # what was there to gain, in hindsight?\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
         "    adaptune report   configs/demo.yaml    # all of it as a page to look at\n\n"
-        "    adaptune record   configs/demo.yaml    # replays to look at in Rerun or Foxglove"
+        "    adaptune record   configs/demo.yaml    # replays to look at in Foxglove or Rerun"
     ),
 )
 

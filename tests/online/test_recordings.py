@@ -1,35 +1,27 @@
 """Replays as recordings to look at."""
 
-import csv
-import errno
 import re
 import resource
-import sys
 from contextlib import contextmanager
 
 import drives
 import numpy as np
-import pyarrow.parquet
 import pytest
 from commands import call
 from rosbags.highlevel import AnyReader
 
-from adaptune.errors import import_extra
 from adaptune.geometry import invert
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
 from online.record import ReplayIdentity, StoredReplayError, write_reference, write_replay
-from online.recordings import clouds, gather, topic
+from online.recordings import record_replays, topic
 from online.replay import Choice, RealTimeRecord, Replay
-from online.rerun_recording import record_replays
 from online.run import shared_identity
 
 N = 40
 STAMPS = drives.FIRST_STAMP + np.arange(N) * 100_000_000
-ALL = ["rerun", "mcap", "parquet"]
 FIXED = {"max_correspondence_distance": 2.5, "kernel": "huber"}
 
 
@@ -118,7 +110,7 @@ def numbers(found, name):
 
 
 def test_an_mcap_holds_what_foxglove_shows(study):
-    (file,) = record_replays(study, "three", ["mcap"])
+    file = record_replays(study, "three")
     assert file == study.folder / "recordings/three/three.mcap"
     found = messages(file.parent)
     assert [len(found[name]) for name in ("/points", "/tf", "/adaptive/odometry")] == [4, N, N]
@@ -148,7 +140,7 @@ def test_an_mcap_holds_what_foxglove_shows(study):
 
 
 def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
-    record_replays(study, "three", ["mcap"])
+    record_replays(study, "three")
     found = messages(study.folder / "recordings/three")
     made, end = STAMPS[::10].tolist(), int(STAMPS[-1])
     assert numbers(found, "/adaptive/predicted_error") == (made, [0.7] * 4)
@@ -180,118 +172,21 @@ def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
 
 def test_topics_have_names_that_ros_allows():
     assert topic("adaptive", "parameters", "ndt.max-range") == "/adaptive/parameters/ndt_max_range"
-    assert topic("adaptive", "errors", "true_error") == "/adaptive/true_error"
-
-
-def chunks(path):
-    """Rows of an ``.rrd`` by entity and component, without the times of logging."""
-    try:
-        from rerun.chunk import RrdReader
-
-        found = RrdReader(path).store().stream().to_chunks()
-    except ImportError:  # before 0.32
-        from rerun.recording import load_recording
-
-        found = load_recording(path).chunks()
-    columns = {}
-    for chunk in found:
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if not name.startswith("rerun.controls"):
-                key = chunk.entity_path, name, chunk.is_static
-                columns.setdefault(key, []).extend(batch.column(name).to_pylist())
-    return columns
-
-
-def test_a_rerun_file_holds_all_of_it(study):
-    (file,) = record_replays(study, "three", ["rerun"])
-    assert file == study.folder / "recordings/three.rrd"
-    found = chunks(file)
-    assert not any(name in ("log_time", "log_tick") for _, name, _ in found)
-    at = "/errors/adaptive/estimated_error"
-    assert found[at, "Scalars:scalars", False] == [[2.0], [3.0], [4.0]]
-    stamps = [int(time.value) for time in as_arrow(found[at, "stamp", False])]
-    assert stamps == STAMPS[10::10].tolist()
-    assert found[at, "SeriesLines:names", True] == [["adaptive estimated_error"]]
-    assert found["/words/adaptive/kernel", "TextLog:text", False] == [["none"], ["huber"]] * 2
-    for entity, n in {
-        "/parameters/adaptive/max_correspondence_distance": 5,
-        "/weights/adaptive/5": 5,
-        "/milliseconds/adaptive/late_ms": N,
-        "/health/fixed/restarted": N,
-        "/errors/adaptive/predicted_fixed_error": 4,
-    }.items():
-        assert len(found[entity, "Scalars:scalars", False]) == n, entity
-    for mode in ("baseline", "fixed", "adaptive", "reference"):
-        ((path,),) = found[f"/world/{mode}", "LineStrips3D:strips", True]
-        assert len(path) == N
-    scans = {scan.stamp: scan for scan in study.sequences.open("three")}
-    placed = found["/world/scan", "Points3D:positions", False]
-    for stamp, points in zip(STAMPS[::10], placed, strict=True):
-        moved = scans[stamp].points + gather(study, "three").modes["adaptive"].trajectory.at(
-            np.array([stamp])
-        )[0, :3, 3].astype(np.float32)
-        np.testing.assert_allclose(points, moved, atol=1e-5)
-
-
-def as_arrow(values):
-    return pyarrow.array(values, pyarrow.timestamp("ns")) if values else []
 
 
 def test_recordings_are_the_same_again_and_replays_stay(study):
     before = {p: p.read_bytes() for p in (study.folder / "replays").rglob("*") if p.is_file()}
-    first = [path.read_bytes() for path in record_replays(study, "three", ["mcap", "parquet"])]
-    (rerun,) = record_replays(study, "three", ["rerun"])
-    held = chunks(rerun)
-    # Over those that are there, and all of them in one go.
-    written = record_replays(study, "three", ALL)
-    again = [path.read_bytes() for path in written if path.suffix != ".rrd"]
-    assert again[-1:] + again[:-1] == first[-1:] + first[:-1]
-    assert chunks(rerun) == held
+    first = record_replays(study, "three").read_bytes()
+    assert record_replays(study, "three").read_bytes() == first  # over the one that is there
     after = {p: p.read_bytes() for p in (study.folder / "replays").rglob("*") if p.is_file()}
     assert after == before
-
-
-def test_parquet_equals_csv(study):
-    files = record_replays(study, "three", ["parquet"])
-    assert [file.name for file in files[-2:]] == [
-        "three_adaptive_selections.parquet",
-        "three_adaptive_frames.parquet",
-    ]
-    for file in files:
-        _, mode, name = file.stem.split("_")
-        with (study.folder / "replays/three" / mode / f"{name}.csv").open() as read:
-            names, *rows = csv.reader(read)
-        table = pyarrow.parquet.read_table(file)
-        assert table.column_names == names
-        assert table.num_rows == len(rows)
-        for of, row in zip(rows, table.to_pylist(), strict=True):
-            for text, value in zip(of, row.values(), strict=True):
-                if isinstance(value, list):
-                    assert text == " ".join(f"{k}:{v:.3f}" for k, v in value)
-                elif value is None or isinstance(value, str):
-                    assert text == (value or "")
-                else:
-                    assert float(value) == pytest.approx(float(text), nan_ok=True, rel=1e-15)
-    types = {f.name: str(f.type) for f in pyarrow.parquet.read_schema(files[-2])}
-    assert (types["stamp_ns"], types["trial"], types["ms"]) == ("int64", "int64", "double")
-    assert (types["lost"], types["kernel"]) == ("bool", "string")
-    assert types["weights"].startswith("map<int64, double")
-    # A table without rows has the same types.
-    empty = {f.name: str(f.type) for f in pyarrow.parquet.read_schema(files[0])}
-    assert empty.items() <= types.items()
 
 
 def test_the_command_says_what_it_wrote(study, study_file):
     done = command(study, study_file)
     assert done.exit_code == 0, done.stderr
-    folder = study.folder / "recordings"
-    for name in ("three.rrd", "three/three.mcap", "three_fixed_frames.parquet"):
-        assert (folder / name).stat().st_size > 0
-        assert f"{folder / name} (" in done.stdout
-    assert done.stdout.splitlines()[-1] == f"Next: rerun {folder / 'three.rrd'}    # look at it"
-    assert f"`Open local file`, and {folder / 'three/three.mcap'}" in done.stdout
-    assert command(study, study_file, "three", "--to", "mcap", "--to", "parquet").exit_code == 0
+    assert f"{study.folder / 'recordings/three/three.mcap'} (" in done.stdout
+    assert command(study, study_file, "three").exit_code == 0
 
 
 @contextmanager
@@ -304,35 +199,21 @@ def files_of_at_most(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.parametrize("format_", ["rerun", "mcap"])
 @pytest.mark.parametrize("size", [1_000, 100_000])
-def test_a_full_disk_leaves_nothing_half_written(study, study_file, format_, size):
+def test_a_full_disk_leaves_nothing_half_written(study, study_file, size):
     list(study.sequences.open("three"))  # which is in the cache then
     for earlier in (False, True):
         if earlier:
-            assert command(study, study_file, "--to", format_).exit_code == 0
+            assert command(study, study_file).exit_code == 0
         before = left(study)
         with files_of_at_most(size):
-            done = command(study, study_file, "--to", format_)
+            done = command(study, study_file)
         assert done.exit_code == 2
-        name = "three.rrd" if format_ == "rerun" else "three"
         (line,) = done.stderr.strip().splitlines()
-        assert line.startswith(f"error: {study.folder / 'recordings' / name}: cannot be written (")
+        assert line.startswith(f"error: {study.folder / 'recordings/three'}: cannot be written (")
         assert line.endswith("; make room, and run the same command again")
         assert left(study) == before
         assert not [p for p in (study.folder / "recordings").iterdir() if p.name.startswith(".")]
-
-
-def test_a_disk_that_is_full_for_a_table(study, study_file, monkeypatch):
-    def fail(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    before = left(study)
-    monkeypatch.setattr(pyarrow.parquet, "write_table", fail)
-    done = command(study, study_file, "--to", "parquet")
-    assert done.exit_code == 2
-    assert "three_baseline_selections.parquet: cannot be written (No space" in done.stderr
-    assert left(study) == before
 
 
 def test_ctrl_c_leaves_nothing_half_written(study):
@@ -342,26 +223,9 @@ def test_ctrl_c_leaves_nothing_half_written(study):
 
     before = left(study)
     with pytest.raises(KeyboardInterrupt):
-        record_replays(study, "three", ["rerun", "mcap"], interrupt)
+        record_replays(study, "three", interrupt)
     assert left(study) == before
     assert list((study.folder / "recordings").iterdir()) == []
-
-
-@pytest.mark.parametrize(("format_", "package"), [("rerun", "rerun"), ("parquet", "pyarrow")])
-def test_a_package_that_is_missing_is_named(study, study_file, monkeypatch, format_, package):
-    import_extra.cache_clear()
-    monkeypatch.setitem(sys.modules, package, None)
-    before = left(study)
-    done = command(study, study_file, "--to", format_)
-    assert done.exit_code == 2
-    assert f"run `pip install 'adaptune[{format_}]'`" in done.stderr
-    assert left(study) == before
-    done = command(study, study_file)
-    assert done.exit_code == 0, done.stderr
-    assert f"Not written: {format_}; `pip install 'adaptune[{format_}]'` adds it" in done.stdout
-    suffixes = {".rrd", ".parquet"} - {{"rerun": ".rrd"}.get(format_, ".parquet")}
-    written = {p.suffix for p in (study.folder / "recordings").iterdir() if p.is_file()}
-    assert written == suffixes
 
 
 def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_path):
@@ -380,14 +244,19 @@ def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_pat
 def test_replays_of_something_else_are_refused(study, study_file):
     other = load_study(study_file, ["sequences.three.stop=2"], study.folder)
     with pytest.raises(StoredReplayError, match="was replayed with another sequence; run"):
-        gather(other, "three")
+        record_replays(other, "three")
     other = load_study(study_file, ["sequences.three.reference=none"], study.folder)
     with pytest.raises(StoredReplayError, match="was judged by another reference; run"):
-        gather(other, "three")
+        record_replays(other, "three")
     path = study.folder / "replays/three/adaptive/selections.csv"
     path.write_text(path.read_text().replace("0.7000", "many"))
     with pytest.raises(StoredReplayError, match=r"selections\.csv: is damaged"):
-        gather(study, "three")
+        record_replays(study, "three")
+
+
+def positions(path):
+    ((_, message),) = path
+    return np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
 
 
 def test_all_begin_where_they_first_overlap_the_reference(study):
@@ -395,31 +264,28 @@ def test_all_begin_where_they_first_overlap_the_reference(study):
     truth = along_x()
     late = Trajectory(STAMPS[10:], truth.T_world_sensor[10:])
     write_reference(folder, late, truth, study.sequences.reference("three"))
-    replays = gather(study, "three")
-    np.testing.assert_allclose(replays.reference.T_world_sensor[0], np.eye(4), atol=1e-9)
-    placed = replays.modes["baseline"].trajectory.T_world_sensor
-    np.testing.assert_allclose(placed[10], np.eye(4), atol=1e-9)
+    found = messages(record_replays(study, "three").parent)
+    np.testing.assert_allclose(positions(found["/reference/path"])[0], 0.0, atol=1e-9)
     own = along_x(0.02).T_world_sensor
-    np.testing.assert_allclose(placed, invert(own[10]) @ own, atol=1e-8)
+    placed = (invert(own[10]) @ own)[:, :2, 3]
+    np.testing.assert_allclose(positions(found["/baseline/path"]), placed, atol=1e-8)
     write_reference(folder, None, truth, study.sequences.reference("three"))
-    without = gather(study, "three")
-    assert without.reference is None
-    assert "true_error" not in without.modes["baseline"].series["errors"]
-    np.testing.assert_allclose(without.modes["fixed"].trajectory.T_world_sensor[0], np.eye(4))
+    without = messages(record_replays(study, "three").parent)
+    assert not {"/reference/path", "/baseline/true_error"} & set(without)
+    np.testing.assert_allclose(positions(without["/fixed/path"])[0], 0.0, atol=1e-9)
 
 
-def test_clouds_are_thinned_and_have_a_pose(monkeypatch):
+def test_clouds_are_thinned_and_have_a_pose(study, monkeypatch):
     monkeypatch.setattr("online.recordings.MAX_POINTS", 100)
-    rng = np.random.default_rng(1)
-    scans = [Scan(int(s), rng.normal(size=(500, 3)).astype(np.float32)) for s in STAMPS]
-    seen = []
-    made = list(clouds(scans, along_x(), lambda: seen.append(1)))
-    assert len(seen) == N
-    assert [cloud.stamp for cloud in made] == STAMPS[::10].tolist()
-    for cloud, scan in zip(made, scans[::10], strict=True):
-        assert cloud.points.shape == (100, 3)
-        same = (scan.points[:, None] == cloud.points).all(axis=2)
-        assert (np.diff(same.argmax(axis=0)) > 0).all()
     # No pose, no cloud: the second second is beyond the path.
     short = Trajectory(STAMPS[:10], along_x().T_world_sensor[:10])
-    assert len(list(clouds(scans, short))) == 1
+    monkeypatch.setattr("online.recordings._placed", lambda *_: short)
+    seen = []
+    found = messages(record_replays(study, "three", lambda *call: seen.append(call)).parent)
+    assert [call[1] for call in seen] == [*range(1, N + 1), N]
+    ((stamp, cloud),) = found["/points"]
+    points = cloud.data.view("<f4").reshape(-1, 3)
+    (scan,) = [s for s in study.sequences.open("three") if s.stamp == stamp]
+    same = (scan.points[:, None] == points).all(axis=2)
+    assert points.shape == (100, 3)
+    assert (np.diff(same.argmax(axis=0)) > 0).all()
