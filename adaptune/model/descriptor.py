@@ -68,12 +68,10 @@ ENTRY_POINTS = "adaptune.descriptors"
 
 DESCRIPTORS = {
     "ndt": "adaptune.model.ndt:describe",
-    "ring_heights": "adaptune.model.polar:ring_heights",
-    "range_image": "adaptune.model.polar:range_image",
-    "fpfh": "adaptune.model.fpfh:fpfh",
-    "intensity": "adaptune.model.intensity:intensity",
     MOTION: "adaptune.model.descriptor:unknown",
 }
+GONE = ("ring_heights", "range_image", "fpfh", "intensity")
+"""Descriptors of earlier versions, which did no better than `ndt`."""
 
 
 class DescriptorError(AdaptuneError):
@@ -91,6 +89,8 @@ def where(name: str) -> str:
     `name` is one of `DESCRIPTORS`, one that an installed package announces in the entry-point group
     ``adaptune.descriptors``, or ``module:function``; else there is a DescriptorError.
     """
+    if name in GONE:
+        raise DescriptorError(f"{name} is gone, for it did no better; choose ndt or motion")
     try:
         return plugins.path_of(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
     except plugins.PluginError as error:

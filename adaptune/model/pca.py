@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
+from sklearn.utils.validation import check_is_fitted, validate_data
 
 
 class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -30,7 +31,7 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def fit(self, X: NDArray[np.floating], y: Any = None) -> Self:  # noqa: ARG002
         """Learn from descriptors of shape (n_scans, n_features)."""
-        X = np.asarray(X, np.float64)
+        X = validate_data(self, X, dtype=np.float64)
         ends = np.cumsum(X.shape[1:] if self.blocks is None else self.blocks)
         self.mean_ = np.empty(X.shape[1])
         components, scales = [], []
@@ -51,4 +52,6 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def transform(self, X: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map descriptors to shape (n_scans, n_components)."""
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
         return np.asarray((X - self.mean_) @ self.components_.T / self.scale_)

@@ -190,10 +190,3 @@ def test_a_view_that_cannot_be_is_told(study_file, tmp_path):
     study = load_study(study_file, ["offline.augment=[{rings: 2}]"], tmp_path / "study")
     with pytest.raises(AdaptuneError, match=r"its points have no ring"):
         train(study)
-
-
-def test_what_the_only_task_raises_is_told(study_file, tmp_path):
-    changed = ["training=[one]", "descriptor=[ndt, intensity]", "offline.batch=1"]
-    study = load_study(study_file, [*changed, "offline.initial=1"], tmp_path / "study")
-    with pytest.raises(AdaptuneError, match=r"sequences\.one: the points of scan .* no intensity"):
-        train(study)

@@ -46,9 +46,11 @@ def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_p
     assert frames.descriptors[:, :90].any()
 
 
-def test_what_cannot_be_described_names_the_sequence(study_file, tmp_path):
-    study = load_study(study_file, ["descriptor=[ndt, intensity]"], tmp_path)
-    with pytest.raises(AdaptuneError, match=r"sequences.one: the points of .* no intensity"):
+def test_what_cannot_be_described_names_the_sequence(study_file, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text("def unknown(scan):\n    return [float('nan')]\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    study = load_study(study_file, ["descriptor=[ndt, 'mine:unknown']"], tmp_path)
+    with pytest.raises(AdaptuneError, match=r"sequences.one: mine:unknown: described .* by NaN"):
         setup_of(study).prepare("one", 1e9)
 
 

@@ -18,7 +18,7 @@ from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
 from online.compare import compare
 from online.record import StoredReplay, StoredReplayError
-from online.run import ReplayError, run_replays, warn_of_scant_evidence
+from online.run import run_replays, warn_of_scant_evidence
 from online.statistics import ComparisonRow, Reference
 from online.verdict import remarks
 
@@ -91,19 +91,6 @@ def test_values_that_stay_read_as_those_that_change(own):
     path.write_text(json.dumps(about))
     choices = StoredReplay.read(path.parent).choices
     assert choices == {"mode": ["True"], "size": [3.0], "kernel": ["none"]}
-
-
-def test_what_cannot_be_described_names_the_sequence(trained, tmp_path):
-    model = ErrorModel.load(trained.folder / "model.safetensors")
-    lit = np.zeros((len(model.descriptors), 29), np.float32)
-    model = replace(
-        model,
-        blocks=model.blocks | {"intensity": 29},
-        descriptors=np.hstack([model.descriptors, lit]),
-    )
-    model.save(tmp_path / "lit.safetensors")
-    with pytest.raises(ReplayError, match=r"sequences\.three: the points of scan .* no intens"):
-        run_replays(trained, tmp_path / "lit.safetensors", again=True)
 
 
 @pytest.mark.parametrize("mechanism", ["live", "bank"])

@@ -9,7 +9,6 @@ import turns
 
 from adaptune.model.descriptor import (
     DESCRIPTORS,
-    MOTION,
     Describer,
     DescriptorError,
     averaged,
@@ -20,11 +19,6 @@ from adaptune.model.ndt import ndt_histogram
 from adaptune.recording import Scan
 
 EMPTY = Scan(0, np.empty((0, 3), np.float32))
-
-
-def lit(points):
-    """A scan of what reflects the more the higher it is."""
-    return Scan(0, points, intensities=100.0 + points[:, 2])
 
 
 MINE = """
@@ -58,12 +52,7 @@ def mine(tmp_path, monkeypatch):
 def test_every_descriptor_describes_any_scan_by_as_many_numbers(name):
     describe = Describer([name])
     sizes = set()
-    for scan in (
-        EMPTY,
-        lit(turns.turn(0).points),
-        lit(turns.turn(0).points[:1]),
-        lit(turns.turn(1).points),
-    ):
+    for scan in (EMPTY, turns.turn(0), Scan(0, turns.turn(0).points[:1]), turns.turn(1)):
         described = describe(scan)
         assert described.dtype == np.float32
         assert np.isfinite(described).all()
@@ -71,13 +60,12 @@ def test_every_descriptor_describes_any_scan_by_as_many_numbers(name):
     assert sizes == {(describe.blocks[name],)}
 
 
-@pytest.mark.parametrize("name", [name for name in DESCRIPTORS if name != MOTION])
-def test_every_descriptor_tells_places_apart_and_not_headings(name):
-    describe = Describer([name])
+def test_it_tells_places_apart_and_not_headings():
+    describe = Describer(["ndt"])
     here, there = turns.turn(0).points, turns.turn(40).points
     # The street's end, and the same place faced backwards: columns of rays stay where they were.
     turned = here * np.array([-1, -1, 1], np.float32)
-    one, other, again = (describe(lit(points)) for points in (here, there, turned))
+    one, other, again = (describe(Scan(0, points)) for points in (here, there, turned))
     assert np.linalg.norm(one - again) < 0.3 * np.linalg.norm(one - other)
 
 
@@ -99,6 +87,7 @@ def test_descriptors_of_other_packages(monkeypatch):
     ("name", "message"),
     [
         ("ntd", "there is no descriptor 'ntd': did you mean 'ndt'.*module:function"),
+        ("fpfh", "fpfh is gone, .* choose ndt or motion"),
         ("no_such_module:f", "cannot import no_such_module .*PYTHONPATH"),
         ("my_descriptors:shap", "my_descriptors has no shap"),
         ("my_descriptors:", "my_descriptors has no function"),

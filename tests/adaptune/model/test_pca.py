@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from sklearn.base import clone
 from sklearn.decomposition import PCA
-from sklearn.pipeline import make_pipeline
+from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from adaptune.model.pca import ScaledPCA
 
@@ -64,7 +63,6 @@ def test_each_block_has_components_of_its_own():
     )
 
 
-def test_it_is_an_sklearn_estimator():
-    pca = clone(ScaledPCA(n_components=4))
-    assert pca.get_params() == {"n_components": 4, "blocks": None}
-    assert make_pipeline(pca).fit_transform(counts(3, 8)).shape == (8, 4)
+@parametrize_with_checks([ScaledPCA()])
+def test_it_is_a_transformer_of_scikit_learn(estimator, check):
+    check(estimator)

@@ -68,7 +68,7 @@ def test_a_program_is_its_files(tmp_path):
 
 
 def test_descriptors_of_the_user_are_their_modules(package):
-    assert descriptor_content(["ndt", "intensity"]) == {}
+    assert descriptor_content(["ndt", "motion"]) == {}
     before = descriptor_content(["ndt", "theirs.odometry:describe"])
     (package / "odometry.py").write_text("# another\n")
     after = descriptor_content(["ndt", "theirs.odometry:describe"])
