@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
+from adaptune.odometry.base import MOST_FAULTS
 from adaptune.odometry.program import contradiction
-from adaptune.odometry.remote import MOST_FAULTS
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from offline.config import OfflineConfig, OfflineStudy

@@ -12,8 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.errors import OdometryError, import_extra, nearest
 from adaptune.geometry import Poses, invert, squared_ranges
-from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, RangeSettings
-from adaptune.odometry.scan_time import END, MIDDLE, NO_IMU, OwnFrameOdometry, duration_of
+from adaptune.odometry.base import (
+    END,
+    MIDDLE,
+    MIN_POINTS,
+    NO_IMU,
+    BaseSettings,
+    Description,
+    OwnFrameOdometry,
+    RangeSettings,
+    duration_of,
+)
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value
 
@@ -156,7 +165,7 @@ class Pipeline(OwnFrameOdometry):
     pipeline : str
         What evalio calls it; class attribute.
     deskews_to : float
-        Share of a scan's duration, see `adaptune.odometry.scan_time`; class attribute.
+        Share of a scan's duration, see `adaptune.odometry.base`; class attribute.
     untuned : dict
         Values that must differ from the pipeline's own defaults: one thread, no scans dropped
         when late; class attribute.

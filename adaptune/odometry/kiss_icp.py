@@ -12,8 +12,16 @@ from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import MIN_POINTS, Odometry, RangeSettings, Registration
-from adaptune.odometry.scan_time import END, MIDDLE, AtStamp, duration_of
+from adaptune.odometry.base import (
+    END,
+    MIDDLE,
+    MIN_POINTS,
+    AtStamp,
+    Odometry,
+    RangeSettings,
+    Registration,
+    duration_of,
+)
 from adaptune.recording.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 

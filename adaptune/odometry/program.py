@@ -30,8 +30,9 @@ from adaptune.odometry.base import (
     OdometryInstance,
     Registration,
     Usage,
+    pose_fault,
 )
-from adaptune.odometry.remote import Arguments, Limits, pose_fault
+from adaptune.odometry.remote import Arguments, Limits
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.recording.config import SequenceConfig, Transform, resolve, to_pose
 from adaptune.recording.export import IMU, POINTS, Layout, export

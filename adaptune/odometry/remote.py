@@ -4,10 +4,13 @@ A small server imports the odometry once and forks a fresh process for every sta
 milliseconds, and global state of the odometry ends with its process.
 """
 
-import logging
+import signal
 import socket
 import tempfile
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Annotated, Any, ClassVar, Self
 
@@ -15,34 +18,28 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_validator
 
 from adaptune import processes
-from adaptune.errors import OdometryError, UnavailableError
+from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
 from adaptune.odometry.base import (
     BaseSettings,
     Description,
-    LastMotion,
-    Motions,
-    OdometryInstance,
+    FaultError,
+    Faulting,
+    Odometry,
     Registration,
     Usage,
+    pose_fault,
 )
+from adaptune.odometry.registry import odometry_class
 from adaptune.processes import available, next_core
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
 from adaptune.space import ParameterSet
 from adaptune.strict import StrictModel
 
-MOST_FAULTS = 10
-"""An instance with so many faults does not start again: the rest of its sequence is lost."""
-
-_TOLERANCE = 1e-3
-"""By how much a rotation times its transpose may differ from the identity."""
-
 SERVICE = processes.Service("adaptune.odometry.serving", tuple(processes.ONE_THREAD.items()))
 """What a server does with an odometry."""
-
-_log = logging.getLogger(__name__)
 
 
 def _in_study(argument: str, info: ValidationInfo) -> str:
@@ -74,42 +71,6 @@ class Limits(StrictModel):
         late = f"a scan took longer than isolation.seconds = {self.seconds:g}"
         full = f"out of isolation.memory = {self.memory:g} GB"
         return processes.Bounds(self.seconds, self.memory, late, full)
-
-
-class Faulting(OdometryInstance):
-    """An instance that may go wrong, and notes it.
-
-    Parameters
-    ----------
-    name, parameters
-        The odometry.
-    """
-
-    faults: Sequence[str] = ()
-
-    def __init__(self, name: str, parameters: ParameterSet):
-        self.name = name
-        self.parameters = dict(parameters)
-        self._last_motion = LastMotion()
-
-    @property
-    def motions(self) -> Motions:
-        return self._last_motion.motions
-
-    @property
-    def given_up(self) -> bool:
-        """Whether it had so many faults that it does not start again."""
-        return len(self.faults) >= MOST_FAULTS
-
-    def note_fault(self, what: str) -> Registration:
-        """Note a fault and end; the pose of a scan with a fault."""
-        self.close()
-        if what not in self.faults:
-            _log.warning("%s with %s: %s", self.name, self.parameters, what)
-        self.faults = [*self.faults, what]
-        if self.given_up:
-            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
-        return Registration(np.full((4, 4), np.nan), registered=False)
 
 
 class Isolated(Faulting):
@@ -276,18 +237,6 @@ class Isolated(Faulting):
             return None
 
 
-def pose_fault(T_odom_sensor: Poses) -> str | None:
-    """What is wrong with a pose, if anything."""
-    if T_odom_sensor.shape != (4, 4):
-        return f"of shape {T_odom_sensor.shape}"
-    if not np.isfinite(T_odom_sensor).all():
-        return "that is not finite"
-    R = T_odom_sensor[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
-        return "that is not rigid"
-    return None
-
-
 # Odometries in programs of the user that receive scans and return poses, one after the other.
 
 
@@ -447,3 +396,139 @@ def announced_by(program: Isolated) -> Description:
         return wire.announced(answer)
     finally:
         program.close()
+
+
+# A class of the user in this process: where it goes wrong, this is a fault and nothing else.
+
+
+class _LateError(BaseException):
+    """A call has taken too long; not an exception that user code would handle."""
+
+
+class Guarded(Faulting):
+    """A clean class of the user in this process, with the faults that `Isolated` would have.
+
+    Parameters
+    ----------
+    name, parameters
+        The odometry.
+    settings
+        Its checked settings.
+    seconds
+        Time for one scan. It holds for Python code in the main thread; other code is trusted.
+    """
+
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):
+        super().__init__(name, parameters)
+        self._seconds = seconds
+        self._settings = settings.model_dump(mode="json")
+        self._odometry: Odometry | None = None
+        self._cpu = 0.0
+        self._running = False
+
+    @property
+    def ended(self) -> bool:
+        return not self._running
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(self._cpu, None)
+
+    @property
+    def preparation(self) -> Hashable:
+        try:
+            preparation: Hashable = self._guarded(lambda odometry: odometry.preparation)
+            hash(preparation)
+        except (FaultError, TypeError):
+            return self  # it shares with nobody
+        return preparation
+
+    def prepare(self, scan: Scan) -> Any:
+        try:
+            return self._guarded(lambda odometry: odometry.prepare(scan))
+        except FaultError as fault:
+            return fault  # of whoever is given this in place of a scan
+
+    def start(
+        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+        self._running = False
+        if self.given_up:
+            return
+        motion = None if T_previous_current is None else T_previous_current.copy()
+        given = prepared, T_odom_sensor.copy(), motion
+        try:
+            self._guarded(lambda odometry: odometry.start(*given), prepared)
+            self._running = True
+        except FaultError as fault:
+            self.note_fault(str(fault))
+
+    def submit(self, prepared: Any) -> None:
+        self._submitted = prepared
+
+    def collect(self) -> Registration:
+        def register(odometry: Odometry) -> Registration:
+            T_odom_sensor, registered = wire.unpacked(odometry.register(self._submitted))
+            return Registration(np.array(T_odom_sensor, np.float64), bool(registered))
+
+        registration = Registration(np.full((4, 4), np.nan), registered=False)
+        if self._running:
+            begin = time.process_time()
+            try:
+                registration = self._guarded(register, self._submitted)
+                if wrong := pose_fault(registration.T_odom_sensor):
+                    registration = self.note_fault(f"it gave a pose {wrong}")
+            except FaultError as fault:
+                registration = self.note_fault(str(fault))
+            self._cpu += time.process_time() - begin
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def apply(self, selection: Selection) -> None:
+        self.parameters |= selection.parameters
+        try:
+            self._guarded(lambda odometry: odometry.configure(selection.parameters))
+        except FaultError as fault:
+            self.note_fault(str(fault))
+
+    def close(self) -> None:
+        self._odometry, self._running = None, False
+
+    def _guarded(self, call: Callable[[Odometry], Any], prepared: Any = None) -> Any:
+        """What a call of user code returns; a `FaultError` with the place where it raised."""
+        if isinstance(prepared, FaultError):
+            raise prepared
+        try:
+            with _limited(self._seconds):
+                if self._odometry is None:
+                    cls: Any = odometry_class(self.name)
+                    settings = cls.settings_type.model_validate(self._settings)
+                    self._odometry = cls(self.parameters, settings)
+                return call(self._odometry)
+        except AdaptuneError:
+            raise
+        except _LateError as error:
+            what = f"a scan took longer than isolation.seconds = {self._seconds:g}"
+            raise FaultError(what) from error
+        except BaseException as error:
+            raise FaultError(in_a_line(error)) from error
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise a `_LateError` in the block after so long, where there is a way."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(_: int, __: object) -> None:
+        raise _LateError
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

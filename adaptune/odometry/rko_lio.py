@@ -14,8 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.errors import OdometryError, import_extra
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import MIN_POINTS, Description, RangeSettings
-from adaptune.odometry.scan_time import END, MIDDLE, NO_IMU, OwnFrameOdometry
+from adaptune.odometry.base import (
+    END,
+    MIDDLE,
+    MIN_POINTS,
+    NO_IMU,
+    Description,
+    OwnFrameOdometry,
+    RangeSettings,
+)
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, ParameterSpace
 

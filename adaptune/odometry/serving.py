@@ -13,7 +13,7 @@ import numpy as np
 from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry import wire
-from adaptune.odometry.base import Description, Registration
+from adaptune.odometry.base import Description, FaultError, Registration
 from adaptune.odometry.factory import declare, declare_here
 from adaptune.odometry.registry import check_served, is_user_class, make_here, odometry_class
 from adaptune.odometry.remote import Isolated, Limits, parse_address
@@ -24,12 +24,12 @@ _log = logging.getLogger(__name__)
 
 
 class _Guarding(Isolated):
-    """An odometry in a process of its own; where it ends, there is a `wire.FaultError`."""
+    """An odometry in a process of its own; where it ends, there is a `FaultError`."""
 
     def register(self, prepared: Scan) -> Registration:
         registration = super().register(prepared)
         if self.faults and not np.isfinite(registration.T_odom_sensor).all():
-            raise wire.FaultError(self.faults[-1])
+            raise FaultError(self.faults[-1])
         return registration
 
 

@@ -39,9 +39,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from adaptune.errors import AdaptuneError, nearest
+from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses
-from adaptune.odometry import Description, OdometryError, Registration
+from adaptune.odometry.base import Description, FaultError, Registration
 from adaptune.processes import Answer, Message
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
@@ -77,10 +77,6 @@ def to_scan(message: Message) -> Scan:
         imu = Imu(stamps, gyro, acceleration, T_sensor_imu, ImuNoise(*noise.tolist()))
     columns: Any = {name: arrays.get(name) for name in _COLUMNS}
     return Scan(message.header["stamp"], imu=imu, **columns)
-
-
-class FaultError(AdaptuneError):
-    """A served odometry has ended, in a process of its own."""
 
 
 class Served(Protocol):

@@ -27,7 +27,14 @@ from rosbags.typesys.store import Typestore
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify
-from adaptune.odometry.base import Description, OdometryInstance, Registration, Usage
+from adaptune.odometry.base import (
+    Description,
+    Faulting,
+    OdometryInstance,
+    Registration,
+    Usage,
+    pose_fault,
+)
 from adaptune.odometry.docker.engine import ContainerSettings, Mount, costs, image_digest, kept_log
 from adaptune.odometry.docker.ros_container import (
     RosSystem,
@@ -37,7 +44,7 @@ from adaptune.odometry.docker.ros_container import (
     whole_name,
 )
 from adaptune.odometry.program import ProgramInput, WholeRun, WholeSettings
-from adaptune.odometry.remote import Faulting, Limits, pose_fault
+from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template, check_names
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
 from adaptune.recording.config import resolve, to_pose

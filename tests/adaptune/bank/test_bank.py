@@ -10,10 +10,10 @@ from walker import at, kept, makes, selected, x_of, x_on
 from adaptune.bank.bank import Bank
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import InProcess
+from adaptune.odometry.base import MOST_FAULTS, InProcess
 from adaptune.odometry.evalio import EvalioSettings
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
-from adaptune.odometry.remote import MOST_FAULTS, Isolated, Limits
+from adaptune.odometry.remote import Isolated, Limits
 from adaptune.selection import Selection
 
 NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}

@@ -10,8 +10,8 @@ import pytest
 from setups import setup_of
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.factory import Guarded, OdometryFactory
-from adaptune.odometry.remote import Isolated, Limits
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.remote import Guarded, Isolated, Limits
 from adaptune.recording import Scan
 from adaptune.selection import Selection
 from offline.config import load_study

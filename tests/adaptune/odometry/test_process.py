@@ -11,9 +11,9 @@ import server
 import turns
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import InProcess
+from adaptune.odometry.base import MOST_FAULTS, InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.remote import MOST_FAULTS, Limits, Process, ProcessSettings
+from adaptune.odometry.remote import Limits, Process, ProcessSettings
 from adaptune.odometry.serving import listen
 from adaptune.recording import Scan
 from adaptune.selection import Selection

@@ -3,8 +3,8 @@ import pytest
 import turns
 from needs import needs_evalio
 
+from adaptune.odometry.base import END, MIDDLE, START, AtStamp, duration_of
 from adaptune.odometry.registry import odometry_class
-from adaptune.odometry.scan_time import END, MIDDLE, START, AtStamp, duration_of
 from adaptune.recording.scan import Scan
 
 TURN = 10**8
