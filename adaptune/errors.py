@@ -63,6 +63,7 @@ _NO_HAND_OVER = "is gone with the hand-over, which gained nothing; leave it out"
 DELETED = {
     "offline.search": "is gone: a search is always for single sets; leave it out",
     "online.dwell": "is gone: selections do not wait; leave it out",
+    "online.pin": "is gone: fix a parameter by its range (odometry.parameters), or leave it out",
     "online.switching.beside": _NO_HAND_OVER,
     "online.switching.catch_up_scans": _NO_HAND_OVER,
     "online.switching.full_rate": _NO_HAND_OVER,

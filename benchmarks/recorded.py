@@ -2,7 +2,7 @@
 
     python benchmarks/recorded.py FOLDER [--odometries gicp ndt kiss_icp] [--sets 16] [--seed 0]
                                          [--directions town campus_1 ...] [--no-reference]
-                                         [--also one_set even ...]
+                                         [--also even]
 
 ADAPTUNE_TEST_DATA names the folder of the recordings. Each direction and odometry is a study in
 FOLDER: a Sobol sequence of so many sets, one after the other on one core. The same command resumes.
@@ -149,7 +149,6 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
     rows: list[ComparisonRow] = []
     for name in study.config.test:
         folder = study.folder / "replays" / name
-        # What `adaptive` does already is not replayed again.
         also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
         replays = {mode: [StoredReplay.read(folder / mode)] for mode in (*MODES, *also)}
         reference = Reference.read(

@@ -30,7 +30,7 @@ from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_modes
 from online.record import StoredReplay, damaged, read_applied, read_columns
-from online.replay_picture import FEW, Track, drawn_modes
+from online.replay_picture import Track
 from online.statistics import ALL, ComparisonRow, Reference, reference_of, seen_from, track_of
 from online.verdict import of_lengths, short_replays
 
@@ -60,11 +60,7 @@ def comparison_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
     """
     versus = next((key for key in (rows[0] if rows else {}) if key.startswith(_VERSUS)), "")
     yardstick = versus.removeprefix(_VERSUS)
-    known = [
-        row
-        for row in rows
-        if row.get(versus) is not None and row["mode"] != yardstick and not row.get("twin")
-    ]
+    known = [row for row in rows if row.get(versus) is not None and row["mode"] != yardstick]
     if not known:
         return None
     # Those over all sequences, or on the only one.
@@ -209,8 +205,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     """Read the replays of a sequence that are finished and drawn; there may be none.
 
     Those that `compare` refuses are not, see `online.stale_replays.current_modes`, and neither are
-    those that are too short. Of many modes on demand, none is drawn, see
-    `online.replay_picture.drawn_modes`.
+    those that are too short.
 
     Raises
     ------
@@ -224,8 +219,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     if len(space.baselines) > 1 and study.model_path.exists():
         model = ErrorModel.load(study.model_path)
     current = current_modes(study, name)
-    drawn = drawn_modes(current.modes)
-    replays = {mode: StoredReplay.read(folder / mode) for mode in drawn}
+    replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
     replays, short = _whole(name, replays)
     modes = {
         mode: _read_mode(folder / mode, replay, reference, model)
@@ -241,15 +235,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         space,
         scenes,
         reference.estimated,
-        [*current.refused, *short, *_undrawn(name, [m for m in current.modes if m not in drawn])],
+        [*current.refused, *short],
     )
-
-
-def _undrawn(name: str, modes: Sequence[str]) -> list[str]:
-    """A sentence about modes that are left out so that charts can be read, if there are some."""
-    listed = ", ".join(f"`{mode}`" for mode in modes)
-    why = f"nobody could read charts of more than {FEW} modes on demand"
-    return [f"No lines of {listed} along {name}: {why}."] if modes else []
 
 
 def _whole(

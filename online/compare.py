@@ -23,7 +23,7 @@ from online.record import (
     check_reference,
     read_repeats,
 )
-from online.replay_picture import draw_replays, drawn_modes
+from online.replay_picture import draw_replays
 from online.run import shared_identity
 from online.statistics import (
     ALL,
@@ -54,17 +54,13 @@ class ComparedModes(NamedTuple):
 
     sequences: tuple[str, ...]
     modes: tuple[str, ...]  # replayed on all of them, in the order of `LINES`
-    twins: Mapping[str, str]  # by mode that is not replayed itself, the one whose replay it has
     # By mode that somebody may expect, the sequences on which it was not replayed.
     missing: Mapping[str, Sequence[str]]
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
 
     def words(self, study: Study) -> list[str]:
-        """Sentences about what is not shown because another mode is the same, or is missing."""
-        said = [
-            f"`{mode}` is what `{twin}` drives here: it has the same numbers, shown once."
-            for mode, twin in self.twins.items()
-        ]
+        """Sentences about what is not shown because it is missing."""
+        said = []
         if self.unfinished:
             there = [m for m in self.modes if m not in ALSO or self.modes == WITHOUT_MODEL]
             lacking = (
@@ -107,34 +103,31 @@ def compared_modes(study: Study) -> ComparedModes:
         If the fixed set was replayed on none of them, and baseline and untrained bank not on all.
     """
     setup = ReplaySetup.of(study)
-    names, without_model = study.config.test, sequences_without_model(study)
+    names, without_model = study.config.test, sequences_without_model(study.config)
     of_model = [mode for mode in LINES if mode not in WITHOUT_MODEL]
     if not _any(study, names, of_model) and _any(study, without_model, [UNTRAINED]):
         made, unfinished = _finished(study, without_model, WITHOUT_MODEL)
         if made:
-            return ComparedModes(made, WITHOUT_MODEL, {}, {}, unfinished)
+            return ComparedModes(made, WITHOUT_MODEL, {}, unfinished)
     if not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
     unfixed = [name for name in names if not _is_there(study, name, "fixed")]
     if len(unfixed) == len(names):
         if all(_is_there(study, name, m) for name in names for m in WITHOUT_MODEL):
-            return ComparedModes(names, WITHOUT_MODEL, {}, {"fixed": unfixed})
+            return ComparedModes(names, WITHOUT_MODEL, {"fixed": unfixed})
         ReplaySummary.read(_folder(study, names[0], "fixed"))
     names, unfinished = _finished(study, names, ("fixed", BASELINE, *setup.rules))
     model = _model(study, names[0])
     also = _on_demand(study, setup, model)
-    twins = {} if model is None else {m: setup.twin(m, model) for m in also}
-    twins = {mode: twin for mode, twin in twins.items() if twin != mode}
     there = {
         mode: [name for name in names if _is_there(study, name, mode)]
         for mode in LINES
-        if mode in (BASELINE, *RIVALS, "fixed", *setup.rules, *also) and mode not in twins
+        if mode in (BASELINE, *RIVALS, "fixed", *setup.rules, *also)
     }
     expected = (BASELINE, *setup.rules, *also)
     return ComparedModes(
         names,
         tuple(mode for mode, on in there.items() if len(on) == len(names)),
-        {mode: twin for mode, twin in twins.items() if len(there.get(twin, [])) == len(names)},
         {
             mode: [name for name in names if name not in on]
             for mode, on in there.items()
@@ -156,13 +149,9 @@ def _finished(
 
 
 def _on_demand(study: Study, setup: ReplaySetup, model: ErrorModel | None) -> list[str]:
-    """The modes on demand that were asked for or replayed, and those that are another's replay."""
+    """The modes on demand that were asked for or replayed."""
     names, asked = study.config.test, study.config.online.also
     found: list[str] = [mode for mode in ALSO if mode in asked or _any(study, names, [mode])]
-    if model is None:
-        return found
-    if any(mode != UNTRAINED for mode in found):
-        found += [mode for mode in ALSO if mode not in found and setup.twin(mode, model) != mode]
     return [mode for mode in found if not setup.obstacle(mode, model)]
 
 
@@ -386,7 +375,6 @@ def check_replays(
         for mode in modes
     }
     path, model = _model_of(study, made.values())
-    model = model and setup.pinned(model)
     # Both read what they are about.
     shared = {name: shared_identity(study, name) for name in names}
     _check_rates(study, made.values())
@@ -419,7 +407,7 @@ def current_modes(study: Study, name: str) -> CurrentModes:
         of: tuple[Path, ErrorModel | None] = own, _load(study, own)
     else:
         of = _model_of(study, made.values())
-    path, model = of[0], of[1] and setup.pinned(of[1])
+    path, model = of
     considered = _considered(setup, model)
     made = {mode: summary for mode, summary in made.items() if mode in considered}
     _check_rates(study, made.values())
@@ -444,7 +432,7 @@ def _considered(setup: ReplaySetup, model: ErrorModel | None) -> set[str]:
     also: Iterable[str] = ALSO
     if model is not None:
         rivals = [mode for mode in RIVALS if mode in model.rivals]
-        also = [m for m in ALSO if setup.twin(m, model) == m and not setup.obstacle(m, model)]
+        also = [mode for mode in ALSO if not setup.obstacle(mode, model)]
     return {BASELINE, *rivals, "fixed", *setup.rules, *also}
 
 
@@ -570,7 +558,7 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
         folder = study.folder / "replays" / name
         replays = {mode: read_repeats(folder / mode) for mode in modes}
         reference = reference_of(study, name)
-        every = _with_twins(replays, model, compared.twins)
+        every = _with_fixed_rivals(replays, model)
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         oracle = None if model is None else read_oracle(study, name, model)
@@ -583,13 +571,12 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
             study.folder / "comparison" / f"{name}.png",
             f"{study.name}: {name}",
             study.config.sub_trajectory,
-            {mode: track_of(replays[mode][0], reference, model) for mode in drawn_modes(modes)},
+            {mode: track_of(replays[mode][0], reference, model) for mode in modes},
             None if reference.trajectory is None else seen_from(reference.trajectory),
             setup.odometry.space,
             reference.estimated,
         )
-    twins = compared.twins
-    rows = [replace(row, twin=twins.get(row.mode, "")) for row in _rows(judged, oracles)]
+    rows = _rows(judged, oracles)
     words = [*remarks(rows), *_equal_cost(model, modes), *compared.words(study)]
     words += _missing_repeats(judged, study.config.online.repeats)
     words += _without_oracle(judged, oracles) if model is not None else []
@@ -656,14 +643,11 @@ def _against(
     return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})
 
 
-def _with_twins(
-    replays: Repeats, model: ErrorModel | None, twins: Mapping[str, str]
+def _with_fixed_rivals(
+    replays: Repeats, model: ErrorModel | None
 ) -> dict[str, Sequence[StoredReplay]]:
-    """The replays by mode, also for each mode that has that of another one.
-
-    Of several odometries, a rival that is the fixed set has its replay.
-    """
-    same = {mode: replays[twin] for mode, twin in twins.items()}
+    """The replays by mode; of several odometries, a rival that is the fixed set has its replay."""
+    same: dict[str, Sequence[StoredReplay]] = {}
     if model is not None and "fixed" in replays and len(model.sets.space.baselines) > 1:
         of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
         same |= dict.fromkeys(of_fixed, replays["fixed"])

@@ -1,8 +1,8 @@
-"""The modes of a replay: baseline, rivals, fixed, adaptive by each rule, and those on demand."""
+"""The modes of a replay: what each one runs, and what chooses its parameters."""
 
-import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -19,32 +19,28 @@ from adaptune.report.paper import LINES
 from adaptune.selection import Selection
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets
-from adaptune.study.config import RealTimeConfig, SwitchingConfig
+from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
 from adaptune.study.inputs import check_model
-from adaptune.study.study import RIVALS, Mechanism, ModeError, Study, bank_members, mechanism_of
+from adaptune.study.study import (
+    RIVALS,
+    Mechanism,
+    ModeError,
+    Study,
+    bank_members,
+    cannot_adapt,
+    mechanism_of,
+)
 
-# Controls: selectors that look at nothing, and that adapting has to beat.
-
-
-SEED = 0
-"""Of random choices, together with the sequence's name and the number of the repeat."""
-
-
-class _Control:
-    """It has the methods of `adaptune.selector.Selector`, and neither sees nor measures."""
-
-    def reset(self) -> None:
-        """Forget all selections, as before a new recording."""
-
-    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan; nothing depends on it."""
-
-    def measure(self) -> None:
-        """Measure nothing."""
+BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
+EVEN, UNTRAINED = "even", "untrained"
+WITHOUT_MODEL = (BASELINE, UNTRAINED)
+"""The modes that need neither trials nor a model."""
 
 
-class EvenSelector(_Control):
-    """Gives all members of a bank the same weight, always.
+class EvenSelector:
+    """Gives all members of a bank the same weight, always: a control, which looks at nothing.
+
+    It has the methods of `adaptune.selector.Selector`.
 
     Parameters
     ----------
@@ -58,6 +54,15 @@ class EvenSelector(_Control):
         even = dict.fromkeys(members, 1.0 / len(members))
         self._selection = weighted_selection(sets, even)
 
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """Nothing depends on a scan."""
+
+    def measure(self) -> None:
+        """Nothing is measured."""
+
     def select(self) -> Selection:
         """Even weights."""
         return self._selection
@@ -67,64 +72,18 @@ class EvenSelector(_Control):
         return self._selection
 
 
-class RandomSelector(_Control):
-    """Chooses a random set among a few, at every selection.
-
-    Parameters
-    ----------
-    sets
-        The parameter sets.
-    candidates
-        Trial numbers of the sets to choose among; all are equally likely.
-    fixed
-        Trial number of the set to begin with, and to return to where an odometry fails.
-    seed
-        Of the choices, which are the same with the same seed; see `random_seed`.
-    """
-
-    def __init__(
-        self, sets: ParameterSets, candidates: Sequence[int], fixed: int, seed: Sequence[int]
-    ):
-        self._sets, self._candidates, self._fixed = sets, tuple(candidates), fixed
-        self._seed = list(seed)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin the same choices anew, as before a new recording."""
-        self._rng = np.random.default_rng(self._seed)
-
-    def select(self) -> Selection:
-        """A random set."""
-        trial = self._candidates[int(self._rng.integers(len(self._candidates)))]
-        return Selection(trial, self._sets[trial])
-
-    def fall_back(self) -> Selection:
-        """The fixed set."""
-        return Selection(self._fixed, self._sets[self._fixed])
-
-
-def random_seed(sequence: str, repeat: int = 1) -> tuple[int, int, int]:
-    """The seed of `RandomSelector` on a sequence: the same on every machine."""
-    return SEED, zlib.crc32(sequence.encode()), repeat
-
-
-BASELINE, UNTRAINED = "baseline", "untrained"
-LEARNED, EVEN, RANDOM = "bank_learned", "even", "random"
-BANKS = ("bank", LEARNED, EVEN)
-"""The modes on demand that drive the study's bank, whatever `adaptive` drives."""
-MEASURING = ("adaptive", "bank")
-"""Those with live evidence."""
-SINGLES = ("one_set", RANDOM)
-"""Those that drive one set at a time."""
-WITHOUT_MODEL = (BASELINE, UNTRAINED)
-"""The modes that need neither trials nor a model."""
-
-
 class Mode(NamedTuple):
     """What runs along a recording, and what chooses its parameters, if anything does."""
 
-    odometry: OdometryInstance
-    selector: AnySelector | None
+    name: str
+    sets: Mapping[int, ParameterSet]  # by trial: a bank's members, or the one set to begin with
+    bank: bool = False
+    selector: Callable[[], AnySelector] | None = None  # makes it; pickles
+
+    @property
+    def fixed(self) -> int:
+        """Trial number of the set that it begins with."""
+        return next(iter(self.sets))
 
 
 @dataclass(frozen=True)
@@ -141,13 +100,7 @@ class ReplaySetup:
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
     real_time: RealTimeConfig | None = None
-    pins: Mapping[str, Any] = field(default_factory=dict)  # values that parameters have in all sets
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
-
-    @property
-    def cores(self) -> int:
-        """Cores that the members of a bank may use."""
-        return min(self.switching.cores or together(), together())
 
     @classmethod
     def of(cls, study: Study) -> Self:
@@ -164,47 +117,121 @@ class ReplaySetup:
             config.descriptor.names,
             config.online.budget,
             config.online.real_time,
-            config.online.pin,
             config.online.also,
         )
 
-    def modes(self, model: ErrorModel) -> tuple[str, ...]:
-        """What is replayed with a model, in the order of `LINES`.
+    def mode(self, name: str, model: ErrorModel | None = None) -> Mode:
+        """What a mode runs.
 
-        Baseline, rivals, fixed, each selection rule, and the modes on demand that are possible. A
-        mode whose replay is that of another one is not replayed again.
+        Raises
+        ------
+        ModeError
+            If it is not possible, if the model is lacking, or does not go with the study's bank.
         """
-        rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
-        also = [m for m in self.also if self.twin(m, model) == m and not self.obstacle(m, model)]
-        rules = [rule for rule in self.rules if self._mechanism(rule, model) is not None]
-        modes = {BASELINE, *rivals, "fixed", *rules, *also}
-        return tuple(mode for mode in LINES if mode in modes)
+        if name == BASELINE:
+            return Mode(name, {0: self.odometry.space.baseline})
+        if why := self.obstacle(name, model):
+            raise ModeError(f"{name} is not possible: {why}")
+        if name == UNTRAINED:
+            sets = self._untrained_sets()
+            members = dict(zip(sets.trials, sets.parameters, strict=True))
+            return Mode(name, members, True, partial(UntrainedSelector, sets, self.sub_trajectory))
+        model = needed(name, model)
+        if name in (FIXED, *RIVALS):
+            trial = model.rivals.get(name, model.fixed)
+            return Mode(name, {trial: model.sets[trial]})
+        if name == EVEN:
+            members = self._always(model)
+            return Mode(name, members, True, partial(EvenSelector, model.sets, list(members)))
+        if self._mechanism(name, model) == "live":
+            one = {model.fixed: model.sets[model.fixed]}
+            return Mode(name, one, False, partial(Selector, model, name, (), self.descriptors))
+        # The bank's reserve joins in by what is measured: only this mode has one.
+        members = bank_members(self.switching, model) if name == ADAPTIVE else self._always(model)
+        make = partial(Selector, model, name, list(members), self.descriptors)
+        return Mode(name, members, True, make)
 
-    def twin(self, mode: str, model: ErrorModel) -> str:
-        """The mode whose replay is also that of a mode on demand: usually itself."""
-        if "adaptive" in self.rules:
-            way = self._mechanism("adaptive", model)
-            if mode == "bank" and way == "bank" and model.bank_adapts:
-                return "adaptive"
-            if mode == "one_set" and way != "bank" and model.paired.adapt:
-                return "adaptive"
-        return mode
-
-    def obstacle(self, mode: str, model: ErrorModel) -> str:
-        """Why a mode on demand cannot be replayed; empty if it can."""
+    def obstacle(self, name: str, model: ErrorModel | None = None) -> str:
+        """Why a mode is not possible; empty if it is, as far as is known without a model."""
+        if name in (BASELINE, FIXED, *RIVALS):
+            return ""
         if self.odometry.description.whole:
-            return "a program that runs whole recordings cannot change its parameters"
-        if mode == UNTRAINED:
-            try:
-                self.untrained_sets()
-            except ModeError as error:
-                return str(error)
-        elif mode != "one_set" and len(self.switching.sets or model.bank) < 2:
-            return "the model's bank has no other member than the fixed set"
+            return cannot_adapt(self.odometry, None)
+        if name == UNTRAINED:
+            differ = len(self._untrained_sets()) > 1
+            why = "no parameters by which the members of a bank would differ (odometry.parameters)"
+            return "" if differ else f"{self.odometry.name} has {why}"
+        if name == EVEN and model is not None:
+            alone = len(self.switching.sets or model.bank) < 2
+            return "the model's bank has no other member than the fixed set" if alone else ""
+        if model is not None and self._mechanism(name, model) is None:
+            return cannot_adapt(self.odometry, self.mechanism)
         return ""
 
+    def modes(self, model: ErrorModel) -> tuple[str, ...]:
+        """What is replayed with a model, in the order of `LINES`: what is possible of all modes.
+
+        A rival that is the fixed set is not replayed again.
+        """
+        rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
+        modes = {BASELINE, *rivals, FIXED, *self.rules, *self.also}
+        return tuple(name for name in LINES if name in modes and not self.obstacle(name, model))
+
+    def start(
+        self, name: str, model: ErrorModel | None = None, sequence: str | None = None
+    ) -> tuple[OdometryInstance, AnySelector | None]:
+        """Make a new odometry, or a bank, and its selector; None if its parameters stay."""
+        mode = self.mode(name, model)
+        selector = None if mode.selector is None else mode.selector()
+        return self.instance(mode, sequence), selector
+
+    def instance(self, mode: Mode, sequence: str | None = None) -> OdometryInstance:
+        """Make the odometry of a mode, or the bank.
+
+        Parameters
+        ----------
+        mode
+            What `mode` returned.
+        sequence
+            On which it will run; programs that run whole recordings need it.
+        """
+        if not mode.bank:
+            return self.odometry(mode.sets[mode.fixed], sequence)
+        # Where no scan is dropped, no member is left behind either.
+        waits = self.real_time is None or not self.real_time.queue
+        rate = None if self.real_time is None or waits else self.real_time.rate
+        given = self.odometry, mode.sets, self.warm_up, self.lost_track, self._cores, rate
+        return Bank(*given)
+
+    def identity(
+        self, name: str, model: ErrorModel | None = None, digest: str = ""
+    ) -> dict[str, Any]:
+        """What a mode depends on, as plain data; `digest` is the model's."""
+        about = {"mode": name, "parameters": None, "model": None, "switching": None}
+        if name in (BASELINE, FIXED, *RIVALS):
+            mode = self.mode(name, model)
+            return about | {"parameters": mode.sets[mode.fixed]}
+        switching: dict[str, Any] = {"mechanism": "bank", "warm_up": self.warm_up}
+        if name == UNTRAINED:
+            members = list(self._untrained_sets().parameters)
+            return about | {"switching": switching | {"members": members}}
+        if name != EVEN and self._mechanism(name, needed(name, model)) != "bank":
+            return about | {"model": digest, "switching": {"mechanism": "live"}}
+        named = self.switching.model_dump(mode="json", include={"size", "sets"})
+        return about | {"model": digest, "switching": switching | named}
+
+    def core_ms(self, mode: Mode, model: ErrorModel | None) -> float:
+        """Milliseconds that a scan keeps the busiest core at work; NaN if that was not measured."""
+        if mode.name == UNTRAINED or model is None or model.costs is None:
+            return np.nan
+        if mode.selector is None:
+            return model.costs.alone(mode.fixed)
+        if not mode.bank:
+            return max(model.costs.adaptive([trial]) for trial in model.sets)
+        return model.costs.adaptive(mode.sets) / min(len(mode.sets), self._cores)
+
     def model(self, study: Study, path: Path) -> ErrorModel:
-        """An error model, with what is pinned.
+        """Load an error model.
 
         Raises
         ------
@@ -215,21 +242,9 @@ class ReplaySetup:
         model = ErrorModel.load(path)
         if path.resolve() == study.model_path.resolve():
             check_model(study, model.sequences, model.provenance)
-        length = study.config.sub_trajectory
-        model.check_study(study.odometry.identity, study.odometry.space, length, path)
+        model.check_study(self.odometry.identity, self.odometry.space, self.sub_trajectory, path)
         self.check(model, path)
-        return self.pinned(model)
-
-    def pinned(self, model: ErrorModel) -> ErrorModel:
-        """The model with what is pinned in all its sets."""
-        return replace(model, sets=self._held(model.sets)) if self.pins else model
-
-    def _held(self, sets: ParameterSets) -> ParameterSets:
-        held = (
-            own | {name: value for name, value in self.pins.items() if name in own}
-            for own in sets.parameters
-        )
-        return replace(sets, parameters=tuple(held))
+        return model
 
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
@@ -239,193 +254,30 @@ class ReplaySetup:
                 f"online.budget: {path} was fitted for another budget; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
-        on_demand = {*BANKS, RANDOM}.intersection(self.also)
-        if self.mechanism == "bank" or any(not self.obstacle(m, model) for m in on_demand):
+        is_even = EVEN in self.also and not self.obstacle(EVEN, model)
+        if self.mechanism == "bank" or is_even:
             bank_members(self.switching, model)
 
-    def untrained_sets(self) -> ParameterSets:
-        """The members of the bank that needs no model.
+    def _mechanism(self, name: str, model: ErrorModel) -> Mechanism | None:
+        return mechanism_of(name, model, self.mechanism, self.odometry.description.live)
 
-        Raises
-        ------
-        ModeError
-            If the odometry cannot be in a bank, or has no parameters by which members differ.
-        """
-        what = f"{UNTRAINED}: a bank of {self.odometry.name} is not possible, because"
-        if self.odometry.description.whole:
-            raise ModeError(
-                f"{what} the program runs whole recordings; try parameter sets on recordings with "
-                f"a reference instead (`adaptune offline`)"
-            )
-        sets = self._held(untrained_sets(self.odometry.space, self.switching.size))
-        if len(sets) < 2:
-            raise ModeError(
-                f"{what} it has no parameters by which its members would differ; name some "
-                f"(odometry.parameters)"
-            )
-        return sets
-
-    def identity(
-        self, mode: str, model: ErrorModel | None = None, digest: str = ""
-    ) -> dict[str, Any]:
-        """What a mode depends on, as plain data; `digest` is the model's."""
-        about = {"mode": mode, "parameters": None, "model": None, "switching": None}
-        if mode == UNTRAINED:
-            members = list(self.untrained_sets().parameters)
-            switching = {"mechanism": "bank", "members": members, "warm_up": self.warm_up}
-            return about | {"switching": switching}
-        if not self.adapts(mode):
-            return about | {"parameters": self.parameters(mode, model)}
-        mechanism = self._mechanism(mode, needed(mode, model))
-        used = {"size", "sets"} if mechanism == "bank" or mode == RANDOM else set()
-        settings = self.switching.model_dump(mode="json", include=used)
-        if mechanism == "bank":
-            settings["warm_up"] = self.warm_up
-        if mode == RANDOM:
-            settings["seed"] = SEED
-        settings["mechanism"] = mechanism
-        return about | {"model": digest, "switching": settings}
-
-    def parameters(self, mode: str, model: ErrorModel | None = None) -> ParameterSet | None:
-        """The parameters of modes that keep them; None for adaptive modes."""
-        if mode == BASELINE:
-            return self.odometry.space.baseline
-        if mode != "fixed" and mode not in RIVALS:
-            return None
-        model = needed(mode, model)
-        return model.sets[model.rivals[mode] if mode in RIVALS else model.fixed]
-
-    def start(
-        self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
-    ) -> Mode:
-        """Make a new odometry, or a bank, and its selector; see `instance` and `selector`."""
-        selector = self.selector(mode, model, sequence)
-        return Mode(self.instance(mode, model, sequence), selector)
-
-    def instance(
-        self, mode: str, model: ErrorModel | None = None, sequence: str | None = None
-    ) -> OdometryInstance:
-        """Make a new odometry, or a bank.
-
-        Parameters
-        ----------
-        mode
-            One of `modes`, or `untrained`.
-        model
-            The error model; baseline and untrained need none.
-        sequence
-            Name of the recording; a program that reads whole recordings needs it.
-
-        Raises
-        ------
-        ModeError
-            If the model is lacking, or does not go with the study's bank.
-        """
-        if mode == UNTRAINED:
-            members = self.untrained_sets()
-            by_number = dict(zip(members.trials, members.parameters, strict=True))
-            return self._bank(by_number)
-        if not self.adapts(mode):
-            return self.odometry(self.parameters(mode, model), sequence)
-        model = needed(mode, model)
-        mechanism = self._mechanism(mode, model)
-        if mechanism == "bank":
-            return self._bank(self.members(mode, model))
-        fixed = model.sets[model.fixed]
-        return self.odometry(fixed)
-
-    def selector(
-        self,
-        mode: str,
-        model: ErrorModel | None = None,
-        sequence: str | None = None,
-        repeat: int = 1,
-    ) -> AnySelector | None:
-        """Make the selector of a mode; None if its parameters stay. See `start`.
-
-        What `random` chooses depends on the sequence, and on which repeat of a replay it is.
-        """
-        if mode == UNTRAINED:
-            return UntrainedSelector(self.untrained_sets(), self.sub_trajectory)
-        if not self.adapts(mode):
-            return None
-        model = needed(mode, model)
-        if mode == EVEN:
-            return EvenSelector(model.sets, list(self.members(mode, model)))
-        if mode == RANDOM:
-            candidates = list(self.members(mode, model))
-            seed = random_seed(sequence or "", repeat)
-            return RandomSelector(model.sets, candidates, model.fixed, seed)
-        descriptors, rule = self.descriptors, mode
-        if mode not in self.rules:
-            model, rule = _adapting(model), "adaptive"
-        if self._mechanism(mode, model) != "bank":
-            return Selector(model, rule, (), descriptors)
-        members, measures = list(self.members(mode, model)), mode != LEARNED
-        return Selector(model, rule, members, descriptors, measures)
-
-    def members(self, mode: str, model: ErrorModel) -> dict[int, ParameterSet]:
-        """The members of the bank that a mode drives, or among which it chooses.
-
-        The bank's reserve joins in by what is measured: other modes than those have none.
-        """
+    def _always(self, model: ErrorModel) -> dict[int, ParameterSet]:
+        """The bank's members without its reserve, which joins in by what is measured."""
+        reserve = model.bank[len(model.bank) - model.bank_settings.reserve :]
         members = bank_members(self.switching, model)
-        if mode in MEASURING:
-            return members
-        reserve = _adapting(model).reserve
-        return {trial: of for trial, of in members.items() if trial not in reserve}
+        return {trial: own for trial, own in members.items() if trial not in reserve}
 
-    def adapts(self, mode: str) -> bool:
-        """Whether a mode has a selector."""
-        return mode in (UNTRAINED, *self.rules, *BANKS, *SINGLES)
+    def _untrained_sets(self) -> ParameterSets:
+        """The members of the bank that needs no model."""
+        return untrained_sets(self.odometry.space, self.switching.size)
 
-    def fixed(self, mode: str, model: ErrorModel) -> int:
-        """Trial number of the set that a mode begins with."""
-        if mode == UNTRAINED:
-            return self.untrained_sets().trials[0]
-        if self.adapts(mode) and self._mechanism(mode, model) == "bank":
-            return next(iter(self.members(mode, model)))
-        return model.fixed
-
-    def core_ms(self, mode: str, model: ErrorModel | None) -> float:
-        """Milliseconds that a scan keeps the busiest core at work; NaN if that was not measured."""
-        if mode == UNTRAINED or model is None or model.costs is None:
-            return np.nan
-        if mode == BASELINE:
-            return model.costs.alone(0)
-        if not self.adapts(mode):
-            return model.costs.alone(model.rivals.get(mode, model.fixed))
-        if self._mechanism(mode, model) != "bank":
-            return max(model.costs.adaptive([trial]) for trial in model.sets)
-        members = self.members(mode, model)
-        return model.costs.adaptive(members) / min(len(members), self.cores)
-
-    def _bank(self, sets: Mapping[int, ParameterSet]) -> Bank:
-        # Where no scan is dropped, no member is left behind either.
-        waits = self.real_time is None or not self.real_time.queue
-        rate = None if self.real_time is None or waits else self.real_time.rate
-        return Bank(self.odometry, sets, self.warm_up, self.lost_track, self.cores, rate)
-
-    def _mechanism(self, mode: str, model: ErrorModel) -> Mechanism | None:
-        if mode in BANKS:
-            return "bank"
-        mechanism = self.mechanism
-        if mode in SINGLES and mechanism == "bank":
-            mechanism = "live"
-        return mechanism_of(mode, model, mechanism, self.odometry.description.live)
+    @property
+    def _cores(self) -> int:
+        """Cores that the members of a bank may use."""
+        return min(self.switching.cores or together(), together())
 
 
-def _adapting(model: ErrorModel) -> ErrorModel:
-    """The model with settings that adapt, also where the fixed set has less expected loss."""
-    adapt = {"adapt": True}
-    return replace(
-        model,
-        paired=model.paired.model_copy(update=adapt),
-        bank_settings=model.bank_settings.model_copy(update=adapt),
-    )
-
-
-def needed(mode: str, model: ErrorModel | None) -> ErrorModel:
+def needed(name: str, model: ErrorModel | None) -> ErrorModel:
     """The model of a mode that cannot do without.
 
     Raises
@@ -434,24 +286,23 @@ def needed(mode: str, model: ErrorModel | None) -> ErrorModel:
         If there is none.
     """
     if model is None:
-        raise ModeError(f"{mode}: needs an error model; run `adaptune offline`, which fits one")
+        raise ModeError(f"{name}: needs an error model; run `adaptune offline`, which fits one")
     return model
 
 
-def sequences_without_model(study: Study) -> tuple[str, ...]:
+def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
     """The sequences to replay without a model: those of the test, or if it names none, all.
 
     A recording of which `training` names parts is replayed as a whole.
     """
-    config = study.config
     if config.test:
         return config.test
     recorded = {name: entry.part for name, entry in config.sequences.items()}
     parts = recorded | {name: course.part for name, course in config.courses.items()}
 
-    def of_another(name: str) -> bool:
+    def is_part(name: str) -> bool:
         part = parts[name]
         whole = name if part is None else name.removesuffix(part_name("", part))
         return whole != name and whole in parts
 
-    return tuple(name for name in parts if not of_another(name))
+    return tuple(name for name in parts if not is_part(name))

@@ -40,7 +40,7 @@ POINTS, TF, REFERENCE = "/points", "/tf", "/reference/path"
 """Topics that belong to no mode."""
 ODOM, SENSOR = "odom", "sensor"
 """Frames: that of all poses, and that of the clouds."""
-_PLACING = ("adaptive", "bank", "one_set", "untrained", "paper", "fixed")
+_PLACING = ("adaptive", "untrained", "paper", "fixed")
 """Modes whose poses place the clouds, the first that was replayed."""
 _ERRORS = {
     "predicted_error": "predicted_error_percent",
@@ -76,7 +76,7 @@ def replayed_sequences(study: Study, wanted: Sequence[str] = ()) -> list[str]:
         If there is none, or not one that is wanted.
     """
     config = study.config
-    default = sequences_without_model(study)
+    default = sequences_without_model(study.config)
     every = dict.fromkeys([*default, *config.sequences, *config.courses])
     there = [name for name in every if replayed_modes(study, name)]
     for name in wanted:

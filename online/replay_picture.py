@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from adaptune.report.paper import LINES, OTHERS, as_png_and_svg, log_scale, picture, plain
 from adaptune.space import ParameterSpace
-from adaptune.study.config import ALSO
 
 _HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---")
 _MARKS = 60
@@ -19,8 +18,6 @@ _MARKS = 60
 _MARGIN = 0.5
 """By how much of its extent the picture may reach beyond the reference."""
 _ESTIMATE = OTHERS[4]
-FEW = 3
-"""Modes on demand that are drawn; where there are more, none is."""
 
 
 class Track(NamedTuple):
@@ -62,12 +59,6 @@ class Track(NamedTuple):
             if not marked or self.seconds[i] - self.seconds[marked[-1]] > apart:
                 marked.append(i)
         return marked
-
-
-def drawn_modes(modes: Sequence[str]) -> list[str]:
-    """Those of some modes that a picture shows, so that it can be read."""
-    on_demand = [mode for mode in modes if mode in ALSO and mode != "untrained"]
-    return [mode for mode in modes if len(on_demand) <= FEW or mode not in on_demand]
 
 
 def draw_replays(

@@ -20,7 +20,6 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError, OdometryError, nearest
 from adaptune.geometry import Poses, invert
-from adaptune.model import ErrorModel
 from adaptune.odometry.base import LastMotion, Motions, OdometryInstance, Registration, Usage
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.clouds import POSES
@@ -29,13 +28,13 @@ from adaptune.recording.opening import imu_settings
 from adaptune.recording.scan import Scan, Timing
 from adaptune.ros.link import RosLink, Steering
 from adaptune.selection import Selection
-from adaptune.selector import BACK, AnySelector, Selector
+from adaptune.selector import BACK, Selector
 from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, SteerConfig
 from adaptune.study.study import ModeError, Study
 from adaptune.trajectory import Trajectory, tum_lines
 from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
-from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, needed
+from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive, SelectorProcess, outlook
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
 from online.replay import Choice, Look, Progressed, RealTimeRecord
@@ -319,23 +318,33 @@ class RobotDrive:
         real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
         # What is only compared with is for replays.
         setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
-        self._study, self._mode, self._setup, self._settings = study, mode, setup, real_time
+        self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
         self._model = None if model_path is None else setup.model(study, model_path)
         self._like = _like(study)
         self._scans: LiveScans | None = None
         self._stopped = False
-        modes = WITHOUT_MODEL if self._model is None else (*setup.modes(self._model), UNTRAINED)
+        modes: tuple[str, ...] = WITHOUT_MODEL
+        if self._model is not None:
+            rules = config.online.rules if self._steers else ()
+            modes = (*dict.fromkeys((*setup.modes(self._model), *rules)), UNTRAINED)
         if mode not in modes:
             raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
         if self._ros.steer is not None:
             if mode not in config.online.rules:
                 raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
+            model = needed(mode, self._model)
+            fixed = {model.fixed: model.sets[model.fixed]}
+            # A node that is steered has one set at a time.
+            make = partial(Selector, model, mode, (), setup.descriptors)
+            self._mode = Mode(mode, fixed, selector=make)
         elif study.odometry.description.whole:
             raise ModeError(
                 f"{study.odometry.name} runs whole recordings: name the node that runs it on the "
                 f"robot (online.ros.steer)"
             )
+        else:
+            self._mode = setup.mode(mode, self._model)
 
     def run(self, link: RosLink, look: Look = lambda *_: None) -> DriveRecord:
         """Drive until Ctrl-C, or until `stop` is called.
@@ -353,15 +362,15 @@ class RobotDrive:
         with ExitStack() as stack:
             steered = None if self._ros.steer is None else SteeredNode(link, self._ros.steer)
             selector = None
-            if steered is not None or self._setup.adapts(self._mode):
-                make = partial(_selector, self._setup, self._mode, self._model, self._steers)
+            if self._mode.selector is not None:
                 period = self._study.config.online.period
-                selector = stack.enter_context(closing(SelectorProcess(make, period)))
+                selector = SelectorProcess(self._mode.selector, period)
+                stack.enter_context(closing(selector))
             self._scans = scans = self._topics(link)
             publisher = _Publisher(link, self._study, scans)
             driven = None
             while driven is None or not (scans.stopped or self._stopped):
-                odometry = steered or self._setup.instance(self._mode, self._model)
+                odometry = steered or self._setup.instance(self._mode)
                 with closing(odometry):
                     driven = self._part(odometry, selector, publisher, look, done)
                 done = driven.scans
@@ -501,15 +510,6 @@ def _like(study: Study) -> SequenceConfig:
     if name not in known:
         raise AdaptuneError(f"online.ros.like: no sequence {name!r}; {nearest(name, known)}")
     return study.sequences.config(name)
-
-
-def _selector(
-    setup: ReplaySetup, mode: str, model: ErrorModel | None, steers: bool
-) -> AnySelector | None:
-    """Make the selector; a node that is steered has one set at a time."""
-    if not steers:
-        return setup.selector(mode, model)
-    return Selector(needed(mode, model), mode, (), setup.descriptors)
 
 
 def _topic(link: RosLink, name: str | None, kind: str, key: str) -> str:

@@ -16,8 +16,8 @@ from adaptune.selection import Selection
 from adaptune.study.config import StudyConfig
 from adaptune.study.inputs import odometry_inputs
 from adaptune.study.references import ensure_references
-from adaptune.study.study import Study, cannot_adapt
-from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
+from adaptune.study.study import Study
+from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import (
     ReplayIdentity,
@@ -81,16 +81,13 @@ def run_replays(
     model = setup.model(study, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
-    names = setup.modes(model)
-    if not {"adaptive", "paper"}.intersection(names):
-        _log.warning("only the fixed set is driven, because %s", cannot_adapt(study))
-    for mode in setup.also:
-        if (twin := setup.twin(mode, model)) != mode:
-            _log.info("%s is not replayed again: %s drives the same", mode, twin)
-        elif why := setup.obstacle(mode, model):
-            _log.warning("%s is not replayed: %s", mode, why)
-    of = _Modes(setup, names, look, model, model_path)
-    return _replay_all(study, study.config.test, of, again, progress)
+    asked = (*study.config.online.rules, *setup.also)
+    obstacles = {name: setup.obstacle(name, model) for name in asked}
+    for why in dict.fromkeys(filter(None, obstacles.values())):
+        names = " and ".join(name for name in asked if obstacles[name] == why)
+        _log.warning("not replayed: %s, because %s", names, why)
+    modes = _Modes(setup, setup.modes(model), look, model, model_path)
+    return _replay_all(study, study.config.test, modes, again, progress)
 
 
 def run_untrained(
@@ -110,9 +107,9 @@ def run_untrained(
         If a bank of the odometry is not possible.
     """
     setup = ReplaySetup.of(study)
-    setup.untrained_sets()
+    setup.mode(UNTRAINED)  # or an error
     modes = _Modes(setup, WITHOUT_MODEL, look)
-    return _replay_all(study, sequences_without_model(study), modes, again, progress)
+    return _replay_all(study, sequences_without_model(study.config), modes, again, progress)
 
 
 class _Run(NamedTuple):
@@ -205,7 +202,8 @@ def _replay_due(
         write_replay(repeat_folder(folder / run.mode, run.repeat), result, about, modes.model_path)
         if modes.model is not None and result.choices:
             selections = [choice.selection for choice in result.choices]
-            warn_of_scant_evidence(what, selections, modes.setup.fixed(run.mode, modes.model))
+            fixed = modes.setup.mode(run.mode, modes.model).fixed
+            warn_of_scant_evidence(what, selections, fixed)
 
 
 def _watch(progress: Progress, look: Look | None, what: str, n: int, at: Progressed) -> None:
@@ -226,14 +224,9 @@ def _renew_reference(study: Study, name: str, replayed: Path) -> None:
 
 
 def _in_lockstep(
-    config: StudyConfig,
-    sequence: Recording,
-    run: _Run,
-    modes: _Modes,
-    watch: Watch,
+    config: StudyConfig, sequence: Recording, run: _Run, modes: _Modes, watch: Watch
 ) -> Replay:
-    odometry = modes.setup.instance(run.mode, modes.model, run.sequence)
-    selector = modes.setup.selector(run.mode, modes.model, run.sequence, run.repeat)
+    odometry, selector = modes.setup.start(run.mode, modes.model, run.sequence)
     with closing(odometry):
         return replay(
             sequence,
@@ -248,20 +241,16 @@ def _in_lockstep(
 
 
 def _in_real_time(
-    config: StudyConfig,
-    sequence: Recording,
-    run: _Run,
-    modes: _Modes,
-    watch: Watch,
+    config: StudyConfig, sequence: Recording, run: _Run, modes: _Modes, watch: Watch
 ) -> Replay:
-    period, setup = config.online.period, modes.setup
     assert config.online.real_time is not None
-    odometry = setup.instance(run.mode, modes.model, run.sequence)
+    mode = modes.setup.mode(run.mode, modes.model)
+    odometry = modes.setup.instance(mode, run.sequence)
     selector = None
     with closing(odometry), ExitStack() as stack:
-        if setup.adapts(run.mode):
-            make = partial(setup.selector, run.mode, modes.model, run.sequence, run.repeat)
-            selector = stack.enter_context(closing(SelectorProcess(make, period)))
+        if mode.selector is not None:
+            selector = SelectorProcess(mode.selector, config.online.period)
+            stack.enter_context(closing(selector))
         return replay_in_real_time(
             sequence,
             odometry,
@@ -270,7 +259,7 @@ def _in_real_time(
             selector,
             watch,
             str(run),
-            setup.core_ms(run.mode, modes.model),
+            modes.setup.core_ms(mode, modes.model),
         )
 
 

@@ -124,7 +124,6 @@ class ComparisonRow:
     gap_closed: float | None = None
     # By mode, that of this mode's error to the other one's; of controls and rivals.
     against: Mapping[str, Ratio] = field(default_factory=dict)
-    twin: str = ""  # the mode whose replay this is, of a mode that drives the same and is not shown
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
@@ -157,7 +156,6 @@ class ComparisonRow:
             "_estimated_low": estimated_low,
             "_estimated_high": estimated_high,
             "_repeats": self.repeats,
-            "_twin": self.twin or None,
             "_worst_tenth": self.worst_tenth,
             "_stretches": self.stretches,
             "_better": self.better,

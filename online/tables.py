@@ -17,11 +17,10 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     Parameters
     ----------
     rows
-        Of one study. Those of a twin are left out, see `ComparisonRow.twin`.
+        Of one study.
     length
         Metres of a sub-trajectory.
     """
-    rows = [row for row in rows if not row.twin]
     made = [_of_modes(rows, length)]
     if rows[-1].sequence == ALL:
         made.append(_of_sequences(rows, length))
@@ -36,11 +35,7 @@ _DRIVEN = {
     "fixed": "the one set that is best in training",
     "adaptive": "what adapts with the least expected loss in training, or the fixed set",
     "untrained": "a bank without a model: sets around the baseline, weighed while driving",
-    "one_set": "one set at a time, chosen by how sets compare with the fixed one",
-    "bank": "several sets side by side; their mean motion, weighed by training and while driving",
-    "bank_learned": "the same bank, weighed by training alone",
-    "even": "the same bank with even weights: a control, which chooses nothing",
-    "random": "at every selection a random member of the bank: a control, which chooses nothing",
+    "even": "the bank with even weights: a control, which chooses nothing",
     "paper": "the set with the least expected error, as Koide et al. (IROS 2021) choose it",
     ORACLES[0]: "the best set of each sequence, known in hindsight only",
     ORACLES[1]: "the best set of every period between selections, known in hindsight only",
@@ -50,7 +45,7 @@ _DRIVEN = {
 
 def modes_in_words(rows: Sequence[ComparisonRow]) -> Listing:
     """What each mode of the tables drives, for readers without the guide."""
-    modes = dict.fromkeys(row.mode for row in rows if not row.twin)
+    modes = dict.fromkeys(row.mode for row in rows)
     cells = [{"mode": mode, "what it drives": _DRIVEN[mode]} for mode in modes]
     return Listing("What the modes are", cells)
 
@@ -63,7 +58,6 @@ def side_by_side(studies: Mapping[str, Sequence[ComparisonRow]]) -> list[Listing
     studies
         The rows of each by its name. Sub-trajectories of all have the same length.
     """
-    studies = {name: [row for row in rows if not row.twin] for name, rows in studies.items()}
     found = {
         (name, row.sequence, row.mode): row.rte for name, rows in studies.items() for row in rows
     }

@@ -9,7 +9,6 @@ from online.statistics import ALL, NO_DIFFERENCE, ORACLES, ComparisonRow, Ratio
 NEARLY = 0.05
 """Where a whole interval lies within this share of 1, there is no difference."""
 CONTROLS = {
-    "random": "Switching at random among the members of the study's bank",
     "even": "The study's bank with even weights",
 }
 """Modes that choose nothing, in words."""
@@ -282,7 +281,6 @@ _WHOLE = 0.95
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """In words: what was gained, and what must be known to trust it."""
-    rows = [row for row in rows if not row.twin]
     return (
         verdict(rows)
         + _lengths(rows)

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,15 +39,6 @@ Rate = Annotated[
 ]
 
 
-Pin = Annotated[
-    list[str],
-    typer.Option(
-        metavar="KEY=VALUE",
-        help="Hold a parameter at this value in all sets but the baseline. May be repeated.",
-    ),
-]
-
-
 Mode = Annotated[
     str | None,
     typer.Option(
@@ -67,7 +58,6 @@ def online(
     ] = None,
     again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
     rate: Rate = None,
-    pin: Pin = [],  # noqa: B006
     untrained: Annotated[
         bool,
         typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
@@ -90,9 +80,8 @@ def online(
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
 
-    With `--thorough`, it replays all modes to compare with (`online.also`): one set at a time and
-    the bank, whatever is driven, the bank without live evidence, with even weights, random sets,
-    and the untrained bank.
+    With `--thorough`, it replays all modes to compare with (`online.also`): the bank with even
+    weights, and the untrained bank.
 
     With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
     so are scans that wait too long.
@@ -103,7 +92,7 @@ def online(
         _check_untrained(model, mode)
     if thorough and (untrained or ros or ros2):
         raise AdaptuneError("--thorough is for replays with a model; leave out the other option")
-    override = [*override, *_as_overrides(rate, pin, thorough=thorough)]
+    override = [*override, *_as_overrides(rate, thorough=thorough)]
     loaded = load(study, override, folder)
     if ros or ros2:
         if (ros and ros2) or rate is not None:
@@ -126,12 +115,9 @@ def _check_untrained(model: Path | None, mode: str | None) -> None:
         raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
 
 
-def _as_overrides(rate: float | None, pin: Sequence[str], *, thorough: bool) -> list[str]:
+def _as_overrides(rate: float | None, *, thorough: bool) -> list[str]:
     """The options that stand for keys of the study."""
-    if wrong := [given for given in pin if "=" not in given]:
-        raise AdaptuneError(f"--pin {wrong[0]}: give a parameter and its value, KEY=VALUE")
-    given = [f"online.pin.{one}" for one in pin]
-    given += ["online.also=all"] if thorough else []
+    given = ["online.also=all"] if thorough else []
     return given + ([] if rate is None else [f"online.real_time.rate={rate:g}"])
 
 
@@ -166,7 +152,7 @@ def _replay(
             made = run_replays(loaded, path, again, show, dashboard.look)
     repeats = loaded.config.online.repeats
     if untrained:
-        return made, len(sequences_without_model(loaded)) * len(WITHOUT_MODEL) * repeats
+        return made, len(sequences_without_model(loaded.config)) * len(WITHOUT_MODEL) * repeats
     modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
     return made, len(loaded.config.test) * len(modes) * repeats
 

@@ -68,7 +68,7 @@ def study_page(
 
     makers: list[_Maker] = [_comparison]
     # Without a test, some may have been replayed without a model.
-    others = sequences_without_model(study)
+    others = sequences_without_model(study.config)
     replayed = [name for name in others if (study.folder / "replays" / name).exists()]
     names = study.config.test or replayed
     makers += [partial(_along, sequence=name) for name in names]

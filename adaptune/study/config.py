@@ -4,7 +4,7 @@ import re
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
     AfterValidator,
@@ -211,17 +211,19 @@ class RosConfig(StrictModel):
     router: str = "127.0.0.1:7447"
 
 
-def _rule_name(name: Any) -> Any:
+def _mode_name(name: Any) -> Any:
     if name == "paired":
         raise ValueError("paired is now called adaptive")
+    if name in ("one_set", "bank", "bank_learned", "random"):
+        raise ValueError(f"{name} is gone: a mode that served research; leave it out")
     return name
 
 
-Rule = Annotated[Literal["adaptive", "paper"], BeforeValidator(_rule_name)]
+Rule = Annotated[Literal["adaptive", "paper"], BeforeValidator(_mode_name)]
 """Selects parameters in a replay."""
+Also = Annotated[Literal["even", "untrained"], BeforeValidator(_mode_name)]
 
-Also = Literal["one_set", "bank", "bank_learned", "even", "random", "untrained"]
-ALSO: tuple[Also, ...] = get_args(Also)
+ALSO = ("even", "untrained")
 """Modes that are replayed only on demand, to compare with."""
 
 
@@ -229,13 +231,11 @@ class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, selection rules, switching, and what it may cost.
 
     `also` names modes that are replayed besides, or `all`. Each mode is replayed `repeats` times.
-    Parameters of `pin` have these values in all sets.
     The budget is in milliseconds of CPU time a scan, all members and live evidence together.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
-    pin: dict[str, Value] = Field(default_factory=dict)
     rules: tuple[Rule, ...] = ("adaptive", "paper")
     also: tuple[Also, ...] = ()
     repeats: int = Field(1, ge=1, le=20)
@@ -251,7 +251,7 @@ class OnlineConfig(StrictModel):
 
     @field_validator("also")
     @classmethod
-    def _once(cls, also: tuple[Also, ...]) -> tuple[Also, ...]:
+    def _once(cls, also: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(also)) < len(also):
             raise ValueError("a mode is named twice")
         return also

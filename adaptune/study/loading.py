@@ -21,7 +21,6 @@ from adaptune.space import (
     Integer,
     ParameterSpace,
     PooledSpace,
-    describe,
 )
 from adaptune.strict import ConfigurationError, Key, Mistake, validated, validated_rest
 from adaptune.study.config import OdometryConfig, StudyConfig, settle_roles
@@ -91,7 +90,6 @@ def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace |
     space = PooledSpace(labelled) if len(entries) > 1 else next(iter(spaces.values()))
     if not mistakes:
         mistakes += _check_switching(config, list(described.values()), space)
-        mistakes += _check_pins(config.online.pin, space)
     return mistakes, space
 
 
@@ -220,20 +218,6 @@ def _check_set(at: Key, given: Mapping[str, Any], space: ParameterSpace) -> Iter
         if name not in space.names:
             message = f"there is no such parameter; {nearest(name, space.names)}"
             yield Mistake((*at, name), message)
-
-
-def _check_pins(pins: Mapping[str, Any], space: ParameterSpace) -> Iterable[Mistake]:
-    """Find parameters that no odometry has, and values that none can have."""
-    spaces = list(space.spaces.values()) if isinstance(space, PooledSpace) else [space]
-    for name, value in pins.items():
-        having = [one.parameters[name] for one in spaces if name in one.parameters]
-        if not having:
-            every = [known for one in spaces for known in one.names]
-            message = f"there is no such parameter; {nearest(name, every)}"
-            yield Mistake(("online", "pin", name), message)
-        elif wrong := [one for one in having if not one.contains(value)]:
-            message = f"{value!r} is outside {describe(wrong[0])}"
-            yield Mistake(("online", "pin", name), message)
 
 
 def _check_switching(

@@ -306,7 +306,10 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     number = f"trial {named(model, model.fixed)}" + ("" if model.fixed else ", the baseline")
     fixed = f"`online` will drive the fixed set ({number})"
     if not study.rules:
-        return Driven(None, f"{fixed} only, because {cannot_adapt(study)}.")
+        why = "no rule is named (online.rules)"
+        if study.mechanism is None:
+            why = cannot_adapt(study.odometry, None)
+        return Driven(None, f"{fixed} only, because {why}.")
     if "adaptive" not in study.rules:
         return Driven(None, "`online` will drive `paper`, and not `adaptive` (online.rules).")
     live = study.odometry.description.live
@@ -332,17 +335,16 @@ def driven(study: Study, model: ErrorModel) -> Driven:
     return Driven(None, f"{fixed} as `adaptive`, because {why}")
 
 
-def cannot_adapt(study: Study) -> str:
-    """Why no mode of a study adapts."""
-    name = study.odometry.name
-    if study.odometry.description.whole:
+def cannot_adapt(odometry: Factory, mechanism: Mechanism | None) -> str:
+    """Why an odometry keeps its set, given how it might change it."""
+    if odometry.description.whole:
         return "a program that runs whole recordings cannot change its parameters"
-    if not study.config.online.rules:
-        return "no rule is named (online.rules)"
-    why = "the model has no bank"
-    if study.mechanism is None:
-        why = "a bank needs more than one core and more memory (online.switching)"
-    return f"{name} cannot change its parameters between scans, and {why}"
+    why = "the model has none"
+    if mechanism is None:
+        why = "there are too few cores or too little memory for one (online.switching)"
+    return (
+        f"{odometry.name} cannot change its parameters between scans: that takes a bank, and {why}"
+    )
 
 
 def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism | None) -> str:

@@ -129,20 +129,3 @@ def test_what_is_not_installed_is_named_first(study_of, monkeypatch):
     monkeypatch.setattr(evalio, "evalio_modules", missing)
     text = refused(study_of, "\n  - gicp\n  - mad_icp")
     assert "line 3: odometry.1.name: evalio cannot be imported" in text
-
-
-@pytest.mark.parametrize(
-    ("pin", "said"),
-    [
-        ("keyframe_intervall=2", "online.pin.keyframe_intervall: there is no such parameter"),
-        ("keyframe_interval=400", "online.pin.keyframe_interval: 400 is outside"),
-        ("resolution=fine", "online.pin.resolution: 'fine' is outside"),
-    ],
-)
-def test_pins_that_are_refused(study_of, pin, said):
-    assert said in refused(study_of, TWO, f"online.pin.{pin}")
-
-
-def test_pins(study_of):
-    study = study_of(TWO, "online.pin.keyframe_interval=3", "online.pin.resolution=2.0")
-    assert study.config.online.pin == {"keyframe_interval": 3, "resolution": 2.0}

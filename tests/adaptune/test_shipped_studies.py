@@ -37,5 +37,4 @@ def test_studies_of_third_party_odometries_load(name: str, tmp_path: Path) -> No
     assert f"configs/{name}.yaml" in (CONFIGS / f"{name}.yaml").read_text(encoding="utf-8")
     tuned = study.config.odometry.parameters  # type: ignore[union-attr]
     assert set(tuned or {}) <= set(study.odometry.space.parameters)
-    assert set(study.config.online.also) == {"bank", "one_set"}
     assert study.odometry.description.live == (name == "third_party_kiss_icp")

@@ -18,10 +18,7 @@ from online.compare import compare, compared_modes
 from online.record import StoredReplayError, read_repeats, repeat_folder
 from online.run import run_replays, run_untrained
 
-EVERY = [
-    *("baseline", "fixed", "adaptive", "untrained", "one_set", "bank", "bank_learned"),
-    *("even", "random", "paper"),
-]
+EVERY = ["baseline", "fixed", "adaptive", "untrained", "even", "paper"]
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +29,7 @@ def load(study_file, trained_folder, tmp_path_factory):
     model, off = ErrorModel.load(path), {"adapt": False}
     errors = model.errors.copy()
     errors[:, model.sets.column(model.bank[1])] *= 0.1
-    settings = {"adaptive": PairedSettings(**off), "bank_settings": BankSettings(**off)}
+    settings = {"paired": PairedSettings(**off), "bank_settings": BankSettings(**off)}
     replace(model, errors=errors, **settings).save(path)
     return lambda *overrides, at=folder: load_study(study_file, overrides, at)
 
@@ -71,37 +68,21 @@ def test_all_are_compared_in_the_order_of_their_lines(replayed):
 
 def test_they_do_what_their_names_say(replayed):
     model = ErrorModel.load(replayed.model_path)
-    # The study keeps the fixed set; these modes adapt all the same.
+    # The study keeps the fixed set.
     assert {int(row["trial"]) for row in selections(replayed, "adaptive")} == {model.fixed}
-    chosen = {int(row["trial"]) for row in selections(replayed, "one_set")}
-    assert model.bank[1] in chosen
-    assert about(replayed, "one_set")["switching"]["mechanism"] == "live"
-    for mode in ("bank", "bank_learned"):
-        weights = {row["weights"] for row in selections(replayed, mode)}
-        assert not any(f"{model.fixed}:1.000" in text for text in weights)
-        assert about(replayed, mode)["switching"]["mechanism"] == "bank"
-
-    def estimated(mode):
-        return [float(row["estimated_error_percent"]) for row in selections(replayed, mode)]
-
-    assert np.isfinite(estimated("bank")).any()
-    assert not np.isfinite(estimated("bank_learned")).any()
     share = f"{1 / len(model.bank):.3f}"
     even = " ".join(f"{member}:{share}" for member in model.bank)
     assert {row["weights"] for row in selections(replayed, "even")} == {even}
-    drawn = [int(row["trial"]) for row in selections(replayed, "random")]
-    assert set(drawn) <= set(model.bank)
-    assert set(drawn) != {model.fixed}
-    assert about(replayed, "random")["switching"]["mechanism"] == "live"
+    assert about(replayed, "even")["switching"]["mechanism"] == "bank"
 
 
 def test_they_are_made_once_and_again_for_another_model(own):
     study = own("online.also=all")
-    before = selections(study, "random")
+    before = selections(study, "adaptive")
     assert run_replays(study, study.model_path) == 0
-    shutil.rmtree(study.folder / "replays/three/random")
+    shutil.rmtree(study.folder / "replays/three/adaptive")
     assert run_replays(study, study.model_path) == 1
-    assert [r["trial"] for r in selections(study, "random")] == [r["trial"] for r in before]
+    assert [r["trial"] for r in selections(study, "adaptive")] == [r["trial"] for r in before]
     # Without being asked for, they are compared if they are there, and renewed by a command.
     other = replace(ErrorModel.load(study.model_path), paired=PairedSettings(threshold=-0.2))
     other.save(study.model_path)
@@ -109,18 +90,8 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert run_replays(plain, plain.model_path) == 2
     with pytest.raises(StoredReplayError, match=r"different models .* --thorough` again"):
         compare(plain)
-    assert run_replays(study, study.model_path) == 4
-    compared = compare(plain)
-    rows = {row.mode: row for row in compared.rows}
-    # Now `adaptive` is one set at a time, too. Programs find both, readers one.
-    assert rows["one_set"].rte == rows["adaptive"].rte
-    assert {row.mode: row.twin for row in compared.rows if row.twin} == {"one_set": "adaptive"}
-    (same,) = compared_modes(plain).words(plain)
-    assert same == "`one_set` is what `adaptive` drives here: it has the same numbers, shown once."
-    assert [said for said in compared.words if "`one_set`" in said] == [same]
-    with (folder := plain.folder / "comparison").joinpath("comparison.csv").open() as file:
-        assert {row["mode"]: row["twin"] for row in csv.DictReader(file)}["one_set"] == "adaptive"
-    assert "| one_set |" not in (folder / "tables.md").read_text("utf-8")
+    assert run_replays(study, study.model_path) == 1
+    assert {row.mode for row in compare(plain).rows} == set(EVERY)
 
 
 def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
@@ -135,9 +106,8 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     assert said == [
         "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
         "missing.",
-        "`untrained` and `one_set` and `bank` and `bank_learned` and `random` and `paper` are not "
-        "compared: there is no replay on four; `adaptune online --untrained` or `adaptune online "
-        "--thorough` or `adaptune online` makes what is missing.",
+        "`untrained` and `paper` are not compared: there is no replay on four; `adaptune online "
+        "--untrained` or `adaptune online` makes what is missing.",
     ]
     shutil.rmtree(both.folder / "replays/four/fixed")
     run_untrained(both)
@@ -175,30 +145,27 @@ def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, t
     ) in compare(both).words
 
 
-def test_every_mode_is_repeated_and_random_sets_differ(own):
-    study = own("online.also=[random]", "online.repeats=3")
+def test_every_mode_is_repeated(own):
+    study = own("online.repeats=3")
     kept = study.folder / "replays/three"
-    assert run_replays(study, study.model_path) == 10
+    assert run_replays(study, study.model_path) == 8
     assert run_replays(study, study.model_path) == 0
-    first, *others = (selections(study, f"random{of}") for of in ("", "/repeat_2", "/repeat_3"))
-    for other in others:
-        assert [row["trial"] for row in other] != [row["trial"] for row in first]
     adaptive = read_repeats(kept / "adaptive")
     assert [replay.summary.about.repeat for replay in adaptive] == [1, 2, 3]
     for replay in adaptive[1:]:
         np.testing.assert_array_equal(
             replay.trajectory.T_world_sensor, adaptive[0].trajectory.T_world_sensor
         )
-    assert [len(read_repeats(kept / mode)) for mode in ("random", "even")] == [3, 1]
+    assert [len(read_repeats(kept / mode)) for mode in ("paper", "even")] == [3, 1]
     # What is left of an interrupted run is made again, and nothing else.
-    (repeat_folder(kept / "random", 2) / "frames.csv").unlink()
-    assert len(read_repeats(kept / "random")) == 1
+    (repeat_folder(kept / "paper", 2) / "frames.csv").unlink()
+    assert len(read_repeats(kept / "paper")) == 1
     assert run_replays(study, study.model_path) == 1
     shutil.rmtree(kept / "fixed/repeat_3")
     (said,) = (said for said in compare(study).words if said.startswith("Replayed less often"))
     assert said.startswith("Replayed less often than 3 times (`adaptune online` goes on): ")
     assert "fixed on three 2" in said
-    assert "random" not in said
+    assert "paper" not in said
     # Repeats of something else do not count.
     other = own("online.period=2", "online.rules=[adaptive]")
     run_replays(other, other.model_path)

@@ -21,7 +21,6 @@ ROWS = [
     row("two", "new_mode", None),
     row("all", "baseline", 1.3),
     row("all", "adaptive", 0.85, 0.8, 0.95),
-    row("all", "bank", 0.85) | {"twin": "adaptive"},
     row("all", "oracle, sequence", 0.6),
 ]
 

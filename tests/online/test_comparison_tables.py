@@ -40,12 +40,6 @@ def test_one_table_of_the_modes_one_of_the_sequences_one_of_standard_errors():
     assert "KITTI" not in f"{standard.title} {standard.caption}"
 
 
-def test_what_is_the_same_as_another_mode_is_shown_once():
-    twins = [replace(r, mode="bank", twin="adaptive") for r in ROWS if r.mode == "adaptive"]
-    assert tables([*ROWS[:-3], *twins[:2], *ROWS[-3:], twins[2]], 25.0) == tables(ROWS, 25.0)
-    assert side_by_side({"a": [*ROWS, twins[2]]}) == side_by_side({"a": ROWS})
-
-
 def test_kittis_errors_are_there_where_they_are_known():
     known = StandardErrors(1.0, 0.1, KittiError(0.5, 0.01, (100.0, 200.0)), 0.1)
     standard = tables([*ROWS[:-1], replace(ROWS[-1], standard=known)], 25.0)[-1]
@@ -71,8 +65,7 @@ def test_references_are_told_where_they_differ():
 
 def test_every_mode_that_may_be_shown_is_put_in_words():
     shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*LINES, *ORACLES)]
-    twin = ComparisonRow("a", "of another", 1.0, 1.0, 0, 0, 0, twin="adaptive")
-    made = modes_in_words([*shown, twin])
+    made = modes_in_words(shown)
     assert [row["mode"] for row in made.rows] == [*LINES, *ORACLES]
 
 

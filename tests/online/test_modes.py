@@ -7,7 +7,7 @@ import pytest
 from random_models import random_model
 
 from adaptune.model import BankSettings, PairedSettings
-from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.space import ParameterSpace
@@ -42,10 +42,8 @@ def test_rivals_are_driven_where_the_model_has_some():
     # One that is the fixed set is not replayed again.
     same = replace(model, rivals={"equal_cost": model.fixed, "best_default": 2})
     assert setup().modes(same)[:3] == ("baseline", "best_default", "fixed")
-    assert setup().parameters("equal_cost", both) == both.sets[6]
-    assert setup().parameters("best_default", both) == both.sets[2]
-    assert setup().parameters("fixed", both) == both.sets[4]
-    assert setup().parameters("adaptive", both) is None
+    for mode, trial in {"equal_cost": 6, "best_default": 2, "fixed": 4}.items():
+        assert setup().mode(mode, both)[1:] == ({trial: both.sets[trial]}, False, None)
     identity = setup().identity("equal_cost", both, "digest")
     assert identity["parameters"] == both.sets[6]
     # Another model with the same rival replays the same.
@@ -58,9 +56,11 @@ def test_a_rival_keeps_its_parameters():
     rng = np.random.default_rng(0)
     own = tuple(gicp.from_unit(rng.random((len(model.sets), len(gicp)))))
     sets = replace(model.sets, space=gicp, parameters=own)
-    driven = setup().start("equal_cost", replace(model, sets=sets, rivals={"equal_cost": 6}))
-    assert driven.selector is None
-    assert driven.odometry.odometry.parameters == sets[6]
+    odometry, selector = setup().start(
+        "equal_cost", replace(model, sets=sets, rivals={"equal_cost": 6})
+    )
+    assert selector is None
+    assert odometry.odometry.parameters == sets[6]
 
 
 def test_a_model_for_another_budget_is_refused(tmp_path):
@@ -72,57 +72,44 @@ def test_a_model_for_another_budget_is_refused(tmp_path):
             setup(given).check(replace(model, budget=fitted), tmp_path)
 
 
-def test_what_is_pinned_has_its_value_in_all_sets():
+def test_a_mode_is_replayed_where_it_is_possible():
     model = random_model()
-    pinning = replace(setup(), pins={"points": 7})
-    held = pinning.pinned(model)
-    assert {of["points"] for of in held.sets.parameters} == {7}
-    assert [of | {"points": 0} for of in held.sets.parameters] == [
-        of | {"points": 0} for of in model.sets.parameters
-    ]
-    assert held.digest != model.digest
-    assert setup().pinned(model) is model
-    gicp = replace(pinning, pins={"keyframe_interval": 2.5})
-    members = gicp.untrained_sets().parameters
-    assert {of["keyframe_interval"] for of in members} == {2.5}
-    assert len({of["max_correspondence_distance"] for of in members}) == len(members)
+    asked = replace(setup(), also=ALSO)
+    every = ("baseline", "fixed", "adaptive", "untrained", "even", "paper")
+    odometry = replace(asked.odometry, space=odometry_class("gicp").space)
+    asked = replace(asked, odometry=odometry)
+    assert asked.modes(model) == every
+    # A bank of one member, and an odometry that cannot change its set.
+    alone = replace(model, bank=[4], vectors=np.zeros((50, 1, 3), np.float32))
+    assert asked.modes(alone) == tuple(mode for mode in every if mode != "even")
+    assert "no other member" in asked.obstacle("even", alone)
+    stiff = replace(asked, odometry=OdometryPool({"a": odometry, "b": odometry}), mechanism="bank")
+    unpaying = replace(alone, bank_settings=BankSettings(adapt=False))
+    assert "cannot change its parameters between scans" in stiff.obstacle("adaptive", unpaying)
+    assert "adaptive" in stiff.modes(replace(model, paired=PairedSettings(adapt=False)))
 
 
-def test_a_mode_on_demand_that_is_another_one_is_not_replayed_again():
-    model = random_model()
-    asked = replace(setup(), also=("one_set", "bank", "even", "random"))
-    demand = ("bank", "even", "random")
-    # One set at a time is what `adaptive` drives.
-    assert asked.modes(model) == ("baseline", "fixed", "adaptive", *demand, "paper")
-    fixed = replace(model, paired=PairedSettings(adapt=False))
-    assert asked.modes(fixed)[3:5] == ("one_set", "bank")
-    with_bank = replace(asked, mechanism="bank")
-    assert with_bank.modes(model)[3:6] == ("one_set", "even", "random")
-    assert with_bank.twin("bank", model) == "adaptive"
-    unpaying = replace(fixed, bank_settings=BankSettings(adapt=False))
-    assert with_bank.modes(unpaying)[3:5] == ("one_set", "bank")
-    # The bank that is driven may rest, the one on demand does not.
-    assert with_bank.identity("adaptive", unpaying)["switching"]["mechanism"] == "bank"
-    # Controls have no reserve, and `adaptive` has one.
-    bank, vectors = [*model.bank, 0], np.zeros((len(model.errors), 3, 3), np.float32)
-    reserve = replace(model, bank=bank, vectors=vectors, bank_settings=BankSettings(reserve=1))
-    few = replace(with_bank, switching=SwitchingConfig(size=2))
-    assert list(few.members("adaptive", reserve)) == reserve.bank
-    assert list(few.members("even", reserve)) == reserve.bank[:-1]
-    # Without `adaptive`, nothing is.
-    alone = replace(asked, rules=("paper",))
-    assert alone.modes(model) == ("baseline", "fixed", "one_set", *demand, "paper")
-    assert all(alone.identity(mode, model, "of it")["model"] == "of it" for mode in demand)
-    assert alone.identity("random", model)["switching"]["seed"] == 0
-
-
-def test_a_bank_of_one_member_is_not_compared_with():
-    model = replace(random_model(), bank=[4], vectors=np.zeros((50, 1, 3), np.float32))
-    asked = replace(setup(), also=("one_set", "bank", "even", "random", "untrained"))
-    assert asked.modes(replace(model, paired=PairedSettings(adapt=False)))[3:] == (
-        *("untrained", "one_set", "paper"),
+def test_what_each_mode_drives():
+    model = replace(random_model(), rivals={"equal_cost": 6})
+    live = replace(setup(), switching=SwitchingConfig(size=2))
+    bank = replace(live, mechanism="bank")
+    assert list(live.mode("adaptive", model).sets) == [model.fixed]
+    assert live.identity("adaptive", model, "of it")["switching"] == {"mechanism": "live"}
+    assert bank.identity("adaptive", model, "of it")["switching"]["mechanism"] == "bank"
+    # The bank that is driven may rest.
+    rests = replace(
+        model, paired=PairedSettings(adapt=False), bank_settings=BankSettings(adapt=False)
     )
-    assert "no other member" in asked.obstacle("even", model)
+    assert bank.mode("adaptive", rests).bank
+    # Only `adaptive` has a reserve.
+    vectors = np.zeros((len(model.errors), 3, 3), np.float32)
+    members = [*model.bank, 0]
+    reserve = replace(model, bank=members, vectors=vectors, bank_settings=BankSettings(reserve=1))
+    few = replace(bank, switching=SwitchingConfig(size=2))
+    assert list(few.mode("adaptive", reserve).sets) == reserve.bank
+    for name in ("even", "paper"):
+        assert list(few.mode(name, reserve).sets) == reserve.bank[:-1]
+    assert bank.identity("even", model, "of it")["model"] == "of it"
 
 
 def test_a_program_that_runs_whole_recordings_has_none():
@@ -131,3 +118,5 @@ def test_a_program_that_runs_whole_recordings_has_none():
     asked = replace(setup(), odometry=program, rules=(), also=ALSO)
     assert asked.modes(random_model()) == ("baseline", "fixed")
     assert "whole recordings" in asked.obstacle("even", random_model())
+    with pytest.raises(ModeError, match="untrained is not possible: a program that runs whole"):
+        asked.mode("untrained")

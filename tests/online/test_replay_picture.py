@@ -4,7 +4,7 @@ from pictures import MODES, is_white, share_of, texts
 
 from adaptune.report.paper import LINES, OTHERS
 from adaptune.space import Categorical, Float, ParameterSpace
-from online.replay_picture import FEW, Track, draw_replays, drawn_modes
+from online.replay_picture import Track, draw_replays
 
 SECONDS = np.arange(0.0, 20.0, 0.1)
 REFERENCE = np.column_stack([SECONDS, np.sin(SECONDS)])
@@ -175,11 +175,3 @@ def test_a_straight_path_is_no_sliver(tmp_path):
 def test_an_odometry_without_parameters_or_reference_is_drawn(tmp_path):
     bare = track(choices={}, errors=np.full(len(SECONDS), np.nan))
     assert "from above" in drawn(tmp_path, {"baseline": bare, "fixed": bare}, None)[1]
-
-
-def test_few_modes_on_demand_are_drawn_and_many_are_not():
-    usual = ["baseline", "fixed", "adaptive", "untrained", "paper"]
-    few = ["bank", "even", "random"]
-    assert len(few) == FEW
-    assert drawn_modes([*usual, *few]) == [*usual, *few]
-    assert drawn_modes([*usual, *few, "one_set"]) == usual

@@ -83,15 +83,6 @@ def test_a_replay_that_is_too_short_is_told_and_not_drawn(study, study_file, tmp
     assert said in charts_of_replays(own, "three").notes
 
 
-def test_modes_that_are_too_many_to_draw_are_named(study, monkeypatch):
-    monkeypatch.setattr("online.replayed_sequence.drawn_modes", lambda modes: list(modes[:2]))
-    assert list(read_replays(study, "three").modes) == ["baseline", "fixed"]
-    (said,) = (
-        said for said in charts_of_replays(study, "three").notes if said.startswith("No lines")
-    )
-    assert said.startswith("No lines of `adaptive`, `paper` along three: nobody could read charts")
-
-
 def test_scenes_of_a_part_of_a_course_are_those_of_that_part(tmp_path):
     (tmp_path / "course.yaml").write_text(COURSE, "utf-8")
     study = load_study(tmp_path / "course.yaml", [], tmp_path / "study")

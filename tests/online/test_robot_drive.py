@@ -194,7 +194,6 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
         (["--mode", "fixed"], "--mode fixed is for a robot"),
         (["--ros", "--untrained", "--mode", "fixed"], "--untrained is a mode of its own"),
         (["--ros", "-o", "online.ros.points=a b"], "online.ros.points: is no name in ROS: give"),
-        (["--pin", "voxel"], "--pin voxel: give a parameter and its value, KEY=VALUE"),
     ],
 )
 def test_options_that_exclude_each_other(study_file, folder, options, said):

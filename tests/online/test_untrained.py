@@ -165,9 +165,9 @@ def test_it_is_compared_with_the_trained_modes_too(load, trained_folder):
 
 
 def test_without_a_test_all_recordings_are_replayed_whole(load, study_file):
-    assert sequences_without_model(load()) == ("three",)
+    assert sequences_without_model(load().config) == ("three",)
     study = load("test=[]", "training=[one: 0-60%, two]")
-    assert sequences_without_model(study) == ("one", "two", "three")
+    assert sequences_without_model(study.config) == ("one", "two", "three")
     assert run_untrained(load("test=[]", "training=[two]")) == 6
     assert [row.sequence for row in compare(load("test=[]", "training=[two]")).rows][-2:] == [
         "all"
@@ -180,7 +180,7 @@ def test_a_bank_of_what_cannot_be_in_one_is_refused(study_file, tmp_path, load):
     words = [str(study_file), "--untrained", "--folder", str(tmp_path / "run")]
     done = CliRunner().invoke(app, ["online", *words, "-o", WHOLE])
     assert done.exit_code == 2
-    assert "a bank of command is not possible, because the program runs whole" in done.stderr
+    assert "untrained is not possible: a program that runs whole recordings" in done.stderr
     done = CliRunner().invoke(app, ["online", *words, "--model", "some.safetensors"])
     assert done.exit_code == 2
     assert "--untrained uses no model; leave out --model some.safetensors" in done.stderr
@@ -188,7 +188,7 @@ def test_a_bank_of_what_cannot_be_in_one_is_refused(study_file, tmp_path, load):
     for mode in ("fixed", "adaptive"):
         with pytest.raises(ModeError, match=f"{mode}: needs an error model"):
             setup.start(mode)
-    assert setup.start("baseline").selector is None
+    assert setup.start("baseline")[1] is None
 
 
 def test_the_command_line_names_what_follows(study_file, tmp_path):
