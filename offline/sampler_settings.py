@@ -54,7 +54,7 @@ class SamplerError(AdaptuneError):
 class Step(StrictModel):
     """How far a step of annealing moves a parameter.
 
-    ``docs/reference-offline.md`` describes the settings and their defaults.
+    ``docs/reference-study.md`` describes the settings and their defaults.
     """
 
     mu: float | None = None
@@ -69,7 +69,7 @@ class Step(StrictModel):
 class AnnealingSettings(StrictModel):
     """Settings of simulated annealing, with the names they have in RUSTLE.
 
-    ``docs/reference-offline.md`` describes them.
+    ``docs/reference-study.md`` describes them.
     """
 
     initial_temperature: float = Field(0.1, gt=0)
