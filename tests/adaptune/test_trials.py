@@ -162,7 +162,6 @@ def test_csv_opens_in_pandas(tmp_path):
 
 
 def test_the_index_opens_in_pandas(archive):
-    """As docs/reference-study.md says."""
     index = pd.read_json(archive.folder / "index.jsonl", lines=True)
     trials = index.join(pd.json_normalize(index.pop("summary")))
     assert len(trials) == 5
