@@ -28,16 +28,11 @@ from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import places, stretch_numbers
 from adaptune.report import tables
 from adaptune.space import (
-    ODOMETRY,
-    Categorical,
-    Parameter,
     ParameterSet,
     ParameterSets,
     ParameterSpace,
     SpaceError,
-    describe,
     in_words,
-    label,
     load_space,
 )
 from adaptune.strict import in_one_line
@@ -526,80 +521,51 @@ class ErrorModel:
 
 
 N_BEST = 5
-"""Sets to show, besides the fixed one."""
+"""Sets to show, besides the fixed one, the bank's and the rivals."""
 
 
 def render(model: ErrorModel, path: Path) -> RenderableType:
-    """Describe a model: its odometry, its training, and what validation found.
-
-    Parameters
-    ----------
-    model
-        The model.
-    path
-        Its file.
-    """
+    """Describe the model in a file: its odometry, its training, and what validation found."""
     n_frames, n_sets = model.errors.shape
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
     window = f", as a mean over {model.window} selections in a row" if model.window > 1 else ""
     size, n = path.stat().st_size / 1e3, len(model.sequences)
+    caption = "Mean error over all sequences."
+    validated = [{"rule": rule} | _numbers(found) for rule, found in model.validation.items()]
     return Group(
         Text(
             f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets "
             f"on {n_frames} frames of {n} sequence{'s' if n > 1 else ''}, {size:,.0f} kB\n"
             f"Errors over {model.length:g} m. Scans are described by {blocks}{window}."
         ),
-        *_named("Settings", model.odometry.get("settings", {})),
         tables.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
-        tables.table("Parameters", _parameters(model)),
-        tables.table(f"The best sets of {n_sets}", _best(model), "Mean error over all sequences."),
-        *_adapting(model),
-        *_spending(model),
+        tables.table(f"The best sets of {n_sets}", _sets(model), caption),
+        Text("\n".join(_driven(model))),
+        *_named("Settings", model.odometry.get("settings", {})),
         *_named("Where it comes from", model.provenance),
-        *_validation(model),
+        tables.table("Validation", validated, "Ratios to the fixed set's error on what is left out")
+        if validated
+        else Text("Not validated yet: `adaptune validate` shows what adapting gains."),
     )
 
 
-def _adapting(model: ErrorModel) -> Iterator[RenderableType]:
-    """What is selected along the way."""
-    paired, bank = model.paired, model.bank_settings
-    if not paired.adapt:
-        yield Text("One set at a time: no less expected loss; `adaptive` does not use it.")
+def _driven(model: ErrorModel) -> Iterator[str]:
+    """What is selected along the way, what it costs, and what may be spent."""
+    if model.bank_adapts:
+        yield f"Driven: the bank of trials {', '.join(map(str, model.bank))}."
     else:
-        n = "all" if paired.n_sets is None else str(paired.n_sets)
-        yield Text(f"One set at a time: `adaptive` chooses among {n} sets.")
-    if not model.bank:
-        return
-    if not bank.adapt:
-        yield Text("Bank: it has not the least expected loss.")
-        if not model.bank_rests:
-            return
-    else:
-        share = 100 * bank.min_fixed_share
-        yield Text(f"Bank: the first member has {share:.0f} % of the weight at least.")
-    if model.reserve:
+        yield "Driven: one set at a time." if model.paired.adapt else "Driven: the fixed set."
+    if (model.bank_adapts or model.bank_rests) and model.reserve:
         reserve = ", ".join(map(str, model.reserve))
-        yield Text(f"Members that work only in new places and after failures: {reserve}.")
-    yield tables.table(f"The bank's {len(model.bank)} members", _sets(model, model.bank))
-
-
-def _spending(model: ErrorModel) -> Iterator[RenderableType]:
-    """What a bank costs, what may be spent, and what could be driven instead."""
+        yield f"Members that work only in new places and after failures: {reserve}."
     costs = model.costs
     if costs is not None and model.bank and np.isfinite(cost := costs.adaptive(model.bank)):
-        yield Text(
+        yield (
             f"All members of the bank together cost {cost:.1f} ms of CPU time a scan, "
             f"{costs.evidence:.1f} ms of it for live evidence."
         )
     if model.budget is not None:
-        yield Text(f"Budget: {model.budget:g} ms of CPU time a scan.")
-    if model.rivals:
-        rows = [
-            {"rival": name} | row
-            for name, trial in model.rivals.items()
-            for row in _sets(model, [trial])
-        ]
-        yield tables.table("Rivals", rows, "What could be driven without adapting.")
+        yield f"Budget: {model.budget:g} ms of CPU time a scan."
 
 
 def _named(title: str, data: Mapping[str, Any]) -> list[Table]:
@@ -628,25 +594,10 @@ def _words(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _validation(model: ErrorModel) -> list[RenderableType]:
-    """Numbers in a table, and the rest in words."""
-    if not model.validation:
-        return [Text("Not validated yet: `adaptune validate` shows what adapting gains.")]
-    found = {
-        rule: of_rule if isinstance(of_rule, Mapping) else {"found": of_rule}
-        for rule, of_rule in model.validation.items()
-    }
-    keys = dict.fromkeys(key for of_rule in found.values() for key in of_rule)
-    numbers = [k for k in keys if all(isinstance(f.get(k, 0.0), float) for f in found.values())]
-    rows = [
-        {"rule": rule} | {k: of_rule.get(k) for k in numbers} for rule, of_rule in found.items()
-    ]
-    caption = "Ratios to the fixed set's error on what is left out; low, high: 95 % interval."
-    made: list[RenderableType] = [tables.table("Validation", rows, caption)] if numbers else []
-    for rule, of_rule in found.items():
-        rest = {key: value for key, value in of_rule.items() if key not in numbers}
-        made += [Text(f"{rule}, {key}: {text}") for key, text in _flat(rest)]
-    return made
+def _numbers(found: Any) -> dict[str, float]:
+    """The numbers of what validation found; a later version may have found something else."""
+    known = found if isinstance(found, Mapping) else {}
+    return {key: value for key, value in known.items() if isinstance(value, float)}
 
 
 def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
@@ -669,45 +620,18 @@ def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
     return rows
 
 
-def _parameters(model: ErrorModel) -> list[dict[str, Any]]:
-    fixed = model.sets.space.flat(model.sets[model.fixed])
-    return [
-        {
-            "parameter": label(name, parameter),
-            "range": _range(parameter),
-            "baseline": _words(parameter.baseline),
-            "fixed": _words(fixed.get(name, "-")),
-        }
-        for name, parameter in model.sets.space.parameters.items()
-    ]
-
-
-def _range(parameter: Parameter) -> str:
-    if isinstance(parameter, Categorical):
-        return _words(parameter.choices)
-    return describe(parameter) + (" log" if parameter.log else "")
-
-
-def _best(model: ErrorModel) -> list[dict[str, Any]]:
+def _sets(model: ErrorModel) -> list[dict[str, Any]]:
+    """The fixed set, the bank's, the rivals, and the best."""
     means = mean_errors(model.errors, model.sequence)
     best = [model.sets.trials[c] for c in np.argsort(means, kind="stable")[:N_BEST]]
-    return _sets(model, best if model.fixed in best else [model.fixed, *best])
-
-
-def _sets(model: ErrorModel, trials: Sequence[int]) -> list[dict[str, Any]]:
-    means = mean_errors(model.errors, model.sequence)
+    roles = {model.fixed: ["fixed"]}
+    for name, trials in (("bank", model.bank), *((k, [n]) for k, n in model.rivals.items())):
+        for trial in trials:
+            roles.setdefault(trial, []).append(name)
     return [
-        {"set": f"{n}, fixed" if n == model.fixed else str(n)}
+        {"set": ", ".join((str(n), *roles.get(n, ())))}
         | {"mean [%]": float(means[model.sets.column(n)])}
         | ({} if model.costs is None else {"cost [ms]": model.costs.alone(n)})
-        | _values(model.sets[n])
-        for n in trials
+        | {"parameters": in_words(model.sets[n])}
+        for n in dict.fromkeys([*roles, *best])
     ]
-
-
-def _values(parameters: ParameterSet) -> dict[str, str]:
-    """Columns of a set; those of several odometries have too many for a column each."""
-    if ODOMETRY not in parameters:
-        return {name: _words(value) for name, value in parameters.items()}
-    own = {name: value for name, value in parameters.items() if name != ODOMETRY}
-    return {ODOMETRY: str(parameters[ODOMETRY]), "parameters": in_words(own)}

@@ -229,7 +229,7 @@ GRID = "offline: {trials: null, sampler: grid, sampler_settings: {grid: {"
             "offline: {sampler: grid, sampler_settings: {\n grid: {max_correspondence_distance:"
             " [1, 0.0001, 31623], keyframe_interval: {low: 1, high: 9, count: 31623}}}}",
             15,
-            "has 1,000,014,129 points, and the study sets no budget; give offline.trials, hours,",
+            "has 1,000,014,129 points, and the study sets no budget; give offline.trials, hours or",
         ),
     ],
 )
