@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses
 from adaptune.live.evidence import LiveEvidence
 from adaptune.metrics import FAILURE
-from adaptune.model import RULES, BankRule, ErrorModel, make_rule
+from adaptune.model import RULES, BankRule, ErrorModel, Rule
 from adaptune.model.descriptor import (
     MOTION,
     SECOND,
@@ -99,7 +99,7 @@ class Selector:
     Raises
     ------
     ModelError
-        If there is no such rule, the model's bank lacks a member, or the model names a descriptor
+        If the model's bank lacks a member, or the model names a descriptor
         that may not be used.
     DescriptorError
         If a descriptor has changed since the model was fitted.
@@ -126,9 +126,14 @@ class Selector:
         reserve = model.reserve if weighs else []
         self._reserve = frozenset(reserve).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]
-        # A bank that need not always work weighs its members where it does.
-        settings = model.bank_settings.model_copy(update={"adapt": True})
-        fitted = BankRule(settings) if weighs else make_rule(rule, model.paired)
+        fitted: Rule = PairedExpectedRatio(model.paired)
+        if weighs:
+            # A bank that need not always work weighs its members where it does.
+            fitted = BankRule(model.bank_settings.model_copy(update={"adapt": True}))
+        elif rule == "paper":
+            from adaptune.model.knn import NearestNeighbours  # compiled code, which few need
+
+            fitted = NearestNeighbours()
         self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
         self._live = LiveEvidence(self.members, model.length)
         self._describe = Describer(model.blocks)

@@ -20,7 +20,7 @@ from gain_data import ODOMETRIES, factory_of, labelled, training_courses, trials
 from gain_modes import by_kind, own_errors, validate
 
 from offline.labelled import LabelledData
-from offline.leave_one_out import BANK_SIZE
+from offline.validate import BANK_SIZE
 
 
 def compare(data: LabelledData, arguments: argparse.Namespace) -> None:

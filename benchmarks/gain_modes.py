@@ -12,8 +12,8 @@ from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.bank_simulation import chained
 from offline.labelled import LabelledData, LabelledSequence, periods
-from offline.leave_one_out import Validation, leave_one_out, leave_out
 from offline.tuning import cancelling_members, on_labelled, simulated_with
+from offline.validate import Validation, leave_one_out, leave_out
 
 Errors = dict[str, NDArray[np.float64]]
 """Capped errors on a sequence in several modes, at each frame that has a sub-trajectory."""
@@ -30,8 +30,6 @@ def validate(data: LabelledData, size: int) -> None:
     for mode in validation.modes:
         each = zip(left_out, validation.ratios[mode], strict=True)
         print(f"{mode}: " + ", ".join(f"{of.name} {ratio:.2f}" for of, ratio in each))
-    known = " ".join(f"{ratio:.3f}" for ratio in validation.portfolio())
-    print(f"if the best of 1, 2, ... complementary sets were known: {known}", flush=True)
 
 
 def by_kind(data: LabelledData, size: int) -> None:

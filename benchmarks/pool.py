@@ -43,9 +43,9 @@ from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import BEST_DEFAULT, EQUAL_COST, RIVALS, named
 from offline.labelled import LabelledData
-from offline.leave_one_out import PAIRED, Validation, leave_one_out
 from offline.train import fit, tuned
 from offline.tuning import figures
+from offline.validate import PAIRED, Validation, leave_one_out
 from online.replay import Replay, replay
 
 DRIVEN_LENGTH = 40.0

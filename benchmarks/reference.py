@@ -25,17 +25,17 @@ from scipy.stats import spearmanr
 
 from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
-from adaptune.model import PairedSettings, make_rule
+from adaptune.model import PairedExpectedRatio
 from adaptune.reference.estimate import VERSION, estimated
 from adaptune.reference.registering import pass_over
 from adaptune.reference.stored import EstimateError
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
-from offline import leave_one_out
+from offline import validate as validation
 from offline.bank_simulation import chained
 from offline.labelled import LabelledData
-from offline.leave_one_out import PAIRED, LeftOut, Validation
 from offline.tuning import choose
+from offline.validate import PAIRED, LeftOut, Validation
 
 LENGTH = 25.0
 
@@ -146,7 +146,7 @@ def trained(data: LabelledData, estimates: LabelledData, size: int) -> None:
     """Leave each course out: banks trained on the truth, and on the estimates, judged by truth."""
     found: dict[str, list[LeftOut]] = {"truth": [], "estimate": [], "circular": []}
     # What is chosen on the estimates does not depend on who judges it.
-    leave_one_out.choose = lru_cache(maxsize=1)(choose)
+    validation.choose = lru_cache(maxsize=1)(choose)
     for i, (of_truth, of_estimate) in enumerate(
         zip(data.sequences, estimates.sequences, strict=True)
     ):
@@ -159,8 +159,8 @@ def trained(data: LabelledData, estimates: LabelledData, size: int) -> None:
             ("estimate", of_truth, without),
             ("circular", of_estimate, without),
         ):
-            rules: dict[str, Any] = {PAIRED: lambda _: make_rule(PAIRED, PairedSettings())}
-            found[name].append(leave_one_out.leave_out(left, others, rules, size, True))
+            rules: dict[str, Any] = {PAIRED: PairedExpectedRatio()}
+            found[name].append(validation.leave_out(left, others, rules, size, True))
     for name, what in (
         ("truth", "trained with truth, judged by truth"),
         ("estimate", "trained without truth, judged by truth"),

@@ -39,8 +39,8 @@ from adaptune.model import (
 from adaptune.model.knn import NearestNeighbours
 from adaptune.report.paper import POINTS, as_png_and_svg, log_scale, picture
 from adaptune.space import Float, ParameterSets, ParameterSpace
-from offline.leave_one_out import BANK_SIZE
 from offline.tuning import BANK_FRAMES
+from offline.validate import BANK_SIZE
 
 LENGTHS = (4541, 1101, 4661, 801, 271, 2761)
 """Scans of KITTI's sequences 00 to 05."""

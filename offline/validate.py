@@ -1,27 +1,391 @@
-"""Validate a study: find whether adapting would pay in places that it was not trained on."""
+"""Validate a study: find whether adapting would pay in places that it was not trained on.
+
+Recordings or stretches are left out in turn. A fixed set, and what is driven instead of it, are
+chosen on the rest. On what is left out, the errors that were recorded for the sets they choose are
+looked up, period by period; no odometry runs.
+"""
 
 import logging
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.archive import Archive
-from adaptune.model import ErrorModel, ModelError
+from adaptune.errors import AdaptuneError
+from adaptune.metrics import bootstrap, cap
+from adaptune.model import RULES, ErrorModel, ModelError, PairedExpectedRatio, Rule, TrainingData
+from adaptune.model.knn import NearestNeighbours
+from adaptune.model.pca import ScaledPCA
+from adaptune.model.rules import ERROR_FLOOR
+from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.paper import draw_chart
 from adaptune.study.inputs import check_model
 from adaptune.study.references import estimates_beside_intervals
-from adaptune.study.study import Driven, driven
+from adaptune.study.study import (
+    MIN_RECORDINGS,
+    ONE_SET,
+    PER_STRETCH,
+    RIVAL_WORDS,
+    RIVALS,
+    Driven,
+    driven,
+    expected_in_words,
+)
 from offline.campaign import rivalry
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
-from offline.labelled import LabelledData, labelled_data
-from offline.leave_one_out import PAIRED, Interval, Validation, ValidationError, leave_one_out
+from offline.labelled import LabelledData, LabelledSequence, comparable, labelled_data, periods
+from offline.tuning import (
+    MOST_FOLDS,
+    Figures,
+    Policy,
+    bank_data,
+    bank_errors,
+    bank_evidence,
+    choose,
+    driven_cost,
+    figures,
+    log_ratios,
+    rivals,
+    weights_along,
+)
 
 _log = logging.getLogger(__name__)
+
+PAIRED = RULES[0]
+"""The mode that `adaptune online` drives: what has the least expected loss."""
+BANK_SIZE = 4
+"""Its members, unless the study says otherwise."""
+
+Interval = tuple[float, float] | None
+"""The ends, where they are known."""
+
+
+class ValidationError(AdaptuneError):
+    """A study that cannot be validated."""
+
+
+class LeftOut(NamedTuple):
+    """What happened on one recording, or stretch of it, that was left out."""
+
+    name: str
+    # For every mode the capped error in percent at each frame, of shape (n,).
+    errors: dict[str, NDArray[np.float64]]
+    # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
+    # share of the weight that the other members had.
+    adapted: dict[str, float]
+    familiarity: NDArray[np.float64]  # (n,): see `Selection`; NaN where no rule computes it
+    block: int = 1  # frames of a sub-trajectory
+    stretch: NDArray[np.intp] | None = None  # (n,): of each frame; one stretch when left out
+    recording: str = ""  # that it is a part of; it alone when left out
+    # For every mode the milliseconds of CPU time a scan that it costs, as far as they are known.
+    costs: Mapping[str, float] = MappingProxyType({})
+
+    @property
+    def stretches(self) -> NDArray[np.intp]:
+        """Number of each frame's stretch, of shape (n,)."""
+        if self.stretch is None:
+            return np.zeros(len(self.errors["fixed"]), np.intp)
+        return self.stretch
+
+    def interval(self, mode: str) -> Interval:
+        """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
+
+        It is about this sequence, and says nothing about other places.
+        """
+        intervals = bootstrap(self.errors[mode], self.errors["fixed"], self.block)
+        return intervals and intervals[1]
+
+
+def joined(parts: Sequence[LeftOut]) -> LeftOut:
+    """Stretches of a recording that were left out, as one."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    n_frames = [len(part.familiarity) for part in parts]
+    return LeftOut(
+        first.name,
+        {
+            mode: np.concatenate([part.errors[mode] for part in parts])
+            for mode in _of_all(part.errors for part in parts)
+        },
+        {
+            mode: float(np.average([part.adapted[mode] for part in parts], weights=n_frames))
+            for mode in first.adapted
+        },
+        np.concatenate([part.familiarity for part in parts]),
+        first.block,
+        np.concatenate([part.stretches for part in parts]),
+        first.recording,
+        {
+            mode: float(np.average([part.costs[mode] for part in parts], weights=n_frames))
+            for mode in _of_all(part.costs for part in parts)
+        },
+    )
+
+
+def _of_all(parts: Iterable[Mapping[str, object]]) -> list[str]:
+    """The modes that are known of every part, in the order of the first.
+
+    A rival may be unknown where something is left out, if its cost was measured elsewhere only.
+    """
+    every = list(parts)
+    return [mode for mode in every[0] if all(mode in one for one in every)]
+
+
+@dataclass
+class Validation:
+    """All that was left out, and the conclusion."""
+
+    left_out: list[LeftOut]  # one of each recording
+    bank: bool = False  # whether a bank was simulated
+    # For every mode its mean error over the fixed set's, a number for each recording.
+    ratios: dict[str, NDArray[np.float64]] = field(init=False)
+    # For every mode the logarithm of its ratio to the fixed set's error on each stretch.
+    logs: dict[str, NDArray[np.float64]] = field(init=False)
+    recordings: list[str] = field(init=False)  # of each stretch
+
+    def __post_init__(self) -> None:
+        modes = _of_all(one.errors for one in self.left_out)
+        means = {
+            mode: np.array([s.errors[mode].mean() for s in self.left_out]) + ERROR_FLOOR
+            for mode in modes
+        }
+        self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
+        self.logs = {
+            mode: np.concatenate(
+                [log_ratios(s.errors[mode], s.errors["fixed"], s.stretches) for s in self.left_out]
+            )
+            for mode in modes
+        }
+        self.recordings = [
+            s.recording or s.name for s in self.left_out for _ in np.unique(s.stretches)
+        ]
+
+    @property
+    def modes(self) -> list[str]:
+        """`PAIRED`, and what it is compared with."""
+        return [mode for mode in dict.fromkeys((PAIRED, ONE_SET, *RULES)) if mode in self.ratios]
+
+    @property
+    def default(self) -> str:
+        """The first of them."""
+        return (*self.modes, RULES[0])[0]
+
+    def figures(self, mode: str, other: str = "fixed") -> Figures:
+        """What is expected of a mode elsewhere, compared with another one."""
+        return figures(self.logs[mode] - self.logs[other], self.recordings)
+
+    def cost(self, mode: str) -> float:
+        """Mean cost of a mode in milliseconds of CPU time a scan; NaN if it is unknown."""
+        return float(np.mean([one.costs.get(mode, np.nan) for one in self.left_out]))
+
+    def summary(self, mode: str) -> dict[str, float]:
+        """Its figures, and the ratio of the mean errors."""
+        mean, fixed = (
+            np.mean([s.errors[m].mean() for s in self.left_out]) for m in (mode, "fixed")
+        )
+        of_mode = self.figures(mode)._asdict()
+        numbers = {key: float(value) for key, value in of_mode.items() if not key.startswith("n_")}
+        return numbers | {"arithmetic": float((mean + ERROR_FLOOR) / (fixed + ERROR_FLOOR))}
+
+    def verdict(self, rule: str) -> str:
+        """What to expect of a rule, in a sentence."""
+        what = f"`{rule}`, with the bank where that is best" if self.bank else f"`{rule}`"
+        what = what if rule == PAIRED else f"`{rule}`"
+        expected = expected_in_words(self.figures(rule)._asdict())
+        share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
+        if not share:
+            return (
+                f"{what} kept the fixed set wherever something was left out: the rest did not show "
+                f"less expected loss; so there is no estimate of it."
+            )
+        if rule == PAIRED and self.bank:
+            return f"{what}: {expected}, with {share:.0f} % of the weight on other sets than fixed."
+        return f"{what}: {expected}, adapting {share:.0f} % of the time."
+
+    def against_rivals(self) -> list[str]:
+        """How `PAIRED` compares with its rivals, a sentence for each."""
+        return [
+            f"Compared with {RIVAL_WORDS[rival]}, `{PAIRED}` has {f.geometric:.2f} times its error "
+            f"(95 % interval {f.low:.2f}-{f.high:.2f}), at {self.cost(PAIRED):.1f} ms of CPU time "
+            f"a scan against {self.cost(rival):.1f}."
+            for rival in RIVALS
+            if rival in self.logs and PAIRED in self.logs
+            for f in [self.figures(PAIRED, rival)]
+        ]
+
+
+def leave_one_out(
+    data: LabelledData,
+    rules: Mapping[str, Rule] | None = None,
+    progress: Progress = unseen,
+    bank: int | Sequence[int] = BANK_SIZE,
+) -> Validation:
+    """Leave each recording or stretch out in turn, with all views of it.
+
+    What is driven is chosen anew on the rest, by the loss with which a study chooses it. So the
+    figures are those of the choice, and not of what was best in hindsight.
+
+    Parameters
+    ----------
+    data
+        The training sequences.
+    rules
+        By name. When left out, those of `adaptune.model.RULES`, of which `PAIRED` is what has the
+        least expected loss.
+    progress
+        Called about every fold.
+    bank
+        Number of a bank's members, or their trial numbers, the first of which counts as the fixed
+        one. No bank is simulated with 0, nor without recorded motions.
+
+    Raises
+    ------
+    ValidationError
+        If there are fewer than two folds.
+    """
+    by_recording = len(data.recordings) >= MIN_RECORDINGS
+    folds = data.folds(by_recording)
+    check_folds(data, folds)
+    parts: dict[str, list[LeftOut]] = {}
+    for i, (left_out, others) in enumerate(folds):
+        progress("parts left out", i, len(folds))
+        found = leave_out(left_out, others, rules, bank, by_recording)
+        parts.setdefault(found.name, []).append(found)
+    progress("parts left out", len(folds), len(folds))
+    has_bank = bool(bank) and data.sequences[0].simulation is not None
+    return Validation([joined(of) for of in parts.values()], has_bank)
+
+
+def check_folds(data: LabelledData, folds: Sequence[object]) -> None:
+    """Refuse to leave out what nothing remains of.
+
+    Raises
+    ------
+    ValidationError
+    """
+    if len(folds) > 1:
+        return
+    extent = data.sequences[0].extent
+    if extent is None:
+        raise ValidationError(
+            "training: one stretch cannot be validated, for nothing remains to train on when it is "
+            "left out; add recordings"
+        )
+    least = 2 * PER_STRETCH * extent.length
+    raise ValidationError(
+        f"training: there is one stretch only, or every stretch passes within "
+        f"{extent.length:g} m of all others, so nothing remains to train on when it is left out. "
+        f"Record {least:g} m or more that do not stay in one place, add recordings, or lower "
+        f"sub_trajectory (two stretches are {2 * PER_STRETCH} sub-trajectories)"
+    )
+
+
+def leave_out(
+    sequence: LabelledSequence,
+    others: LabelledData,
+    rules: Mapping[str, Rule] | None,
+    bank: int | Sequence[int],
+    by_recording: bool,
+) -> LeftOut:
+    """Fit on the others, and look up what happens on what is left out."""
+    n_sets = len(others.sets)
+    sequence, others = comparable(sequence, others)
+    if not isinstance(bank, int) and len(others.sets) < n_sets:
+        bank = len(bank)
+    bank = bank if sequence.simulation is not None else 0
+    data, pca = others.training_data()
+    features = pca.transform(sequence.descriptors)
+    capped = cap(sequence.errors)
+    fixed = capped[:, data.sets.column(data.fixed)]
+    first, period = periods(sequence.period)
+    frames = np.arange(len(capped))
+    baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
+    errors, adapted = {"baseline": baseline, "fixed": fixed}, {}
+    familiarity = np.full(len(first), np.nan)
+    chosen = None
+    if rules is None or bank:
+        chosen = choose(others, bank, by_recording, MOST_FOLDS, rules is None or PAIRED in rules)
+    if rules is None:
+        one_set = PairedExpectedRatio(chosen.one_set if chosen else None)
+        rules = {PAIRED: one_set, "paper": NearestNeighbours()}
+    for name, rule in rules.items():
+        rule.fit(data)
+        selections = [rule.select(features[i]) for i in first]
+        selected = data.sets.columns([selection.trial for selection in selections])
+        errors[name] = capped[frames, selected[period]]
+        adapted[name] = float(np.mean([selection.trial != data.fixed for selection in selections]))
+        if not np.isnan(selections[0].familiarity):
+            familiarity = np.array([selection.familiarity for selection in selections])
+    if bank and chosen is not None:
+        # Where a bank does not have the least loss, one set at a time is driven, or the fixed one.
+        instead = errors.pop(PAIRED, fixed), adapted.pop(PAIRED, 0.0)
+        if PAIRED in rules:
+            errors[ONE_SET], adapted[ONE_SET] = instead
+        driven = _simulate(sequence, others, data, pca, chosen) if chosen.bank.adapt else instead
+        errors[PAIRED], adapted[PAIRED] = driven
+    costs, of_rivals = _rivals(others, chosen, data.fixed, adapted)
+    errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
+    of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
+    errors |= _oracles(capped, of_periods[period])
+    return LeftOut(
+        sequence.name,
+        errors,
+        adapted,
+        familiarity[period],
+        sequence.block,
+        sequence.stretch,
+        sequence.recording,
+        costs,
+    )
+
+
+def _rivals(
+    others: LabelledData, chosen: Policy | None, fixed: int, adapted: Collection[str]
+) -> tuple[dict[str, float], dict[str, int]]:
+    """What the modes cost, as far as it is known, and the rivals' trials."""
+    if chosen is None or others.costs is None:
+        return {}, rivals(others, np.nan)
+    costs = others.costs
+    driven = driven_cost(others, chosen, fixed)
+    found = rivals(others, driven)
+    of = {"baseline": costs.alone(0), "fixed": costs.alone(fixed)}
+    of |= {PAIRED: driven} if PAIRED in adapted else {}
+    return of | {name: costs.alone(trial) for name, trial in found.items()}, found
+
+
+def _oracles(
+    capped: NDArray[np.float64], of_periods: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Errors of the best set in hindsight, of a whole sequence and of each frame's period."""
+    frames = np.arange(len(capped))
+    return {
+        "oracle, sequence": capped[:, int(np.argmin(capped.mean(axis=0)))],
+        "oracle, period": capped[frames, of_periods.argmin(axis=1)],
+    }
+
+
+def _simulate(
+    sequence: LabelledSequence,
+    others: LabelledData,
+    data: TrainingData,
+    pca: ScaledPCA,
+    chosen: Policy,
+) -> tuple[NDArray[np.float64], float]:
+    """A bank's errors on what is left out, and the weight that the first member did not have."""
+    of_bank = bank_data(others, data, chosen.members)
+    near = bank_evidence(sequence, of_bank, pca, chosen.bank)
+    weights = weights_along(sequence, near, chosen.bank)
+    return bank_errors(sequence, near, chosen.bank), float(1.0 - weights.weights[:, 0].mean())
+
+
+# The command `adaptune validate`.
 
 
 class Validated(NamedTuple):
@@ -36,7 +400,7 @@ class Validated(NamedTuple):
 
 def validate(
     study: OfflineStudy,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = unseen,
 ) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
@@ -61,7 +425,7 @@ def validate(
     considered = study.mechanism == "bank" and PAIRED in study.rules
     bank = _bank(study, model) if considered else 0
     try:
-        validation = leave_one_out(data, None, partial(progress, "parts left out"), bank)
+        validation = leave_one_out(data, None, progress, bank)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online.words}") from error
     rows = _rows(validation, _rate(data))

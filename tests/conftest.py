@@ -16,7 +16,7 @@ Factory = pytest.TempPathFactory
 
 SLOW = [
     "offline/test_kill.py",
-    "offline/test_leave_one_out.py",
+    "offline/test_left_out.py",
     "adaptune/odometry/test_conformance.py",
     "offline/test_cluster.py",
     "online/test_comparison.py",

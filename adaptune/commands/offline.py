@@ -210,8 +210,7 @@ def validate(
     from offline.validate import validate as validate_study
 
     with progress() as show:
-        validated = validate_study(loaded, show)
-    validation, rows, verdicts = validated
+        _, rows, verdicts = validate_study(loaded, show)
     console.print(
         tables.table(
             "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
@@ -221,8 +220,6 @@ def validate(
             "the geometric mean over the stretches, what is expected elsewhere.",
         )
     )
-    known = ", ".join(f"{ratio:.2f}" for ratio in validation.portfolio())
-    say(f"If the best of 1, 2, ... complementary sets were always known: {known}.")
     for verdict in verdicts:
         say(verdict)
     names = ("validation", "stretches")

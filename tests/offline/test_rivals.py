@@ -7,8 +7,8 @@ from adaptune.model import BankSettings, PairedSettings
 from adaptune.model.rules import Costs, SetCost
 from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
 from adaptune.study.study import BEST_DEFAULT, EQUAL_COST
-from offline.leave_one_out import PAIRED, leave_one_out
 from offline.tuning import NO_BANK, Policy, driven_cost, rivals
+from offline.validate import PAIRED, leave_one_out
 
 ONE = ParameterSpace({"x": Float(low=0.0, high=9.0, baseline=1.0)})
 POOL = PooledSpace({"gicp": ONE, "ndt": ONE})

@@ -17,11 +17,11 @@ from adaptune.strict import ConfigurationError
 from offline.campaign import run_batches
 from offline.config import OfflineConfig, load_study
 from offline.labelled import labelled_data
-from offline.leave_one_out import leave_one_out
 from offline.objective import best_by_trials
 from offline.samplers import make_sampler
 from offline.search import Search, make_searches, owner
 from offline.train import train
+from offline.validate import leave_one_out
 
 NAMES = ["one", "two", "three"]
 

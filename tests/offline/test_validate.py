@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from offline.leave_one_out import LeftOut, Validation
-from offline.validate import baseline_in_words
+from offline.validate import LeftOut, Validation, baseline_in_words
 
 
 @pytest.mark.parametrize(
@@ -10,9 +9,7 @@ from offline.validate import baseline_in_words
 )
 def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better):
     left_out = [
-        LeftOut(
-            f"s{i}", {"baseline": np.full(9, e), "fixed": np.ones(9)}, {}, np.empty(0), np.ones(6)
-        )
+        LeftOut(f"s{i}", {"baseline": np.full(9, e), "fixed": np.ones(9)}, {}, np.empty(0))
         for i, e in enumerate(errors)
     ]
     said = baseline_in_words(Validation(left_out))

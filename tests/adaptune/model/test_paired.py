@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import table
 
-from adaptune.model import RULES, PairedExpectedRatio, PairedSettings, TrainingData, make_rule
+from adaptune.model import RULES, PairedExpectedRatio, PairedSettings, TrainingData
 from adaptune.model.rules import complementary
 
 modest = settings(max_examples=30, deadline=None)
@@ -172,7 +172,6 @@ def test_it_chooses_among_those_named_on_the_evidence_of_all(seed, n_frames, n_s
 def test_its_constants():
     assert tuple(PairedSettings().model_dump().values()) == (True, 3, 6.0, 0.12, 300, -0.1, 0.5)
     assert RULES[0] == "adaptive"
-    assert isinstance(make_rule("adaptive", PairedSettings()), PairedExpectedRatio)
 
 
 def two_sets(fixed, other, n=40):
