@@ -58,7 +58,7 @@ class _Campaign:
         self._searches = make_searches(self._config, study.odometry.space, self._names, archive)
         n_objectives = len(self._config.objective)
         self._mirror = Mirror(study.folder, n_objectives, study.odometry.space)
-        described = study.config.descriptor.names
+        described = study.config.descriptor
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
         ]
@@ -479,7 +479,7 @@ def _tasks(
     """The whole runs that are lacking; the first of a sequence returns its frames, if they are."""
     tasks: list[Task] = []
     for name in study.training:
-        frames = not archive.has_frames(name, study.config.descriptor.names)
+        frames = not archive.has_frames(name, study.config.descriptor)
         for number, parameters in enumerate(baselines.values()):
             if whole_run(archive, name, number, study.config.health) is None:
                 tasks.append(Task(name, (number,), (parameters,), True, frames))

@@ -80,7 +80,6 @@ class OfflineConfig(StrictModel):
     batch: int = Field(16, ge=1, le=1000)
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
-    memory: float = Field(4.0, gt=0, le=1e6)
     objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
         {"rte": 1.0},
     )

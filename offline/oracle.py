@@ -70,7 +70,7 @@ def run_oracle(
     archive = oracle_archive(study)
     archive.tidy()
     due = {name: [n for n in numbers if n not in archive.finished(name)] for name in names}
-    described = study.config.descriptor.names
+    described = study.config.descriptor
     without_frames = [name for name in names if not archive.has_frames(name, described)]
     if any(due.values()) or without_frames:
         _run(study, archive, due, without_frames, model, progress, cluster)

@@ -15,7 +15,7 @@ from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
-from adaptune.processes import available
+from adaptune.processes import available, installed_memory
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
 from adaptune.report import tables
@@ -290,7 +290,7 @@ def trial_workers(
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
     odometry = study.odometry.allowing(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
-    memory = config.memory * 1e9
+    memory = 0.25 * installed_memory()
     return Cluster(setup, names, memory, cluster) if cluster else Workers(setup, n, memory)
 
 
@@ -302,7 +302,7 @@ def _fitted(
     before: ErrorModel | None,
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
-    settings = study.config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers", "memory"})
+    settings = study.config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
     provenance = {"versions": study.odometry.versions} | settings
     provenance |= {"inputs": digest(study)}
     if judged := estimates_as_data(study, study.training):

@@ -342,7 +342,7 @@ class TrialSettings:
     @classmethod
     def of(cls, config: OfflineStudyConfig) -> Self:
         """The settings of a study."""
-        shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor.names)
+        shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor)
         offline = config.offline
         own = (offline.runs, offline.repeats, offline.baseline_runs, frozenset(offline.metrics))
         return cls(*shared, *own)

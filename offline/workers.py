@@ -185,7 +185,7 @@ class _Queue(Generic[W]):
         if self._deaths[task.key] == MOST_DEATHS:
             help_ = "what they wrote above may say why"
             if death.killed:
-                help_ = "if they were out of memory, lower offline.memory or offline.workers"
+                help_ = "if they were out of memory, lower offline.workers"
             self.failure = WorkerError(
                 f"{MOST_DEATHS} workers died ({death.cause}) on {task}; {help_}"
             )

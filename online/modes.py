@@ -114,7 +114,7 @@ class ReplaySetup:
             study.warm_up,
             config.sub_trajectory,
             config.lost_track,
-            config.descriptor.names,
+            config.descriptor,
             config.online.budget,
             config.online.real_time,
             config.online.also,

@@ -390,7 +390,7 @@ class ErrorModel:
             if name not in DESCRIPTORS and name not in descriptors:
                 raise ModelError(
                     f"{where}: uses the descriptor {name!r}, which is code of its author's; if you "
-                    f"trust it, name it in descriptor.names, too, or fit a model of your own "
+                    f"trust it, name it in `descriptor`, too, or fit a model of your own "
                     f"(`adaptune offline`)"
                 )
 

@@ -5,7 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,26 +47,25 @@ class HealthCheck(StrictModel):
     ----------
     max_speed : float
         Metres a second.
-    max_acceleration : float
-        Metres a second squared, of the step's mean velocity against the last healthy one's;
-        generous enough for the noise of two differentiations. Irregular stamps widen it. What
-        counts is the mean velocity over up to a second: what is taken back within it does not. In
-        the first second of a recording it does not count.
     max_turn_rate : float
         Degrees a second.
     max_freeze : float
         Seconds for which the pose may stay where it is to the micrometre, after a step faster than
         half a metre a second. A robot slows down before it stops, and the noise of its scans moves
         the pose: only an odometry that has given up stops dead.
-    max_unregistered : int
-        Scans in a row that the odometry reports as not registered.
     """
 
     max_speed: float = Field(40.0, gt=0, le=1e9)
-    max_acceleration: float = Field(30.0, gt=0, le=1e9)
     max_turn_rate: float = Field(360.0, gt=0, le=1e9)
     max_freeze: float = Field(1.0, gt=0, le=1e9)
-    max_unregistered: int = Field(10, ge=1, le=10**9)
+
+    # Metres a second squared, of the step's mean velocity against the last healthy one's; generous
+    # enough for the noise of two differentiations. Irregular stamps widen it. What counts is the
+    # mean velocity over up to a second: what is taken back within it does not. In the first second
+    # of a recording it does not count.
+    max_acceleration: ClassVar[float] = 30.0
+    # Scans in a row that the odometry reports as not registered.
+    max_unregistered: ClassVar[int] = 10
 
     def exceeded(
         self,

@@ -66,30 +66,27 @@ def _known_descriptor(name: str) -> str:
     return name
 
 
-class DescriptorConfig(StrictModel):
-    """How scans are described.
+def _names(given: Any) -> Any:
+    if isinstance(given, dict):
+        gone = "" if "window" not in given else "; window is gone, they are averaged over 3 s"
+        what = "name the descriptors alone, as in `descriptor: [ndt, motion]`"
+        raise ValueError(f"{what}{gone}")  # noqa: TRY004 - pydantic takes no other
+    return (given,) if isinstance(given, str) else given
 
-    Descriptors are averaged over `window` seconds; with 0, only the newest scan counts.
-    """
 
-    names: Annotated[
-        tuple[Annotated[str, AfterValidator(_known_descriptor)], ...], Field(min_length=1)
-    ] = ("ndt",)
-    window: float = Field(3.0, ge=0, le=3600)
+def _once(names: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(names)) < len(names):
+        raise ValueError("a descriptor is named twice")
+    return names
 
-    @field_validator("names")
-    @classmethod
-    def _once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(names)) < len(names):
-            raise ValueError("a descriptor is named twice")
-        return names
 
-    @model_validator(mode="before")
-    @classmethod
-    def _names_alone(cls, data: Any) -> Any:
-        if isinstance(data, str):
-            return {"names": (data,)}
-        return {"names": data} if isinstance(data, list) else data
+Descriptors = Annotated[
+    tuple[Annotated[str, AfterValidator(_known_descriptor)], ...],
+    Field(min_length=1),
+    BeforeValidator(_names),
+    AfterValidator(_once),
+]
+"""How scans are described."""
 
 
 MOST_MEMBERS = 6
@@ -272,7 +269,7 @@ class StudyConfig(StrictModel):
     lost_track: float = Field(3.0, gt=0, le=1e6)
     health: HealthCheck = HealthCheck()
     isolation: Limits = Limits()
-    descriptor: DescriptorConfig = DescriptorConfig()
+    descriptor: Descriptors = ("ndt",)
     online: OnlineConfig = OnlineConfig()
 
     @property

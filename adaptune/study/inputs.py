@@ -91,7 +91,7 @@ def odometry_inputs(study: Study) -> dict[str, Any]:
 
 def described_by(study: Study) -> dict[str, str]:
     """What the user's descriptors depend on."""
-    return descriptor_content(study.config.descriptor.names)
+    return descriptor_content(study.config.descriptor)
 
 
 def stale(study: Study) -> list[Stale]:

@@ -32,6 +32,9 @@ CONFIGURATION = "study.yaml"
 MODEL = "model.safetensors"
 """The error model."""
 
+WINDOW = 3.0
+"""Seconds over which a selector averages descriptors."""
+
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
 
@@ -172,7 +175,7 @@ class Study(Generic[C_co]):
     @property
     def window(self) -> int:
         """Number of selections over which descriptors are averaged."""
-        return max(1, math.ceil(self.config.descriptor.window / self.config.online.period))
+        return max(1, math.ceil(WINDOW / self.config.online.period))
 
     @cached_property
     def mechanism(self) -> Mechanism | None:

@@ -43,7 +43,7 @@ def complaints(key):
 
 def test_all_keys_are_keys_of_a_study():
     names = [key.rstrip("=") for key in complete(OfflineStudyConfig, "")]
-    assert {"sub_trajectory", "health.max_speed", "descriptor.window"} <= set(names)
+    assert {"sub_trajectory", "health.max_speed", "descriptor"} <= set(names)
     assert len(names) == len(set(names)) > 40
     for name in names:
         assert "unknown key" not in complaints(name), name

@@ -180,7 +180,7 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
         validate(load_study(study_file, [other_range], study.folder))
     for other, text in (
         ("training=[one]", "other training sequences"),
-        ("descriptor.window=0", "other training sequences or descriptors"),
+        ("online.period=3", "other training sequences or descriptors"),
     ):
         with pytest.raises(AdaptuneError, match=text):
             validate(load_study(study_file, [other], study.folder))

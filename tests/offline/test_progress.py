@@ -49,7 +49,7 @@ def test_memory_is_named_only_where_workers_were_killed(killed):
     pool.said = [Death("its process ended", killed)] * workers.MOST_DEATHS
     with pytest.raises(workers.WorkerError, match="3 workers died") as caught:
         list(run(pool, [Task("one", (0, 1), ({}, {}))]))
-    assert ("offline.memory" in str(caught.value)) == killed
+    assert ("offline.workers" in str(caught.value)) == killed
 
 
 class Elsewhere:

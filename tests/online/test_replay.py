@@ -56,7 +56,11 @@ def scans(stamps):
     return [Scan(int(s * 1e9), np.zeros((0, 3), np.float32)) for s in stamps]
 
 
-HEALTH = HealthCheck(max_speed=5.0, max_acceleration=20.0)
+class Cautious(HealthCheck):
+    max_acceleration = 20.0
+
+
+HEALTH = Cautious(max_speed=5.0)
 MODEL = Path("model.safetensors")
 ABOUT = ReplayIdentity(
     mode="x",
@@ -193,10 +197,10 @@ def test_poor_scans_are_counted(tmp_path):
     assert json.loads((tmp_path / "replay.json").read_text())["poor_scans"] == 1
 
 
-def test_too_many_scans_that_do_not_register_restart(tmp_path):
+def test_too_many_scans_that_do_not_register_restart(tmp_path, monkeypatch):
+    monkeypatch.setattr(HealthCheck, "max_unregistered", 3)
     odometry = Scripted([0.1, 0.1, *[None] * 7, 0.1])
-    check = HEALTH.model_copy(update={"max_unregistered": 3})
-    result = replay(scans(np.arange(11) / 10), InProcess(odometry), check)
+    result = replay(scans(np.arange(11) / 10), InProcess(odometry), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [5, 8]
     assert result.unhealthy == {"max_unregistered": 2}
     write_replay(tmp_path, result, ABOUT, MODEL)

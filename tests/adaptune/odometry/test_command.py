@@ -15,6 +15,7 @@ from setups import setup_of
 
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.template import Template
+from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
 from offline.campaign import BaselineError
 from offline.config import load_study
@@ -246,8 +247,9 @@ def test_poses_without_stamps_that_are_too_many_or_not_rigid(make):
     assert "40 poses without stamps for 20 scans" in trial.faults[0]
 
 
-def test_a_lost_track_is_labelled_and_what_comes_after_judged_for_itself(make):
-    study = make("jump", "health.max_acceleration=10")
+def test_a_lost_track_is_labelled_and_what_comes_after_judged_for_itself(make, monkeypatch):
+    monkeypatch.setattr(HealthCheck, "max_acceleration", 10.0)
+    study = make("jump")
     trial, sequence = run(study)
     assert np.flatnonzero(trial.restarted).tolist() == [20]
     np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
