@@ -11,7 +11,7 @@ import numpy as np
 from adaptune.archive import OF_SLOT, Archive
 from adaptune.errors import AdaptuneError
 from adaptune.recording.scan import OF_VIEW
-from adaptune.report.chart import (
+from adaptune.report.charts import (
     Axis,
     Band,
     Chart,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adaptune import files
 from adaptune.archive import OF_SLOT, Archive, Summary
-from adaptune.report.chart import (
+from adaptune.report.charts import (
     Axis,
     Band,
     Bars,
@@ -322,7 +322,7 @@ def scatter_chart(
         colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
         drawn: list[Drawn] = [Points(x, y, "trial", colour, label, log_colour=log)]
         best = int(of[kept].argmin())
-        drawn.append(Points(x[[best]], y[[best]], "best trial here", marker="D"))
+        drawn.append(Points(x[[best]], y[[best]], "best trial here", shape="diamond"))
         drawn += _marked(table, xy[0], xy[1])
         panels.append(Panel(x_axis, y_axis, tuple(drawn), title))
     if not panels:
@@ -412,7 +412,7 @@ def sensitivity_chart(table: TrialTable) -> Chart | None:
         drawn = [
             Points(x, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
             *_marked(table, x, table.values),
-            Points(x[[at]], table.values[[at]], "best trial", marker="D"),
+            Points(x[[at]], table.values[[at]], "best trial", shape="diamond"),
         ]
         y = Axis(table.objective, bool((table.values > 0.0).all()))
         panels.append(Panel(parameter_axis(name, parameter), y, tuple(drawn)))

@@ -23,7 +23,7 @@ from adaptune.model.pca import ScaledPCA
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
-from adaptune.report.paper import draw_chart
+from adaptune.report.drawing import draw_chart
 from adaptune.study.inputs import check_model
 from adaptune.study.references import estimates_beside_intervals
 from adaptune.study.study import (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
-from adaptune.report.chart import (
+from adaptune.report.charts import (
     Axis,
     Band,
     Chart,
@@ -123,7 +123,7 @@ def _of_sequences(
     """The ratios on each sequence; of many they have the same look."""
     names = list(dict.fromkeys(str(row["sequence"]) for row in rows))
     if len(names) > _MOST_NAMED:
-        return [_ratios(rows, versus, place, "each sequence", _BELOW, faint=True, marker="o")]
+        return [_ratios(rows, versus, place, "each sequence", _BELOW, faint=True, shape="circle")]
     return [
         _ratios([row for row in rows if row["sequence"] == name], versus, place, name, _BELOW)
         for name in names
@@ -484,7 +484,7 @@ def _errors(replayed: ReplayedSequence) -> Panel:
         if restarts := track.restarts:
             x, y = track.seconds[restarts], track.errors[restarts]
             texts = [f"{mode}, {seconds:.1f} s" for seconds in x]
-            drawn.append(Points(x, y, _RESTARTED, texts=texts, marker="v"))
+            drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
     axis = Axis(f"RTE over the next {replayed.length:g} m [%]", log=True)
     return Panel(TIME, axis, tuple(drawn), height=1.6)
 
@@ -635,7 +635,7 @@ def _map(
     texts = [f"{seconds:.1f} s" for seconds in of.track.seconds[some]]
     drawn = (
         Points(x, y, "", chosen[of.selection_at()][some], label, log, texts),
-        Points(x[:1], y[:1], "start", marker="P"),
+        Points(x[:1], y[:1], "start", shape="cross"),
     )
     wide, high = (float(np.ptp(of.places[known][:, axis])) + 1.0 for axis in (0, 1))
     height = _LOW if high < _SLENDER * wide else 1.0

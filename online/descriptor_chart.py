@@ -11,7 +11,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import MOTION, Describer
-from adaptune.report.chart import Axis, Chart, Charts, Panel, Points, charts_of
+from adaptune.report.charts import Axis, Chart, Charts, Panel, Points, charts_of
 from adaptune.study.study import Study
 
 MOST_FRAMES = 300

@@ -10,7 +10,7 @@ from adaptune.commands.terminal import Folder, Override, StudyFile, begin_work, 
 from adaptune.errors import AdaptuneError
 
 if TYPE_CHECKING:
-    from adaptune.report.chart import Charts
+    from adaptune.report.charts import Charts
     from adaptune.report.page import Page, PageSection
     from offline.config import OfflineStudy
 

@@ -3,7 +3,7 @@ import pytest
 from made_trials import SPACE, made_table
 
 from adaptune.archive import OF_SLOT, Summary
-from adaptune.report.chart import Bars, Line, Mark, Points
+from adaptune.report.charts import Bars, Line, Mark, Points
 from offline.config import OfflineConfig
 from offline.trial_charts import (
     best_tenth,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptune.report.chart import Band, Line, Points
+from adaptune.report.charts import Band, Line, Points
 from offline.charts import MOST_NAMED, stretch_chart
 from offline.tuning import figures
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptune.report.chart import Line, Points
+from adaptune.report.charts import Line, Points
 from online.charts import comparison_chart
 
 

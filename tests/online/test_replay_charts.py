@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
-from adaptune.report.chart import Band, Line, Points, Shares, Spans
+from adaptune.report.charts import Band, Line, Points, Shares, Spans
 from offline.config import load_study
 from online.charts import charts_of_replays, choice_chart, error_chart, map_chart, switches
 

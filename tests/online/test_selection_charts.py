@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from made_replays import SECONDS, bank, kept, replay, sequence
 
-from adaptune.report.chart import Line, Mark, Points
+from adaptune.report.charts import Line, Mark, Points
 from online.charts import familiarity_chart, histograms, latency_chart, period_ratios
 
 

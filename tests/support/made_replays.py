@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.report.chart import Spans
+from adaptune.report.charts import Spans
 from adaptune.space import Categorical, Float, ParameterSpace
 from online.charts import ModeReplay, ReplayedSequence
 from online.replay_picture import Track

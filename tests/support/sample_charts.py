@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.report.chart import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Shares, Spans
+from adaptune.report.charts import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Shares, Spans
 from adaptune.report.page import Page, PageSection
 from adaptune.report.tables import Listing
 
@@ -115,8 +115,8 @@ def from_above() -> Chart:
             Line(x + d, y - d, mode)
             for mode, d in (("baseline", 2.0), ("fixed", 1.0), ("adaptive", 0.3))
         ),
-        Points(x[::200], y[::200], "reference", marker="o"),
-        Points([40.0], [0.0], "start", marker="P"),
+        Points(x[::200], y[::200], "reference", shape="circle"),
+        Points([40.0], [0.0], "start", shape="cross"),
     )
     panel = Panel(Axis("x [m]"), Axis("y [m]"), drawn, equal=True)
     return Chart("from-above", "Trajectories from above", (panel,))

@@ -1,7 +1,4 @@
-"""A figure as data: what is drawn, and not how.
-
-`adaptune.report.paper` draws a chart as PNG and SVG, `adaptune.report.interactive` for a browser.
-"""
+"""A chart as data: what is drawn, and not how; `adaptune.report.drawing` draws it."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -50,7 +47,20 @@ class Points:
     log_colour: bool = False
     texts: Sequence[str] | None = None  # what is told of each point in a browser
     faint: bool = False
-    marker: str | None = None  # as matplotlib names it: "o", "s", "^", "v", "D", "x", "P", "*"
+    shape: str | None = None  # of the markers, see `adaptune.report.drawing.Look`
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Thousands of points, drawn as pixels; the last one lies on top."""
+
+    x: Values
+    y: Values
+    colour: Values  # a number for every point, shown on a colour bar
+    colour_label: str
+    colour_limits: tuple[float, float]
+    log_colour: bool = False
+    size: int = 1  # of a point, pixels
 
 
 @dataclass(frozen=True)
@@ -104,7 +114,7 @@ class Mark:
     axis: Literal["x", "y"] = "y"
 
 
-Drawn = Line | Points | Band | Bars | Shares | Spans | Mark
+Drawn = Line | Points | Cloud | Band | Bars | Shares | Spans | Mark
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,724 @@
+"""Draw charts with Vega-Lite: in a browser and, by vl-convert, as PNG and SVG without one."""
+
+import base64
+import json
+import re
+import struct
+import textwrap
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune.files import replacing
+from adaptune.report.charts import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Cloud,
+    Drawn,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shares,
+    Spans,
+    Values,
+)
+
+# How a chart looks.
+
+
+@dataclass(frozen=True)
+class Look:
+    """How whatever has one name is drawn."""
+
+    colour: str
+    width: float = 1.6  # of a line, pixels
+    dash: tuple[float, ...] = ()  # strokes and gaps in pixels; none if it is solid
+    shape: str = "circle"  # of a marker, as Vega names it, or an SVG path
+
+
+_STAR = "M0,-1.2 L.3,-.4 L1.1,-.4 L.5,.1 L.7,.95 L0,.5 L-.7,.95 L-.5,.1 L-1.1,-.4 L-.3,-.4 Z"
+_TIMES = "M-1,-.7 L-.7,-1 L0,-.3 L.7,-1 L1,-.7 L.3,0 L1,.7 L.7,1 L0,.3 L-.7,1 L-1,.7 L-.3,0 Z"
+# Colours that the colour-blind tell apart, most of them Okabe and Ito's. Lines that coincide
+# lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
+# grey, too.
+MODES = {
+    "baseline": Look("#b0b0b0", 9.0, shape="square"),
+    "best_default": Look("#882255", 7.5, shape="triangle-down"),
+    "equal_cost": Look("#56c8a0", 6.0, shape="cross"),
+    "fixed": Look("#0072b2", 4.5, shape=_STAR),
+    "adaptive": Look("#e69f00", 2.6),
+    "untrained": Look("#7b3294", 1.2, shape="triangle-left"),
+    "even": Look("#117733", 1.7, (3, 3), "triangle-right"),
+    "paper": Look("#000000", 1.0, (4, 4), "triangle-up"),
+    "oracle, sequence": Look("#009e73", shape="diamond"),
+    "oracle, period": Look("#009e73", shape=_TIMES),
+}
+"""Looks of the modes; the lines of the first lie lowest."""
+_COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")
+_DASHES: tuple[tuple[float, ...], ...] = ((), (8, 3), (2, 3), (8, 3, 2, 3))
+_SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", _TIMES, "cross")
+_TINTS = ("#dbe9f6", "#fbe3d0", "#dcefdc", "#efdff0", "#e8e8e8", "#fbf3c4")
+_MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
+"""A colour map whose lightness rises, without colours too light for a white ground."""
+_UNKNOWN = "#bbbbbb"
+"""Colour of points without a number where colours say numbers."""
+_MOST, _MOST_FAINT = 1500, 500
+"""Most points of a line that are drawn."""
+_MANY = 1000
+"""Points from which on they are small."""
+
+
+def looks(chart: Chart) -> dict[str, Look]:
+    """The look of each name in a chart, in the order in which they appear; modes have theirs."""
+    names = dict.fromkeys(name for panel in chart.panels for name in _names(panel) if name)
+    taken = {MODES[name].colour for name in names if name in MODES}
+    colours = [colour for colour in _COLOURS if colour not in taken]
+    others = zip(cycle(colours), cycle(_DASHES), cycle(_SHAPES), strict=False)
+    made = {}
+    for name in names:
+        if name in MODES:
+            made[name] = MODES[name]
+        else:
+            colour, dash, shape = next(others)
+            made[name] = Look(colour, dash=dash, shape=shape)
+    return made
+
+
+def _names(panel: Panel) -> Iterator[str]:
+    for item in panel.drawn:
+        if isinstance(item, Shares):
+            yield from item.names
+        elif not isinstance(item, Mark | Cloud):
+            yield item.name
+
+
+def _layer(item: Drawn) -> float:
+    """What a panel shows, from the lowest to the highest."""
+    if isinstance(item, Line | Points) and item.faint:
+        return 4.0
+    if isinstance(item, Points) and len(item.x) > _MANY:
+        return 4.5
+    if isinstance(item, Line):
+        # Equal lines of modes lie on each other from wide to narrow.
+        return 5.0 + (list(MODES).index(item.name) if item.name in MODES else len(MODES)) / 100.0
+    if isinstance(item, Mark):
+        return 7.0
+    order = (Spans, Cloud, Shares, Bars, Band)
+    return float(order.index(type(item))) if isinstance(item, order) else 6.0
+
+
+def plain(value: float) -> str:
+    """A number as on an axis: 0.6, and not 6e-1."""
+    return np.format_float_positional(value, precision=6, fractional=False, trim="-")
+
+
+def numbers(values: Values, axis: Axis) -> NDArray[np.float64]:
+    """Values along an axis as numbers; NaN for what is not finite, or not on a logarithmic axis."""
+    if axis.names is not None:
+        place = {name: float(i) for i, name in enumerate(axis.names)}
+        values = [place[value] if isinstance(value, str) else value for value in values]
+    made = np.array(values, np.float64)
+    made[~np.isfinite(made) | ((made <= 0.0) & axis.log)] = np.nan
+    return made
+
+
+def thinned(*columns: NDArray[np.float64], most: int = _MOST) -> NDArray[np.intp]:
+    """Indices of the points of a line to draw where it has many.
+
+    Of each stretch the lowest and the highest of every column stay, and a gap stays a gap.
+    """
+    n = len(columns[0])
+    if n <= most:
+        return np.arange(n)
+    gaps = np.isnan(np.sum(columns, axis=0))
+    kept = {0, n - 1}
+    for some in np.array_split(np.arange(n), most // (2 * len(columns) + 2)):
+        missing = gaps[some]
+        kept.add(int(some[0]))
+        if missing.any():
+            kept.add(int(some[missing.argmax()]))
+        there = some[~missing]
+        for column in columns if len(there) else ():
+            kept |= {int(there[column[there].argmin()]), int(there[column[there].argmax()])}
+    return np.array(sorted(kept))
+
+
+def wrapped(words: str, letters: float) -> list[str]:
+    """Words on lines of at most so many letters, where they can be broken."""
+    width = max(int(letters), 8)
+
+    def cut(name: re.Match[str]) -> str:
+        """A long name with spaces where it is best broken."""
+        parts = [""]
+        for part in re.split(r"(?<=[_/.])", name[0]):
+            if parts[-1] and len(parts[-1] + part) > width:
+                parts.append("")
+            parts[-1] += part
+        return " ".join(parts)
+
+    lines = (re.sub(rf"\S{{{width + 1},}}", cut, line) for line in words.splitlines())
+    return [part for line in lines for part in textwrap.wrap(line, width)] or [""]
+
+
+# The drawing, as a specification of Vega-Lite.
+
+
+Spec = dict[str, Any]
+_WIDTH, _LETTER, _LINE = 900, 6.5, 14
+"""Pixels: width of a chart, width of a letter, about, and height of a line of words."""
+_DARK = "#333333"
+_Extent = tuple[tuple[float, float], tuple[float, float]]
+_OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
+NO_DATA = "no data"
+"""What an empty panel says."""
+_DOTS = 2
+"""Pixels of a cloud's picture to one of the chart."""
+_CONFIG: Spec = {
+    "font": "Liberation Sans, Arial, Helvetica, sans-serif",
+    "view": {"stroke": None},
+    "axis": {
+        "gridColor": "#e6e6e6",
+        "domainColor": "#888888",
+        "tickColor": "#888888",
+        "labelColor": _DARK,
+        "titleColor": _DARK,
+        "labelFontSize": 12,
+        "titleFontSize": 12,
+        "titleFontWeight": "normal",
+        "labelLimit": 400,
+        "titleLimit": 900,
+        "labelFlush": False,
+    },
+    "legend": {"labelFontSize": 12, "titleFontSize": 12, "titleFontWeight": "normal"},
+    "title": {"anchor": "start", "fontSize": 13, "fontWeight": "normal", "color": _DARK},
+    "text": {"fontSize": 12},
+    "concat": {"spacing": 18},
+}
+
+
+def spec(chart: Chart, titled: bool = True) -> Spec:
+    """A chart as a specification of Vega-Lite 6.
+
+    Parameters
+    ----------
+    chart
+        What to draw.
+    titled
+        Whether its title stands above it.
+    """
+    columns = max(1, min(chart.columns, len(chart.panels)))
+    rows = [chart.panels[i : i + columns] for i in range(0, len(chart.panels), columns)]
+    beside = sum(max(map(_beside, chart.panels[c::columns])) for c in range(columns))
+    width = round((_WIDTH - beside) / columns)
+    usual = 300.0 if len(rows) == 1 else 150.0 if chart.shared_x else 240.0
+    extents = [(_extent(panel, "x"), _extent(panel, "y")) for panel in chart.panels]
+    if chart.shared_x:
+        across = min(x[0] for x, _ in extents), max(x[1] for x, _ in extents)
+        extents = [(across, y) for _, y in extents]
+    every = looks(chart)
+    panels = []
+    for i, panel in enumerate(chart.panels):
+        high = round(usual * max(map(_height, rows[i // columns])))
+        above = chart.shared_x and i >= columns
+        below = chart.shared_x and i + columns < len(chart.panels)
+        if panel.equal:
+            extents[i], high = _equal(extents[i], width, 1.6 * high)
+        panels.append(_Drawing(panel, every, (width, high), extents[i]).spec(above, below))
+    made: Spec = {
+        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+        "vconcat": [
+            {
+                "concat": panels,
+                "columns": columns,
+                "resolve": {"scale": {"color": "independent"}},
+            },
+            *_legend(chart, every),
+        ],
+        "config": _CONFIG,
+        "background": "white",
+        "padding": 8,
+    }
+    if titled:
+        title = wrapped(chart.title, _WIDTH / 9.0)
+        made["title"] = {"text": title, "fontSize": 16, "offset": 14}
+    return made
+
+
+def draw_chart(path: Path, chart: Chart) -> None:
+    """Draw a chart as PNG, and as SVG beside it.
+
+    Parameters
+    ----------
+    path
+        Of the PNG.
+    chart
+        What to draw.
+    """
+    write_pictures(chart, path, path.with_suffix(".svg"))
+
+
+def write_pictures(chart: Chart, *files: Path) -> None:
+    """Draw a chart into files; one whose name ends in ``.svg`` is an SVG, others are PNGs."""
+    import vl_convert
+
+    svg = vl_convert.vegalite_to_svg(spec(chart))
+    # Vega numbers on from picture to picture; the same picture has the same bytes.
+    ids = re.findall(r'(?<= id=")[a-z]+_?\d+(?=")', svg)
+    for i, name in enumerate(dict.fromkeys(ids)):
+        svg = svg.replace(f'"{name}"', f'"id-{i}"').replace(f"#{name})", f"#id-{i})")
+    for file in files:
+        with replacing(file) as temporary:
+            if file.suffix.lower() == ".svg":
+                temporary.write_text(svg, "utf-8")
+            else:
+                temporary.write_bytes(vl_convert.svg_to_png(svg, scale=1.5))
+
+
+def _height(panel: Panel) -> float:
+    """How high a panel is, of which 1 is usual: names below each other need a line each."""
+    return max(panel.height, 0.3 + 0.09 * len(panel.y.names or ()))
+
+
+def _beside(panel: Panel) -> float:
+    """Pixels for what stands left and right of a panel."""
+    names = [part for name in panel.y.names or () for part in wrapped(name, 32)]
+    bar = any(
+        isinstance(item, Cloud) or (isinstance(item, Points) and item.colour is not None)
+        for item in panel.drawn
+    )
+    return 44.0 + max(22.0, _LETTER * max(map(len, names), default=0)) + 90.0 * bar
+
+
+def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """X and y of what a panel shows, flat."""
+    for item in panel.drawn:
+        match item:
+            case Line() | Points() | Cloud():
+                yield numbers(item.x, panel.x), numbers(item.y, panel.y)
+            case Band():
+                x = numbers(item.x, panel.x)
+                yield np.tile(x, 2), np.r_[numbers(item.low, panel.y), numbers(item.high, panel.y)]
+            case Bars():
+                along, across = (panel.y, panel.x) if item.flat else (panel.x, panel.y)
+                places = numbers(item.x, along)
+                places = np.r_[places - 0.5 * item.width, places + 0.5 * item.width]
+                others = (each for each in (item.low, item.high) if each is not None)
+                ends = numbers(np.r_[item.base, item.heights, *others], across)
+                yield (ends, places) if item.flat else (places, ends)
+            case Shares():
+                x = numbers(item.x, panel.x)
+                yield np.tile(x, 2), np.r_[0.0 * x, np.sum(item.shares, axis=0)]
+
+
+def _is_empty(panel: Panel) -> bool:
+    return not any(np.isfinite(x).any() and np.isfinite(y).any() for x, y in _coordinates(panel))
+
+
+def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
+    """Where an axis begins and ends."""
+    axis = panel.x if which == "x" else panel.y
+    if axis.limits is not None:
+        return axis.limits
+    if axis.names is not None:
+        return -0.6, len(axis.names) - 0.4
+    found = [pair[which == "y"] for pair in _coordinates(panel)]
+    found += [
+        numbers([item.at], axis)
+        for item in panel.drawn
+        if isinstance(item, Mark) and item.axis == which
+    ]
+    values = np.concatenate([np.empty(0), *found])
+    values = values[np.isfinite(values) & ((values > 0.0) | (not axis.log))]
+    if not len(values):
+        return 1.0, 10.0
+    low, high = float(values.min()), float(values.max())
+    share = 0.01 if which == "x" else 0.06
+    if axis.log:
+        beyond = max((high / low) ** share, 1.0 + share)
+        return low / beyond, high * beyond
+    beyond = share * (high - low) or 0.1 * abs(high) or 1.0
+    return (low if low == 0.0 < high else low - beyond), high + beyond
+
+
+def _equal(extent: _Extent, width: int, most: float) -> tuple[_Extent, int]:
+    """Extents on which a metre along x is as long as one along y, and the height for them."""
+    (left, right), (low, high) = extent
+    metre = width / (right - left)
+    height = float(np.clip(metre * (high - low), 0.12 * width, most))
+    metre = min(metre, height / (high - low))
+    x, y = 0.5 * (left + right), 0.5 * (low + high)
+    half_x, half_y = 0.5 * width / metre, 0.5 * height / metre
+    return ((x - half_x, x + half_x), (y - half_y, y + half_y)), round(height)
+
+
+def _table(**columns: Any) -> Spec:
+    """Columns as the data of a mark; what is not finite is left out."""
+
+    def cell(value: Any) -> Any:
+        if isinstance(value, str):
+            return value
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+
+    rows = zip(*([cell(value) for value in column] for column in columns.values()), strict=True)
+    return {"values": [dict(zip(columns, row, strict=True)) for row in rows]}
+
+
+class _Drawing:
+    """A panel, and how large it is."""
+
+    def __init__(
+        self, panel: Panel, looks_of: dict[str, Look], size: tuple[int, int], extent: _Extent
+    ) -> None:
+        self._panel, self._looks = panel, looks_of
+        self._width, self._height = size
+        self._extent = {"x": extent[0], "y": extent[1]}
+
+    def spec(self, above: bool, below: bool) -> Spec:
+        """The panel; `above` and `below` are whether ones that share its x axis lie there."""
+        panel = self._panel
+        self._x, self._y = self._channel("x", panel.x, hidden=below), self._channel("y", panel.y)
+        made: Spec = {"width": self._width, "height": self._height}
+        if panel.title:
+            words = wrapped(panel.title, self._width / _LETTER)
+            made["title"] = {"text": words, "offset": 6, "frame": "group"}
+        if _is_empty(panel):
+            self._x["axis"] |= {"values": []}
+            self._y["axis"] |= {"values": []}
+            empty = {"data": _table(x=[np.nan], y=[np.nan]), "mark": "point"}
+            empty["encoding"] = {"x": self._x, "y": self._y}
+            middle = {"x": 0.5 * self._width, "y": 0.5 * self._height}
+            text = {"type": "text", "text": NO_DATA, "color": "#666666", **middle}
+            said = {"data": _table(i=[0]), "mark": text, "encoding": {}}
+            return made | {"layer": [empty, said]}
+        draw: dict[type, Callable[[Any], Iterator[Spec]]] = {
+            Line: self._line,
+            Points: self._points,
+            Cloud: self._cloud,
+            Band: self._band,
+            Bars: self._bars,
+            Shares: self._shares,
+            Spans: partial(self._spans, named=not above),
+            Mark: self._mark,
+        }
+        items = sorted(panel.drawn, key=_layer)
+        return made | {"layer": [layer for item in items for layer in draw[type(item)](item)]}
+
+    def _channel(self, which: Literal["x", "y"], axis: Axis, hidden: bool = False) -> Spec:
+        low, high = self._extent[which]
+        size = self._width if which == "x" else self._height
+        drawn: Spec = {"tickCount": max(size // (70 if which == "x" else 36), 2)}
+        if axis.names is not None:
+            room = size / len(axis.names) / _LETTER if which == "x" else 32
+            names = [wrapped(name, room) for name in axis.names]
+            turned = which == "x" and max(len(part) for name in names for part in name) > room
+            names = [[name] for name in axis.names] if turned else names
+            texts = "[" + ",".join(f"[{','.join(map(_literal, name))}]" for name in names) + "]"
+            drawn = {"values": list(range(len(names))), "labelExpr": f"{texts}[datum.value]"}
+            drawn |= {"grid": False} | ({"labelAngle": -35} if turned else {})
+        elif axis.log:
+            drawn = {"values": ticks(low, high), "format": "~r"}
+        title: Any = wrapped(axis.label, size / _LETTER) if axis.label else None
+        if hidden:
+            title, drawn = None, drawn | {"labels": False, "ticks": False}
+        scale = {"type": "log" if axis.log else "linear", "domain": [low, high], "nice": False}
+        if which == "y":
+            drawn |= {"minExtent": 44}
+        made: Spec = {"field": which, "type": "quantitative", "title": title}
+        if not axis.log:
+            scale["zero"] = False
+        return made | {"scale": scale, "axis": drawn}
+
+    def _line(self, line: Line) -> Iterator[Spec]:
+        look = self._looks.get(line.name, Look("#666666"))
+        x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
+        kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
+        mark: Spec = {
+            "type": "line",
+            "color": look.colour,
+            "strokeWidth": min(look.width, 1.2) if line.faint else look.width,
+            "strokeDash": (5, 3) if line.dashed else look.dash,
+            "opacity": 0.4 if line.faint else 1.0,
+            "interpolate": "step-after" if line.steps else "linear",
+            "strokeJoin": "round",
+            "tooltip": line.name,
+            "clip": True,
+        }
+        # Drawn in the order of the points, and not from left to right.
+        encoding = {"x": self._x, "y": self._y, "order": {"value": None}}
+        yield {"data": _table(x=x[kept], y=y[kept]), "mark": mark, "encoding": encoding}
+
+    def _points(self, points: Points) -> Iterator[Spec]:
+        look = self._looks.get(points.name, Look("#666666"))
+        panel, many = self._panel, len(points.x) > _MANY
+        x, y = numbers(points.x, panel.x), numbers(points.y, panel.y)
+        shape = points.shape or look.shape
+        scaled = shape.startswith("M")
+        mark: Spec = {
+            "type": "point",
+            "shape": shape,
+            "size": 12 if many else 60 if scaled else 45,
+            "opacity": 0.35 if points.faint else 0.7 if many else 1.0,
+            "filled": True,
+            "color": look.colour,
+            "clip": True,
+        }
+        if not many and not points.faint:
+            mark |= _OUTLINE
+        columns: dict[str, Any] = {"x": x, "y": y}
+        tips: list[Spec] = [
+            {"field": "x", "title": panel.x.label or "x", "format": ".4~g"},
+            {"field": "y", "title": panel.y.label or "y", "format": ".4~g"},
+        ]
+        if points.texts is not None:
+            columns["text"] = points.texts
+            tips.insert(0, {"field": "text", "title": points.name or "point"})
+        encoding = {"x": self._x, "y": self._y, "tooltip": tips}
+        if points.colour is None:
+            yield {"data": _table(**columns), "mark": mark, "encoding": encoding}
+            return
+        colour = numbers(points.colour, Axis("", log=points.log_colour))
+        known = np.isfinite(colour)
+        unknown = {name: np.array(column)[~known] for name, column in columns.items()}
+        if len(unknown["x"]):
+            grey = mark | {"color": _UNKNOWN}
+            yield {"data": _table(**unknown), "mark": grey, "encoding": encoding}
+        if known.any():
+            columns = {name: np.array(of)[known] for name, of in columns.items()}
+            limits = float(colour[known].min()), float(colour[known].max())
+            bar = self._colour_bar(points.colour_label, limits, points.log_colour)
+            del mark["color"]
+            data = _table(**columns, c=colour[known])
+            yield {"data": data, "mark": mark, "encoding": encoding | {"color": bar}}
+
+    def _colour_bar(self, words: str, limits: tuple[float, float], log: bool) -> Spec:
+        length = min(self._height - 40, 220)
+        legend: Spec = {
+            "title": wrapped(words, 12),
+            "gradientLength": length,
+            "gradientOpacity": 1.0,
+        }
+        legend |= {"values": ticks(*limits), "format": "~r"} if log else {"tickCount": 5}
+        scale = {"type": "log" if log else "linear", "domain": limits, "range": _MAP}
+        return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
+
+    def _cloud(self, cloud: Cloud) -> Iterator[Spec]:
+        wide, high = _DOTS * self._width, _DOTS * self._height
+        spots = []
+        for which, values, n in (("x", cloud.x, wide), ("y", cloud.y, high)):
+            low, end = self._extent[which]
+            spots.append(np.floor((numbers(values, Axis("")) - low) / (end - low) * n))
+        x, y = spots
+        value = numbers(cloud.colour, Axis("", log=cloud.log_colour))
+        limits = np.array(cloud.colour_limits)
+        if cloud.log_colour:
+            value, limits = np.log(value), np.log(limits)
+        share = np.clip((value - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
+        kept = np.isfinite(x + y + share)
+        x, y, share = x[kept].astype(int), y[kept].astype(int), share[kept]
+        ends = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in _MAP], float)
+        at = share * (len(_MAP) - 1)
+        colours = np.column_stack([np.interp(at, range(len(_MAP)), c) for c in ends.T])
+        pixels = np.zeros((high, wide, 4), np.uint8)
+        for right in range(_DOTS * cloud.size):
+            for up in range(_DOTS * cloud.size):
+                there = (x + right >= 0) & (x + right < wide) & (y + up >= 0) & (y + up < high)
+                opaque = np.column_stack([colours[there], np.full(there.sum(), 255.0)])
+                pixels[high - 1 - y[there] - up, x[there] + right] = opaque
+        url = "data:image/png;base64," + base64.b64encode(png(pixels)).decode()
+        size: Spec = {"width": self._width, "height": self._height, "aspect": False}
+        image: Spec = {"type": "image", "url": url, "x": 0, "y": 0, "align": "left"}
+        yield {"data": _table(i=[0]), "mark": image | size | {"baseline": "top"}, "encoding": {}}
+        bar = self._colour_bar(cloud.colour_label, cloud.colour_limits, cloud.log_colour)
+        # Points without a size, for the axes and the colour bar.
+        encoding = {"x": self._x, "y": self._y, "color": bar}
+        data = _table(x=self._extent["x"], y=self._extent["y"], c=cloud.colour_limits)
+        yield {"data": data, "mark": {"type": "point", "size": 0}, "encoding": encoding}
+
+    def _band(self, band: Band) -> Iterator[Spec]:
+        look, panel = self._looks.get(band.name, Look("#666666")), self._panel
+        x, high = numbers(band.x, panel.x), numbers(band.high, panel.y)
+        low = numbers(band.low, panel.y)
+        if panel.y.log:
+            low = np.where(np.isfinite(high) & np.isnan(low), self._extent["y"][0], low)
+        kept = thinned(x, low, high)
+        data = _table(x=x[kept], y=low[kept], y2=high[kept])
+        mark: Spec = {"type": "area", "color": look.colour, "fillOpacity": 0.25, "clip": True}
+        mark |= {"stroke": look.colour, "strokeOpacity": 0.6, "tooltip": band.name}
+        encoding = {"x": self._x, "y": self._y, "y2": {"field": "y2"}}
+        yield {"data": data, "mark": mark, "encoding": encoding}
+
+    def _bars(self, bars: Bars) -> Iterator[Spec]:
+        look, panel = self._looks.get(bars.name, Look("#666666")), self._panel
+        along, across = (panel.y, panel.x) if bars.flat else (panel.x, panel.y)
+        a, b = ("y", "x") if bars.flat else ("x", "y")
+        place, ends = numbers(bars.x, along), numbers(bars.heights, across)
+        base = np.full(len(place), max(bars.base, self._extent[b][0]) if across.log else bars.base)
+        half = 0.5 * bars.width
+        columns = {a: place - half, f"{a}2": place + half, b: base, f"{b}2": ends}
+        there = np.isfinite(ends)
+        encoding = {"x": self._x, "y": self._y, "x2": {"field": "x2"}, "y2": {"field": "y2"}}
+        tip = {"field": f"{b}2", "type": "quantitative", "title": bars.name, "format": ".4~g"}
+        data = _table(**{name: column[there] for name, column in columns.items()})
+        mark = {"type": "rect", "color": look.colour, "clip": True} | _OUTLINE
+        yield {"data": data, "mark": mark, "encoding": encoding | {"tooltip": [tip]}}
+        if bars.low is not None and bars.high is not None:
+            low, high = numbers(bars.low, across), numbers(bars.high, across)
+            data = _table(**{a: place, b: low, f"{b}2": high})
+            encoding = {"x": self._x, "y": self._y, f"{b}2": {"field": f"{b}2"}}
+            yield {"data": data, "mark": {"type": "rule", "clip": True}, "encoding": encoding}
+
+    def _shares(self, shares: Shares) -> Iterator[Spec]:
+        x = numbers(shares.x, self._panel.x)
+        made = np.nan_to_num(np.array(shares.shares, np.float64).reshape(len(shares.names), -1))
+        ends = np.vstack([np.zeros(len(x)), np.cumsum(made, axis=0)])
+        encoding = {"x": self._x, "y": self._y, "y2": {"field": "y2"}}
+        for name, low, high in zip(shares.names, ends[:-1], ends[1:], strict=True):
+            mark: Spec = {"type": "area", "color": self._looks[name].colour, "clip": True}
+            mark |= {"interpolate": "step-after", "stroke": "white", "strokeWidth": 0.5}
+            data = _table(x=x, y=low, y2=high)
+            yield {"data": data, "mark": mark | {"tooltip": name}, "encoding": encoding}
+
+    def _spans(self, spans: Spans, named: bool) -> Iterator[Spec]:
+        """Shade stretches, and write their names above them, or turned where they are short."""
+        tinted = span_tints(spans)
+        if not tinted:
+            return
+        begins, ends, _, tints = zip(*tinted, strict=True)
+        data = _table(x=begins, x2=ends, tint=tints)
+        tint = {"field": "tint", "type": "nominal", "scale": None}
+        encoding = {"x": self._x, "x2": {"field": "x2"}, "color": tint}
+        mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
+        yield {"data": data, "mark": mark, "encoding": encoding}
+        low, high = self._extent["x"]
+        for begin, end, name, _ in tinted if named else ():
+            pixels, needed = (end - begin) / (high - low) * self._width, _LETTER * len(name)
+            words: Spec = {"type": "text", "text": name, "color": _DARK, "fontSize": 11}
+            if name == spans.name or (needed > pixels and (pixels < 13 or needed > self._height)):
+                continue
+            if needed <= pixels:
+                words |= {"y": -4, "baseline": "bottom"}
+            else:
+                words |= {"y": 4, "angle": -90, "align": "right"}
+            middle = _table(x=[0.5 * (begin + end)])
+            yield {"data": middle, "mark": words, "encoding": {"x": self._x}}
+
+    def _mark(self, mark: Mark) -> Iterator[Spec]:
+        """A line across the panel, and its words."""
+        low, high = sorted(self._extent[mark.axis])
+        if not low <= mark.at <= high:
+            return
+        encoding = {mark.axis: self._x if mark.axis == "x" else self._y}
+        data = _table(**{mark.axis: [mark.at]})
+        rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
+        yield {"data": data, "mark": rule, "encoding": encoding}
+        words: Spec = {"type": "text", "text": mark.words, "color": _DARK, "baseline": "bottom"}
+        if mark.axis == "y":
+            words |= {"align": "right", "x": self._width - 3, "dy": -2}
+        else:
+            words |= {"align": "right", "y": 3, "angle": -90, "dy": -2}
+        # White behind the words, so that they are read on whatever lies there.
+        halo = words | {"stroke": "white", "strokeWidth": 4, "strokeOpacity": 0.8}
+        for text in (halo, words) if mark.words else ():
+            yield {"data": data, "mark": text, "encoding": encoding}
+
+
+def _literal(words: str) -> str:
+    """Words as a string of Vega's expressions."""
+    return json.dumps(words)
+
+
+def ticks(low: float, high: float) -> list[float]:
+    """Values to name on a logarithmic axis between two numbers above zero."""
+    decades = np.log10(high) - np.log10(low)  # the ratio may be too large for a number
+    if decades < 0.5:
+        rough = (high - low) / 4.0
+        power = 10.0 ** np.floor(np.log10(rough))
+        step = power * next(s for s in (1.0, 2.0, 5.0, 10.0) if s * power >= 0.99 * rough)
+        steps = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1.0)
+        return [float(f"{value:.6g}") for value in step * steps]
+    digits = "1" if decades > 4.0 else "125" if decades > 1.3 else "12357"
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    values = [float(f"{digit}e{power}") for power in powers for digit in digits]
+    return [value for value in values if low <= value <= high]
+
+
+def span_tints(spans: Spans) -> list[tuple[float, float, str, str]]:
+    """Begin, end, name and colour of each span that is shaded."""
+    edges = np.asarray(spans.edges, float).tolist()
+    different = list(dict.fromkeys(name for name in spans.names if name))
+    return [
+        (begin, end, name, _TINTS[4 if spans.name else different.index(name) % len(_TINTS)])
+        for begin, end, name in zip(edges[:-1], edges[1:], spans.names, strict=True)
+        if name
+    ]
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """Pixels of shape (height, width, 4), red, green, blue and alpha, as a PNG file."""
+    height, width, _ = pixels.shape
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + check
+
+    lines = np.column_stack([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)])
+    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6))
+    return b"\x89PNG\r\n\x1a\n" + body + chunk(b"IEND", b"")
+
+
+def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
+    """The legend below the panels: of each name what is drawn of it, and the name."""
+    kinds: dict[str, dict[type, Drawn]] = {}
+    for item in (item for panel in chart.panels for item in panel.drawn):
+        for name in item.names if isinstance(item, Shares) else [getattr(item, "name", "")]:
+            if name and not (isinstance(item, Line | Points | Bars) and not len(item.x)):
+                kinds.setdefault(name, {}).setdefault(type(item), item)
+    layers: list[Spec] = []
+    x, y = 0.0, 0.5 * _LINE
+    for name in (name for name in every if name in kinds):
+        wide = 44.0 + _LETTER * len(name) + 14.0
+        if x and x + wide > _WIDTH:
+            x, y = 0.0, y + 1.4 * _LINE
+        layers += _glyphs(kinds[name], every[name], x, y)
+        text: Spec = {"type": "text", "text": name, "align": "left", "baseline": "middle"}
+        layers.append({"mark": text | {"x": x + 38.0, "y": y, "color": _DARK}})
+        x += wide
+    if not layers or all(map(_is_empty, chart.panels)):
+        return []
+    size = {"width": _WIDTH - 60, "height": round(y + 0.5 * _LINE)}
+    # A layer without an encoding is none.
+    return [size | {"data": _table(i=[0]), "layer": [{"encoding": {}} | of for of in layers]}]
+
+
+def _glyphs(kinds: dict[type, Drawn], look: Look, x: float, y: float) -> Iterator[Spec]:
+    """What is drawn of a name, small."""
+    fill: Spec = {"type": "rect", "x": x, "x2": x + 32.0, "y": y - 6.0, "y2": y + 6.0}
+    if Spans in kinds:
+        yield {"mark": fill | {"color": _TINTS[4]}}
+    if Band in kinds:
+        yield {"mark": fill | {"color": look.colour, "fillOpacity": 0.25, "stroke": look.colour}}
+    if Bars in kinds or Shares in kinds:
+        yield {"mark": fill | {"color": look.colour, **_OUTLINE}}
+    if isinstance(line := kinds.get(Line), Line):
+        ends = {"x": {"value": x}, "x2": {"value": x + 32.0}, "y": {"value": y}}
+        dash = (5, 3) if line.dashed else look.dash
+        mark: Spec = {"type": "rule", "color": look.colour, "strokeWidth": look.width}
+        mark |= {"strokeDash": dash, "opacity": 0.4 if line.faint else 1.0}
+        yield {"mark": mark, "encoding": ends}
+    if isinstance(points := kinds.get(Points), Points):
+        shape = points.shape or look.shape
+        point: Spec = {"type": "point", "x": x + 16.0, "y": y, "filled": True, "shape": shape}
+        colour = _MAP[3] if points.colour is not None else look.colour
+        size = {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}
+        yield {"mark": point | size | {"color": colour, **_OUTLINE}}

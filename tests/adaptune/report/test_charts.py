@@ -1,0 +1,186 @@
+"""Each kind of item is drawn, and read back from the SVG."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from sample_charts import comparison, empty, from_above, over_time, samples, trials
+
+from adaptune.report.charts import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Cloud,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shares,
+    Spans,
+    on_axis,
+    parameter_axis,
+)
+from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, ticks, wrapped
+from adaptune.space import Categorical, Float, Integer
+
+KERNEL = Categorical(choices=("none", 1, True), baseline=1)
+
+
+def drawn(chart, folder):
+    """The texts of a chart's SVG, and all of it."""
+    draw_chart(folder / "chart.png", chart)
+    assert (folder / "chart.png").read_bytes().startswith(b"\x89PNG")
+    text = (folder / "chart.svg").read_text("utf-8")
+    root = ElementTree.fromstring(text)
+    return [" ".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")], text
+
+
+def chart_of(*items, **panel):
+    axes = {"x": Axis("x [m]"), "y": Axis("y [m]")} | panel
+    return Chart("one", "A chart", (Panel(drawn=items, **axes),))
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        Line([0, 1, 2], [1, np.nan, 2], "fixed"),
+        Line([0, 1], [1, 2], "fixed", steps=True, dashed=True),
+        Points([0, 1], [1, 2], "fixed", texts=["a", "b"]),
+        Band([0, 1], [1, 2], [2, 3], "fixed"),
+        Bars([0, 1], [1, 2], "fixed", [0.5, 1], [1.5, 3]),
+        Bars([0, 1], [1, 2], "fixed", flat=True),
+        Shares([0, 1, 2], np.full((2, 3), 50.0), ("fixed", "b")),
+    ],
+    ids=lambda item: type(item).__name__,
+)
+def test_an_item_has_its_colour_in_the_panel_and_in_the_legend(tmp_path, item):
+    texts, svg = drawn(chart_of(item), tmp_path)
+    assert {"A chart", "x [m]", "y [m]", "fixed"} <= set(texts)
+    assert svg.count(MODES["fixed"].colour) >= 2
+
+
+def test_colours_of_points_are_on_a_bar_and_unknown_ones_are_grey(tmp_path):
+    points = Points([0, 1, 2], [1, 2, 3], "trial", [0.1, 1.0, np.nan], "size [m]", log_colour=True)
+    texts, svg = drawn(chart_of(points), tmp_path)
+    assert {"size [m]", "0.2", "0.5", "trial"} <= set(texts)
+    assert svg.count("#bbbbbb") == 1
+
+
+def test_a_cloud_is_a_picture_with_a_colour_bar(tmp_path):
+    rng = np.random.default_rng(0)
+    cloud = Cloud(*rng.normal(size=(2, 50_000)), rng.random(50_000), "height z [m]", (0.0, 1.0))
+    texts, svg = drawn(chart_of(cloud, Points([0.0], [0.0], "LiDAR"), equal=True), tmp_path)
+    assert {"LiDAR", "0.5"} <= set(texts)
+    assert "height z" in " ".join(texts)
+    assert svg.count("data:image/png;base64,") == 1
+    assert len(svg) < 2_000_000
+
+
+def test_spans_are_named_above_and_marks_carry_their_words(tmp_path):
+    spans = Spans([0, 10, 11, 50, 100], ("cave", "street", "", "garden"))
+    items = spans, Line([0, 100], [1, 2], "fixed"), Mark(1.5, "goal"), Mark(60, "door", "x")
+    texts, _ = drawn(chart_of(*items, Mark(9.0, "beyond")), tmp_path)
+    assert {"cave", "garden", "goal", "door"} <= set(texts)
+    assert texts.count("street") == 0  # too short for its name
+    # A mark may widen the axis, so that it is seen.
+    assert "beyond" in texts
+
+
+def test_names_stand_along_an_axis_also_long_ones(tmp_path):
+    names = tuple(f"a_long_name_of_a_drive_{i}" for i in range(12))
+    bars = Bars(np.arange(12.0), np.arange(1.0, 13.0), "")
+    texts, _ = drawn(chart_of(bars, x=Axis("", names=names)), tmp_path)
+    assert set(names) <= {text.replace(" ", "") for text in texts}
+    narrow = tuple(f"sequence{i:02d}" for i in range(20))
+    bars = Bars(np.arange(20.0), np.arange(1.0, 21.0), "")
+    texts, svg = drawn(chart_of(bars, x=Axis("", names=narrow)), tmp_path)
+    assert set(narrow) <= set(texts)
+    assert svg.count("rotate(325") >= 20
+    texts, _ = drawn(
+        chart_of(Bars(names, np.ones(12), "", flat=True), y=Axis("", names=names)), tmp_path
+    )
+    assert set(names) <= {text.replace(" ", "") for text in texts}
+
+
+@pytest.mark.parametrize("chart", samples(), ids=lambda chart: chart.key)
+def test_samples_are_drawn_as_wide_as_a_page(tmp_path, chart):
+    texts, svg = drawn(chart, tmp_path)
+    width = float(ElementTree.fromstring(svg).get("width"))
+    assert 800 < width < 990
+    assert {panel.title for panel in chart.panels} - {""} <= set(texts)
+    before = (tmp_path / "chart.svg").read_bytes()
+    drawn(chart, tmp_path)
+    assert (tmp_path / "chart.svg").read_bytes() == before
+
+
+def test_names_are_literal(tmp_path):
+    texts = drawn(comparison(), tmp_path)[0]
+    assert {"tunnel <b>north</b>", "forest_$x_1$", "kiss & tell"} <= set(texts)
+
+
+def test_an_empty_panel_says_so_and_has_no_legend(tmp_path):
+    texts, _ = drawn(empty(), tmp_path)
+    assert sorted(texts) == ["Nothing was measured", "no data", "x [-]", "y [-]"]
+
+
+def test_metres_are_as_long_along_both_axes():
+    made = spec(from_above())["vconcat"][0]["concat"][0]
+    domains = [made["layer"][0]["encoding"][which]["scale"]["domain"] for which in "xy"]
+    pixels = [
+        made[size] / np.ptp(of) for size, of in zip(("width", "height"), domains, strict=True)
+    ]
+    assert pixels[0] == pytest.approx(pixels[1], rel=0.02)
+
+
+def test_panels_that_share_an_axis_begin_and_end_alike():
+    panels = spec(over_time())["vconcat"][0]["concat"]
+    axes = [panel["layer"][0]["encoding"]["x"] for panel in panels]
+    assert len({tuple(x["scale"]["domain"]) for x in axes}) == 1
+    assert [x["title"] is not None for x in axes] == [False, False, False, True]
+
+
+def test_modes_keep_their_colours_and_others_differ():
+    names = ("baseline", "fixed", *(f"drive_{i}" for i in range(20)))
+    found = looks(chart_of(*(Points([0], [1], name) for name in names)))
+    assert found["fixed"] == MODES["fixed"]
+    assert len({(look.colour, look.shape) for look in found.values()}) == len(names)
+
+
+def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
+    y = np.sin(np.arange(20_000.0))
+    y[777], y[12_000:12_100] = 9.0, np.nan
+    kept = thinned(np.arange(20_000.0), y)
+    assert len(kept) < 2000
+    assert 777 in kept
+    assert np.isnan(y[kept]).any()
+    assert kept[0] == 0
+    assert kept[-1] == len(y) - 1
+    data = spec(trials())["vconcat"][0]["concat"][0]["layer"]
+    assert max(len(layer["data"]["values"]) for layer in data) <= 2000
+
+
+@pytest.mark.parametrize(
+    ("ends", "named"),
+    [
+        ((0.6, 1.4), [0.6, 0.8, 1.0, 1.2, 1.4]),
+        ((0.5, 6.0), [0.5, 0.7, 1.0, 2.0, 3.0, 5.0]),
+        ((0.1, 30.0), [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0]),
+        ((1e-3, 1e3), [1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3]),
+    ],
+)
+def test_logarithmic_axes_name_round_numbers(ends, named):
+    assert ticks(*ends) == named
+
+
+def test_long_names_are_broken_after_underscores():
+    assert wrapped("max_correspondence_distance [m]", 20) == ["max_correspondence_", "distance [m]"]
+    assert wrapped("", 20) == [""]
+
+
+def test_parameters_have_the_scale_of_their_range_or_names():
+    distance = Float(low=1.0, high=10.0, baseline=4.0, log=True)
+    assert parameter_axis("distance", distance) == Axis("distance", log=True)
+    assert parameter_axis("points", Integer(low=1, high=9, baseline=4)) == Axis("points")
+    assert parameter_axis("kernel", KERNEL).names == ("none", "1", "True")
+    np.testing.assert_array_equal(on_axis([True, None, "none"], KERNEL), [2.0, np.nan, 0.0])
