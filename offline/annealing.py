@@ -71,14 +71,7 @@ class Chain:
     def step(self, params: Mapping[str, Any], energy: float, scale: float, u: float) -> None:
         """Accept or reject a trial, and cool down or heat up.
 
-        Parameters
-        ----------
-        params, energy
-            The trial.
-        scale
-            Differences of energy are divided by it.
-        u
-            Drawn uniformly from [0, 1).
+        Differences of energy are divided by `scale`; `u` is drawn uniformly from [0, 1).
         """
         if self.params is None:
             self.start(params, energy)

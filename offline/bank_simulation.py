@@ -30,9 +30,7 @@ def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.flo
     Their lengths are the trial's errors. Where a trial was run several times, their directions are
     those of the first run.
 
-    Returns
-    -------
-    ndarray of shape (n_frames, 3)
+    Returns shape (n_frames, 3).
     """
     T_ref_sensor, T_odom_sensor = frames.T_ref_sensor, trial.T_odom_sensor
     vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, trial.restarted)
@@ -133,12 +131,7 @@ class BankSimulation:
     ) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory.
 
-        Parameters
-        ----------
-        weights
-            Of the members.
-        votes
-            The weights with which they vote about who agrees; `weights` when left out.
+        Members vote about who agrees with `votes`; with `weights` when left out.
         """
         T_previous_current = self.motions(weights.members)
         agreeing = self.agreeing(weights if votes is None else votes)
@@ -164,16 +157,7 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     a bank nobody knows at once: here it stands still for `NOTICED` seconds, as all others do that
     lose track there, and then goes on.
 
-    Parameters
-    ----------
-    frames
-        Of the sequence.
-    trials
-        On it.
-
-    Returns
-    -------
-    ndarray of shape (n_frames - 1, n_trials, 4, 4)
+    Returns shape (n_frames - 1, n_trials, 4, 4).
     """
     motions = np.empty((len(frames.stamps) - 1, len(trials), 4, 4))
     for k, trial in enumerate(trials):
@@ -229,14 +213,7 @@ class Extent(NamedTuple):
     def of(cls, T_ref_sensor: Poses, known: NDArray[np.bool_], length: float) -> Self:
         """The extent of the frames that are known to have errors.
 
-        Parameters
-        ----------
-        T_ref_sensor
-            Reference of all frames, of shape (n_frames, 4, 4).
-        known
-            Which frames are labelled, of shape (n_frames,).
-        length
-            Metres of a sub-trajectory.
+        `T_ref_sensor` is of shape (n_frames, 4, 4), `known` of (n_frames,), `length` in metres.
         """
         frames = np.flatnonzero(known)
         ends = window_ends(T_ref_sensor, length)[frames]
@@ -258,13 +235,7 @@ class Extent(NamedTuple):
         That is each frame within the length of a sub-trajectory of where these are, and each whose
         sub-trajectory overlaps one of theirs.
 
-        Parameters
-        ----------
-        left_out
-            The frames that are left out.
-        is_view
-            Whether these frames are those of a view, which counts frames in another way, and may
-            be played backwards.
+        A view counts frames in another way, and may be played backwards.
         """
         path = cKDTree(left_out.positions)
         near = path.query(self.positions)[0] <= self.length

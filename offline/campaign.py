@@ -29,19 +29,7 @@ _log = logging.getLogger(__name__)
 def run_batches(
     study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
 ) -> dict[int, Verdict]:
-    """Run all trials that are not in the archive yet, and judge all of them by trial number.
-
-    Parameters
-    ----------
-    study
-        The study; its folder exists.
-    archive
-        Its trials.
-    workers
-        They run the trials.
-    progress
-        Called about every finished trial.
-    """
+    """Run all trials that are not in the archive yet, and judge all of them by trial number."""
     return _Campaign(study, archive, workers, progress).run()
 
 
@@ -396,14 +384,8 @@ def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:
 def rivalry(config: OfflineConfig, whole: Mapping[int, float], best: int, fixed: int) -> str | None:
     """In words where the baseline is better than the trials suggested.
 
-    Parameters
-    ----------
-    config
-        It says what `whole` is.
-    whole
-        By trial number, the first objective in whole runs: its mean over the sequences.
-    best, fixed
-        Trial numbers of the set with the best trials, and of the fixed set.
+    `whole` has by trial number the first objective in whole runs, its mean over the sequences;
+    `best` is the set with the best trials.
     """
     if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
         return None

@@ -167,10 +167,7 @@ class LabelledData(NamedTuple):
         Views themselves are not left out: they add nothing about the place that they show. A
         stretch is not left out if nothing far enough from it remains.
 
-        Parameters
-        ----------
-        by_recording
-            Whether recordings are left out; by default if there are `MIN_RECORDINGS`.
+        Recordings are left out where `by_recording`; by default if there are `MIN_RECORDINGS`.
         """
         if by_recording is None:
             by_recording = len(self.recordings) >= MIN_RECORDINGS
@@ -311,10 +308,7 @@ def comparable(
 def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First frame of every period, and number of every frame's period among them.
 
-    Parameters
-    ----------
-    period
-        Whole periods since the first scan, of shape (n_frames,).
+    `period` has whole periods since the first scan, of shape (n_frames,).
     """
     _, first, number = np.unique(period, return_index=True, return_inverse=True)
     return first, number
@@ -328,16 +322,7 @@ def measured_costs(
 ) -> Costs:
     """Mean costs of sets over the sequences on which they were run.
 
-    Parameters
-    ----------
-    archive
-        The trials.
-    run
-        For each sequence, the trials that count there.
-    sets
-        The sets.
-    odometry
-        It tells which sets share prepared scans.
+    `run` has for each sequence the trials that count there.
 
     Returns
     -------
@@ -374,22 +359,8 @@ def labelled_data(
 ) -> LabelledData:
     """Read the labelled data set of a study.
 
-    Parameters
-    ----------
-    archive
-        The trials.
-    run
-        For each training sequence, the trials that count there.
-    sets
-        The sets to read about.
-    config
-        Of the study.
-    window
-        Number of descriptors that are averaged.
-    recorded_in
-        The recording of a sequence, by its name.
-    odometry
-        Of the study.
+    `run` has for each training sequence the trials that count there, `window` the number of
+    descriptors that are averaged, `recorded_in` the recording of a sequence.
 
     Raises
     ------

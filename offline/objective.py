@@ -113,17 +113,9 @@ def trajectory_metrics(
 def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
     """Undo restarts at the reference, which would hide the errors that led to them.
 
-    Parameters
-    ----------
-    T_odom_sensor
-        Poses of shape (n, 4, 4).
-    lost_steps
-        By frame of a restart, the odometry's motion since the frame before, of shape (4, 4).
+    `lost_steps` has by frame of a restart the odometry's motion since the frame before, (4, 4).
 
-    Returns
-    -------
-    ndarray of shape (n, 4, 4)
-        The trajectory as it would have continued from the wrong pose.
+    Returns shape (n, 4, 4): the trajectory as it would have continued from the wrong pose.
     """
     T = T_odom_sensor.copy()
     for start, end in pairwise([*sorted(lost_steps), len(T)]):
@@ -278,12 +270,8 @@ def choose_fixed(whole: Mapping[int, float], trials: Mapping[int, float]) -> int
     Of candidates that are nearly as good, the one with the best trials is chosen: the best of a few
     runs owes something to chance.
 
-    Parameters
-    ----------
-    whole
-        By trial number, the first objective in whole runs: its mean over the sequences.
-    trials
-        The same in trials, see `Verdict.bound`.
+    `whole` has by trial number the first objective in whole runs, its mean over the sequences, and
+    `trials` the same in trials, see `Verdict.bound`.
     """
     most = NEARLY * min(whole.values())
     return min((n for n, value in whole.items() if value <= most), key=lambda n: trials[n])
@@ -298,15 +286,7 @@ def label(weights: Mapping[Metric, float], units: bool = False) -> str:
 
 
 def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
-    """A sentence about the spread of the baseline over its runs, if it was run several times.
-
-    Parameters
-    ----------
-    config
-        Its first objective counts.
-    runs
-        The baseline's trial on every sequence.
-    """
+    """A sentence about the spread of the baseline over its runs, if it was run several times."""
     objective = config.objective[0]
     if not all(run.repeats for run in runs) or set(objective) <= set(TIMED):
         return []
@@ -321,15 +301,8 @@ def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
 def pareto_front(values: NDArray[np.float64]) -> NDArray[np.intp]:
     """Rows that no other row dominates: as good in every column, and better in one.
 
-    Parameters
-    ----------
-    values
-        Values to minimise, of shape (n, n_objectives).
-
-    Returns
-    -------
-    ndarray of shape (m,)
-        Indices of these rows, by rising value of the first column; of equal rows the first one.
+    Returns shape (m,): indices of these rows, by rising value of the first column; of equal rows
+    the first one.
     """
     unique, first = np.unique(values, axis=0, return_index=True)
     front = [

@@ -38,17 +38,7 @@ def run_oracle(
 
     What was run with another recording, odometry or set is run again.
 
-    Parameters
-    ----------
-    study
-        The study, with its model. ``oracle`` in its folder receives the trials, which no model is
-        fitted to.
-    n_sets
-        How many, see `oracle_sets`.
-    progress
-        Called about every finished trial.
-    cluster
-        See `offline.train.train`.
+    ``oracle`` in the study's folder receives the trials, which no model is fitted to.
 
     Returns
     -------

@@ -65,11 +65,8 @@ class Sampler(ABC):
     def propose(self, history: Sequence[tuple[Any, ...]]) -> list[ParameterSet]:
         """Propose the parameter sets of the next batch.
 
-        Parameters
-        ----------
-        history
-            Results of all trials of the batches before, in their order: `SamplerResult`, or tuples
-            of its first values.
+        The history has the results of all trials of the batches before, in their order:
+        `SamplerResult`, or tuples of its first values.
 
         Returns
         -------

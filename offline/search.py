@@ -48,11 +48,8 @@ def rungs(pruning: bool, batch: int, n: int) -> list[int]:
 def survivors(batch: Mapping[int, Values], before: Mapping[int, Values]) -> list[int]:
     """Numbers of the trials of a batch that continue.
 
-    Parameters
-    ----------
-    batch, before
-        Values by trial number: of the trials of this batch that are left, and of all trials before.
-        Only trials that keep all limits.
+    Values are by trial number, of this batch and of all trials before, of those that keep all
+    limits.
     """
     if not before:
         return list(batch)
@@ -104,18 +101,7 @@ def spent(
 ) -> str | None:
     """Why a search stops after a batch.
 
-    Parameters
-    ----------
-    config
-        The budgets.
-    verdicts
-        Verdicts of all its trials.
-    best
-        Index of the best of them.
-    hours
-        Hours that their batches took.
-    number
-        Trial number of the best of them.
+    None if it continues. `best` is the index of the best verdict, `number` its trial number.
 
     Returns
     -------
@@ -138,14 +124,7 @@ def spent(
 def all_done(config: OfflineConfig, folder: Path, numbers: Iterable[int]) -> bool:
     """Whether a study has no trials left, and the model is fitted to those that it has.
 
-    Parameters
-    ----------
-    config
-        The budgets.
-    folder
-        The study's. ``trials.csv``, which a run writes at its end, is newer than all trials then.
-    numbers
-        Numbers of the finished trials.
+    ``trials.csv``, which a run writes at its end, is newer than all trials then.
     """
     table, limit = folder / "trials.csv", max_trials(config)
     if not table.exists():
@@ -415,13 +394,5 @@ def make_searches(
 
 
 def owner(slots: Mapping[str, int], number: int) -> str | None:
-    """The sequence whose own search proposed a trial's set; None for a shared search.
-
-    Parameters
-    ----------
-    slots
-        See `adaptune.archive.Archive.slots`.
-    number
-        The trial's.
-    """
+    """The sequence whose own search proposed a trial's set; None for a shared search."""
     return next((name for name, slot in slots.items() if slot == number // OF_SLOT), None)

@@ -137,18 +137,11 @@ def train(
 ) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
-    Parameters
-    ----------
-    study
-        The study. Its folder holds the archive and receives the error model, the fixed set
-        (``fixed.yaml``), tables of the trials (``trials``) and of the training sequences
-        (``training``), and with several objectives their Pareto front (``pareto``).
-    progress
-        Called about every finished trial.
-    cluster
-        Address of a Dask scheduler whose workers run the trials; None for processes here.
-    again
-        Remove the trials that depend on something that has changed since they were run.
+    The study's folder receives the archive, the error model, the fixed set (``fixed.yaml``),
+    tables of the trials (``trials``) and of the training sequences (``training``), and with
+    several objectives their Pareto front (``pareto``). `cluster` is the address of a Dask
+    scheduler whose workers run the trials. `again` removes trials that depend on something that
+    has changed.
 
     Raises
     ------
@@ -475,21 +468,6 @@ def fit(
     """Make the error model, which does not adapt yet.
 
     Sets have no errors (NaN) on the sequences that they were not run on.
-
-    Parameters
-    ----------
-    data
-        Of all trials that keep the limits.
-    fixed
-        Trial number of the fixed set.
-    odometry
-        Its name and settings.
-    length
-        Metres of a sub-trajectory.
-    window
-        Number of descriptors that are averaged.
-    provenance
-        Where the model comes from, for people.
     """
     sequences = data.sequences
     return ErrorModel(
@@ -514,17 +492,7 @@ def fit(
 
 
 def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
-    """Choose what is driven: the rule's settings, the bank and those of its weights.
-
-    Parameters
-    ----------
-    model
-        Fitted to `data`.
-    data
-        The labelled data set.
-    switching
-        Size of the bank, or its members.
-    """
+    """Choose what is driven: the rule's settings, the bank and those of its weights."""
     complete = data.complete()
     bank = named_members(model, switching, complete) or switching.size
     chosen = choose(complete, bank, fixed=model.fixed)

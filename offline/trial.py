@@ -286,15 +286,6 @@ def with_measured_hops(
 ) -> Frames:
     """Register scans directly to those some metres before, see `hops_along`.
 
-    Parameters
-    ----------
-    scans
-        Of the sequence.
-    frames
-        Of the same scans; their reference takes the odometry's place.
-    advance
-        Called with how many scans are done, and how many there are.
-
     Returns
     -------
     Frames

@@ -69,12 +69,7 @@ def log_ratios(
 ) -> Logs:
     """Logarithm of the ratio to the fixed set's error on each stretch, by rising number.
 
-    Parameters
-    ----------
-    errors, fixed
-        Capped errors in percent, of shape (n_frames,).
-    stretch
-        Number of each frame's stretch, of shape (n_frames,).
+    Errors are capped, in percent, of shape (n_frames,); `stretch` has each frame's number.
     """
     _, number = np.unique(stretch, return_inverse=True)
     n_frames = np.bincount(number)
@@ -88,12 +83,7 @@ def expected_loss(logs: Logs, recordings: Sequence[str]) -> float:
     The fixed set has 0. Worst stretches that are better than the fixed set's are no merit. One
     stretch shows nothing: the loss is infinite, unless it does as the fixed set does.
 
-    Parameters
-    ----------
-    logs
-        A number for each stretch.
-    recordings
-        Name of each stretch's recording, in order along it.
+    There is a number for each stretch, and the name of its recording, in order along it.
     """
     if not logs.any():
         return 0.0
@@ -256,16 +246,8 @@ def least_loss(
 ) -> Policy:
     """The settings with the least loss, of one set at a time and of a bank.
 
-    Parameters
-    ----------
-    logs
-        Of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS)).
-    recordings
-        Of each stretch.
-    banks
-        By way to choose them, the members of each bank.
-    n_single
-        How many of the columns are about one set at a time.
+    `logs` is of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS)); its first
+    `n_single` columns are about one set at a time. `banks` has the members by way to choose them.
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
@@ -341,11 +323,8 @@ def _logs(
 ) -> NDArray[np.float64]:
     """Logarithms of ratios to the fixed set's error, on a fold.
 
-    Returns
-    -------
-    ndarray of shape (n_stretches, n_ways)
-        First those of one set at a time with each of `PAIRED_SETTINGS`, then those of each bank
-        with each of `BANK_SETTINGS`.
+    Returns shape (n_stretches, n_ways): first those of one set at a time with each of
+    `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`.
     """
     left_out, others = comparable(left_out, others)
     data, pca = others.training_data()
@@ -498,17 +477,7 @@ def weights_along(
 def simulated(
     sequence: LabelledSequence, near: NearProducts, settings: BankSettings
 ) -> NDArray[np.float64]:
-    """Capped errors of a simulated bank at the frames of a simulation that have a sub-trajectory.
-
-    Parameters
-    ----------
-    sequence
-        The sequence, whose simulation is run from end to end.
-    near
-        See `bank_evidence`.
-    settings
-        Of the bank's weights.
-    """
+    """Capped errors of a simulated bank at the frames that have a sub-trajectory."""
     return simulated_with(sequence, weights_along(sequence, near, settings))
 
 
@@ -543,17 +512,7 @@ def on_labelled(sequence: LabelledSequence, errors: NDArray[np.float64]) -> NDAr
 
 
 def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
-    """Milliseconds of CPU time a scan that a policy costs; NaN if it is unknown.
-
-    Parameters
-    ----------
-    data
-        With the costs of its sets.
-    policy
-        What is driven.
-    fixed
-        Trial number of the fixed set.
-    """
+    """Milliseconds of CPU time a scan that a policy costs; NaN if it is unknown."""
     if data.costs is None:
         return np.nan
     if policy.bank.adapt:
@@ -571,12 +530,7 @@ def rivals(data: LabelledData, cost: float) -> dict[str, int]:
     `BEST_DEFAULT` is the odometry that does best with its own parameters, where there are several;
     `EQUAL_COST` the best of all sets that alone cost no more than what is driven.
 
-    Parameters
-    ----------
-    data
-        On which they are chosen.
-    cost
-        Milliseconds of CPU time a scan of what is driven; NaN if it is unknown.
+    `cost` is in milliseconds of CPU time a scan of what is driven; NaN if it is unknown.
     """
     found = {}
     bounds = data.bounds()

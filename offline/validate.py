@@ -404,13 +404,8 @@ def validate(
 ) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
-    Parameters
-    ----------
-    study
-        A study that the offline stage has finished. Its folder receives ``validation`` (CSV, JSON
-        and a picture) and ``stretches`` (CSV, JSON), and its model the summary.
-    progress
-        Called about every fold.
+    The study's folder receives ``validation`` (CSV, JSON and a picture) and ``stretches`` (CSV,
+    JSON), and its model the summary.
 
     Raises
     ------
@@ -526,12 +521,7 @@ def _rate(data: LabelledData) -> float:
 def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
     """Ratios to the fixed set's error, intervals of the default rule's, and costs.
 
-    Parameters
-    ----------
-    validation
-        What was left out.
-    rate
-        Scans a second, by which costs become cores.
+    Costs become cores by the `rate` in scans a second.
     """
     default = validation.default
     modes = [mode for mode in validation.ratios if mode != "fixed"]

@@ -97,12 +97,7 @@ def read_model_file(
 
     It takes about as much memory as the file is large, whatever the file says.
 
-    Parameters
-    ----------
-    path
-        The file.
-    types
-        The arrays to read, and the types that each may have.
+    `types` has the arrays to read, and the types that each may have.
 
     Raises
     ------
@@ -287,13 +282,8 @@ class ErrorModel:
     def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
         """What selection rules are fitted to.
 
-        Parameters
-        ----------
-        pca
-            What `pca` returned.
-        members
-            Trial numbers of some of the bank's members, to be the only candidates; the first counts
-            as the fixed one. All sets are candidates when left out.
+        `pca` is what `pca` returned. Some of the bank's `members` may be the only candidates; the
+        first counts as the fixed one.
 
         Raises
         ------
@@ -339,17 +329,6 @@ class ErrorModel:
     ) -> None:
         """Refuse a model of another odometry, of other parameters, or of other sub-trajectories.
 
-        Parameters
-        ----------
-        odometry
-            Its name and settings.
-        space
-            The parameters.
-        length
-            Metres of a sub-trajectory.
-        path
-            Where the model is from.
-
         Raises
         ------
         ModelError
@@ -375,12 +354,7 @@ class ErrorModel:
     ) -> None:
         """Refuse a model that would run code which was not asked for.
 
-        Parameters
-        ----------
-        descriptors
-            The names of the descriptors that may be used besides adaptune's own.
-        where
-            Where the model is from.
+        Those of `descriptors` may be used besides adaptune's own.
 
         Raises
         ------
@@ -397,10 +371,7 @@ class ErrorModel:
     def is_foreign(self, elevation: float) -> bool:
         """Whether scans whose lowest points lie there come from no sensor of the training's.
 
-        Parameters
-        ----------
-        elevation
-            Degrees, the median of some scans' `adaptune.descriptor.lowest_elevation`.
+        `elevation` is the median of their `lowest_elevation`, in degrees.
         """
         apart = [abs(elevation - known) for known in self.elevations]
         return bool(apart) and min(apart) > SAME_SENSOR

@@ -128,9 +128,7 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
         ----------
         X : array-like of shape (n_queries, n_features)
 
-        Returns
-        -------
-        ndarray of shape (n_queries, n_sets), or (n_queries,) where `y` was of shape (n_frames,)
+        Returns shape (n_queries, n_sets), or (n_queries,) where `y` was of shape (n_frames,).
         """
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
@@ -144,16 +142,9 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
     def predict_at(self, x: NDArray[np.float64], sets: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predict the targets of other sets.
 
-        Parameters
-        ----------
-        x
-            One frame, of shape (n_features,).
-        sets
-            Of shape (n_candidates, n_parameters); they need not be among those fitted on.
+        `x` is one frame (n_features,); the sets (n_candidates, n_parameters) may be new ones.
 
-        Returns
-        -------
-        ndarray of shape (n_candidates,)
+        Returns shape (n_candidates,).
         """
         return self._predict(x, *self._near(sets))
 
@@ -182,11 +173,6 @@ class NearestNeighbours(Rule):
     After Koide et al., IROS 2021: a k-nearest-neighbour regressor on the concatenation of
     descriptor and parameters, here with the parameters in the unit cube, divided by the mean of
     their standard deviations as the descriptor's components are.
-
-    Parameters
-    ----------
-    k
-        Number of neighbours.
     """
 
     def __init__(self, k: int = 5):
@@ -278,16 +264,8 @@ def _mean_of_nearest(
 ) -> NDArray[np.float64]:
     """Mean target of the `k` nearest pairs, for every candidate.
 
-    Parameters
-    ----------
-    squared, frames, group
-        Near frames by rising distance, of shape (n,).
-    near_squared, near_sets
-        Near sets by rising distance, of shape (n_groups, n_candidates, n_near).
-    y
-        Targets of shape (n_frames, n_sets).
-    k
-        Number of pairs.
+    Near frames (n,) and near sets (n_groups, n_candidates, n_near) come by rising distance; `y` is
+    of shape (n_frames, n_sets).
     """
     n_candidates, n_near = near_sets.shape[1:]
     means = np.empty(n_candidates)

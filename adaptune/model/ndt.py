@@ -173,10 +173,7 @@ def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     direction, planar cells by thirds of abs(z) of their normal, spherical cells by l2/l1. A turn
     of the sensor about z changes nothing. Points (n, 3) that are not finite do not count.
 
-    Returns
-    -------
-    ndarray of shape (90,)
-        Nine classes for each of ten distances, the distance running slowest.
+    Returns shape (90,): nine classes for each of ten distances, the distance running slowest.
     """
     return np.asarray(_histogram(np.ascontiguousarray(points, np.float32)))
 

@@ -41,10 +41,7 @@ class Evidence(NamedTuple):
     def weights(self, sharpness: float) -> NDArray[np.float64]:
         """Weights of the training sequences: the nearer their frames, the larger.
 
-        Returns
-        -------
-        ndarray of shape (n_scans, n_sequences)
-            Each row adds up to 1.
+        Returns shape (n_scans, n_sequences): each row adds up to 1.
         """
         # Where the median is zero, every sequence has the very same place in it.
         spread = np.median(self.squared, axis=1, keepdims=True)
@@ -56,14 +53,9 @@ class Evidence(NamedTuple):
     def means(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Mean over the near frames of every sequence.
 
-        Parameters
-        ----------
-        values
-            One entry for each training frame, of shape (n_frames, ...).
+        There is one value for each training frame, of shape (n_frames, ...).
 
-        Returns
-        -------
-        ndarray of shape (n_scans, n_sequences, ...)
+        Returns shape (n_scans, n_sequences, ...).
         """
         means = np.empty((*self.squared.shape, *values.shape[1:]))
         for s, frames in enumerate(self.frames):
@@ -80,13 +72,7 @@ def trust_in(familiarity: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class NearestFrames:
-    """Finds the evidence about scenes.
-
-    Parameters
-    ----------
-    n_frames
-        Near frames of each sequence.
-    """
+    """Finds the evidence about scenes."""
 
     def __init__(self, n_frames: int):
         self.n_frames = n_frames
@@ -94,12 +80,7 @@ class NearestFrames:
     def fit(self, features: NDArray[np.float64], sequence: NDArray[np.intp]) -> Self:
         """Learn from the training frames.
 
-        Parameters
-        ----------
-        features
-            Of shape (n_frames, n_features).
-        sequence
-            Number of each frame's sequence, of shape (n_frames,).
+        Features are of shape (n_frames, n_features).
         """
         self.members_ = [np.flatnonzero(sequence == s) for s in np.unique(sequence)]
         self.features_ = [features[members] for members in self.members_]
@@ -109,10 +90,7 @@ class NearestFrames:
     def about(self, features: NDArray[np.float64]) -> Evidence:
         """Find the evidence about scans.
 
-        Parameters
-        ----------
-        features
-            Of shape (n_scans, n_features).
+        Features are of shape (n_scans, n_features).
         """
         squared = np.empty((len(features), len(self.members_)))
         frames = []
@@ -308,19 +286,11 @@ class TrainingData:
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
     """Mean capped error of every set; each sequence has the same weight.
 
-    Parameters
-    ----------
-    errors
-        Percent, of shape (n_frames, n_sets); NaN where a set was not run.
-    sequence
-        Number of each frame's sequence, of shape (n_frames,).
+    Errors are percent, of shape (n_frames, n_sets), NaN where a set was not run.
 
-    Returns
-    -------
-    ndarray of shape (n_sets,)
-        Percent. Frames without an error do not count. Where a set has no error on a whole sequence,
-        its mean is infinite: sequences differ more than sets do, so means over different sequences
-        cannot be compared.
+    Returns shape (n_sets,): percent. Frames without an error do not count. Where a set has no
+    error on a whole sequence, its mean is infinite: sequences differ more than sets do, so means
+    over different sequences cannot be compared.
     """
     capped = cap(errors)
     means = []
@@ -342,14 +312,8 @@ def complementary(data: TrainingData, size: int, spending: Spending | None = Non
     The search is greedy and begins with the fixed set. Each next set is the one that lowers the
     mean error most if the best of the chosen sets were known at every frame.
 
-    Parameters
-    ----------
-    data
-        A set that was not run on every sequence is not chosen.
-    size
-        Number of sets; fewer where another one would lower nothing.
-    spending
-        What a bank of them may cost; anything when left out.
+    `size` sets, or fewer where another one would lower nothing, or would cost too much. A set that
+    was not run on every sequence is not chosen.
 
     Returns
     -------
@@ -394,28 +358,14 @@ class Rule(ABC):
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predict the error of every set for one scan.
 
-        Parameters
-        ----------
-        feature
-            The scan's scaled descriptor, of shape (n_features,).
+        The feature is the scan's scaled descriptor, of shape (n_features,).
 
-        Returns
-        -------
-        ndarray of shape (n_sets,)
-            Percent; infinite for sets that are not candidates.
+        Returns shape (n_sets,): percent; infinite for sets that are not candidates.
         """
 
     @abstractmethod
     def select(self, feature: NDArray[np.float64]) -> Selection:
-        """Choose a set, or weights, for one scan.
-
-        Parameters
-        ----------
-        feature
-            The scan's scaled descriptor, of shape (n_features,).
-        current
-            Trial number of the set that the odometry has now, for rules with a switch cost.
-        """
+        """Choose a set, or weights, for one scan's scaled descriptor of shape (n_features,)."""
 
 
 # Selection by the paired expected ratio.
@@ -485,11 +435,6 @@ class PairedExpectedRatio(Rule):
 
     Where a set does worse than predicted, what was measured of it counts instead. Then the baseline
     is a candidate, too: in a place unlike all training, it is the best guess there is.
-
-    Parameters
-    ----------
-    settings
-        `offline.tuning` chooses them on the training sequences.
     """
 
     gated = True
@@ -549,10 +494,7 @@ class PairedExpectedRatio(Rule):
     def near(self, features: NDArray[np.float64]) -> Near:
         """Find the errors on the training frames nearest to scans.
 
-        Parameters
-        ----------
-        features
-            Of shape (n_scans, n_features).
+        Features are of shape (n_scans, n_features).
         """
         evidence = self.nearest_.about(features)
         fixed = evidence.means(self.fixed_errors_)
@@ -586,15 +528,7 @@ class PairedExpectedRatio(Rule):
         feature: NDArray[np.float64],
         measured: Mapping[int, float] | None = None,
     ) -> Selection:
-        """See `Rule.select`.
-
-        Parameters
-        ----------
-        feature
-            The scan's scaled descriptor, of shape (n_features,).
-        measured
-            By trial number, errors in percent of sets that did worse than predicted.
-        """
+        """See `Rule.select`; `measured` has errors in percent of sets worse than predicted."""
         measured = measured or {}
         near = self.near(feature[None])
         (expected,), (cautious,), (weights,) = self._ratios(near, self.settings)

@@ -107,11 +107,6 @@ class BankRule(Rule):
     The weights of a single scan are noise in part, and members' errors of some seconds cancel only
     while the weights stay the same. So a bank applies the mean over a few selections, see
     `smooth_weights`.
-
-    Parameters
-    ----------
-    settings
-        `offline.tuning` chooses them on the training sequences.
     """
 
     gated = True
@@ -145,10 +140,7 @@ class BankRule(Rule):
     def near(self, features: NDArray[np.float64]) -> NearProducts:
         """Find the products of errors on the training frames nearest to scans.
 
-        Parameters
-        ----------
-        features
-            Of shape (n_scans, n_features).
+        Features are of shape (n_scans, n_features).
         """
         evidence = self.nearest_.about(features)
         products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
@@ -178,12 +170,7 @@ class BankRule(Rule):
     def weigh(self, near: NearProducts, live: LiveSquares | None) -> Selection:
         """Weigh members for one scan; the others get no weight.
 
-        Parameters
-        ----------
-        near
-            Of the scan, and of the members to weigh.
-        live
-            What was measured of them, in their order; None if nothing was.
+        `live` is what was measured of them, in their order; None if nothing was.
         """
         (weights,), (ratio,) = bank_weights(near, self.settings, [live])
         (of_sequences,) = near.evidence.weights(self.settings.sharpness)
@@ -209,14 +196,7 @@ def bank_weights(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights of the members, and the root mean square that is expected of their mean.
 
-    Parameters
-    ----------
-    near
-        Of some scans.
-    settings
-        How to weigh.
-    live
-        What was measured of the members before each scan.
+    `live` is what was measured of the members before each scan.
 
     Returns
     -------
@@ -250,16 +230,7 @@ def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.flo
     Until something is measured, the first member has all the weight. From then on, the others get
     theirs as far as the measurements confirm them.
 
-    Parameters
-    ----------
-    n_members
-        Number of members.
-    live
-        What was measured of them.
-
-    Returns
-    -------
-    ndarray of shape (n_members,)
+    Returns shape (n_members,).
     """
     if live is None:
         return np.asarray(np.eye(n_members)[0])
@@ -275,12 +246,7 @@ def _untried(n_members: int) -> NDArray[np.float64]:
 def among(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Weights of the members that are present, adding up to 1; the others have none.
 
-    Parameters
-    ----------
-    weights
-        Of shape (n_members,).
-    present
-        Of the same shape.
+    Both are of shape (n_members,).
     """
     if present.all():
         return weights
@@ -291,14 +257,9 @@ def among(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[n
 def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
 
-    Parameters
-    ----------
-    weights
-        Of shape (n_selections, n_members).
+    They are of shape (n_selections, n_members).
 
-    Returns
-    -------
-    ndarray of shape (n_selections, n_members)
+    Returns shape (n_selections, n_members).
     """
     total = weights.copy()
     for k in range(1, SMOOTHING):
@@ -311,14 +272,8 @@ def clip_errors(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Clip the errors on the frames of a sequence.
 
-    Parameters
-    ----------
-    vectors
-        Percent, of shape (n_frames, n_sets, 3); not finite where the track was lost.
-    fixed_at
-        Column of the fixed set.
-    clip
-        See `BankSettings`.
+    Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost;
+    `fixed_at` is the fixed set's column.
 
     Returns
     -------
@@ -341,16 +296,9 @@ def minimum_variance_weights(
 ) -> NDArray[np.float64]:
     """Weights w, none negative and adding up to 1, for which w'Sw is least.
 
-    Parameters
-    ----------
-    squares
-        S, of shape (n, n).
-    even
-        See `BankSettings`.
+    S is of shape (n, n); see `BankSettings` for `even`.
 
-    Returns
-    -------
-    ndarray of shape (n,)
+    Returns shape (n,).
     """
     n = len(squares)
     harmonic = 1.0 / (1.0 / np.maximum(squares.diagonal(), 1e-12)).mean()
@@ -379,22 +327,10 @@ def choose_members(
     lowers the mean over the sequences of the root mean square of a weighted mean, if the best
     weights in every sequence were known.
 
-    Parameters
-    ----------
-    vectors
-        For every sequence the error vectors by trial number, each of shape (n_frames, 3), see
-        `clip_errors`. A set without them is not chosen.
-    errors
-        Of every sequence, percent, of shape (n_frames, n_sets); NaN where a set was not run. A set
-        that was not run on every sequence is not chosen.
-    sets
-        The columns of `errors`.
-    fixed
-        Trial number of the fixed set.
-    size
-        How many to choose, if there are as many.
-    spending
-        What they may cost; anything when left out.
+    `vectors` has for every sequence the error vectors by trial number, each of shape (n_frames,
+    3); a set without them is not chosen. `errors` has for every sequence percent of shape
+    (n_frames, n_sets), NaN where a set was not run; a set that was not run on every sequence is
+    not chosen.
 
     Returns
     -------
