@@ -202,9 +202,8 @@ class Sequences:
     """The sequences that a worker has prepared, as many as its memory holds."""
 
     def __init__(self, setup: TrialSetup, memory: float):
-        self._setup = self._apart = setup
-        if setup.odometry.user_code and setup.odometry.has_user_class:
-            self._apart = replace(setup, odometry=setup.odometry.allowing(user_code=False))
+        self._setup = setup
+        self._apart = replace(setup, odometry=setup.odometry.allowing(user_code=False))
         self._memory = memory
         self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 

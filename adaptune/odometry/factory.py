@@ -298,11 +298,6 @@ class OdometryFactory:
         """What the poses depend on besides name, settings and parameters."""
         return odometry_content(self.name, self.settings, self.module)
 
-    @property
-    def has_user_class(self) -> bool:
-        """Whether it is a class of the user."""
-        return is_user_class(self.name)
-
     def allowing(self, user_code: bool) -> "OdometryFactory":
         """The same where classes of the user may, or may not, run in this process."""
         return replace(self, user_code=user_code)
@@ -412,16 +407,6 @@ class OdometryPool:
         """The labels, and by label name and settings, by which a model knows what it is of."""
         settings = {label: factory.identity for label, factory in self.factories.items()}
         return {"name": self.name, "settings": settings}
-
-    @property
-    def user_code(self) -> bool:
-        """See `OdometryFactory`."""
-        return any(factory.user_code for factory in self.factories.values())
-
-    @property
-    def has_user_class(self) -> bool:
-        """See `OdometryFactory`."""
-        return any(factory.has_user_class for factory in self.factories.values())
 
     @property
     def apart(self) -> bool:

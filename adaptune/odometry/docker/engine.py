@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, NamedTuple
+from typing import Annotated, Any, BinaryIO, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field
 
@@ -24,7 +24,7 @@ from adaptune.errors import OdometryError, UnavailableError
 from adaptune.files import replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings, Usage
-from adaptune.odometry.docker import undertaker
+from adaptune.odometry.docker import remover
 from adaptune.space import ParameterSet
 
 OWNER = "adaptune.owner"
@@ -151,7 +151,7 @@ def _owner() -> tuple[str, Any]:
     """Label of this process's containers, and who removes them if it is killed."""
     owner = str(_identity(os.getpid()))
     process = subprocess.Popen(
-        [sys.executable, undertaker.__file__, f"{OWNER}={owner}", temporary_prefix()],
+        [sys.executable, remover.__file__, f"{OWNER}={owner}", temporary_prefix()],
         stdin=subprocess.PIPE,  # which closes with this process
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -172,25 +172,27 @@ def image_digest(name: str) -> str:
 
 
 def _image(name: str) -> Any:
-    from docker.errors import APIError, ImageNotFound
+    from docker.errors import ImageNotFound
+
+    with _telling(name):
+        try:
+            return engine().api.inspect_image(name)
+        except ImageNotFound as error:
+            help_ = f"`docker pull {name}`, or `docker build` it"
+            raise EngineError(f"there is no image {name!r} on this machine: {help_}") from error
+
+
+@contextlib.contextmanager
+def _telling(image: str) -> Iterator[None]:
+    """Say what the engine refuses, or that it does not answer."""
+    from docker.errors import APIError
 
     try:
-        return engine().api.inspect_image(name)
-    except ImageNotFound as error:
-        help_ = f"`docker pull {name}`, or `docker build` it"
-        raise EngineError(f"there is no image {name!r} on this machine: {help_}") from error
+        yield
     except APIError as error:
-        raise EngineError(f"image {name!r}: {error.explanation or error}") from error
+        raise OdometryError(f"image {image!r}: {error.explanation or error}") from error
     except OSError as error:
-        raise _silent(error) from error
-
-
-def _refusal(image: str, error: Any) -> str:
-    return f"image {image!r}: {error.explanation or error}"
-
-
-def _silent(error: OSError) -> EngineError:
-    return EngineError(f"the Docker engine does not answer any more ({error})")
+        raise EngineError(f"the Docker engine does not answer any more ({error})") from error
 
 
 def default_user(settings: ContainerSettings) -> str:
@@ -252,7 +254,6 @@ class Container:
         bare: bool = False,
         hurried: bool = False,
     ):
-        from docker.errors import APIError
         from docker.types import Mount as Bind
         from docker.types import Ulimit
 
@@ -277,23 +278,20 @@ class Container:
             ulimits=[Ulimit(name="core", soft=0, hard=0)],
         )
         try:
-            made = client.api.create_container(
-                digest,
-                None if bare else list(command) or None,
-                user=user,
-                environment=_home(user) | dict(environment or {}),
-                labels={OWNER: _owner()[0]},
-                host_config=host,
-                entrypoint=list(command) if bare else None,
-            )
-            self.id = made["Id"]
-            client.api.start(self.id)
-        except APIError as error:
+            with _telling(settings.image):
+                self.id = client.api.create_container(
+                    digest,
+                    None if bare else list(command) or None,
+                    user=user,
+                    environment=_home(user) | dict(environment or {}),
+                    labels={OWNER: _owner()[0]},
+                    host_config=host,
+                    entrypoint=list(command) if bare else None,
+                )["Id"]
+                client.api.start(self.id)
+        except OdometryError:
             self.close()
-            raise OdometryError(_refusal(settings.image, error)) from error
-        except OSError as error:
-            self.close()
-            raise _silent(error) from error
+            raise
 
     id: str | None = None
     out_of_memory = False
@@ -303,12 +301,11 @@ class Container:
         """Exit code, or minus the signal's number; None while it runs."""
         from docker.errors import APIError
 
-        try:
-            state = engine().api.inspect_container(self.id)["State"]
-        except APIError:
-            return -9
-        except OSError as error:
-            raise _silent(error) from error
+        with _telling(self.image):
+            try:
+                state = engine().api.inspect_container(self.id)["State"]
+            except APIError:
+                return -9
         self.out_of_memory = bool(state["OOMKilled"])
         if state["Running"]:
             return None
@@ -317,24 +314,15 @@ class Container:
 
     def hold_to_cores(self) -> None:
         """Let it use no more cores than the settings say from now on."""
-        from docker.errors import APIError
-
         quota = int(self._cpus * _PERIOD)
-        try:
+        with _telling(self.image):
             engine().api.update_container(self.id, cpu_period=_PERIOD, cpu_quota=quota)
-        except APIError as error:
-            raise OdometryError(_refusal(self.image, error)) from error
-        except OSError as error:
-            raise _silent(error) from error
 
     def used(self) -> Ended:
         """CPU seconds and megabytes now; zero where it has ended."""
-        from docker.errors import APIError
-
-        try:
+        stats: dict[str, Any] = {}
+        with contextlib.suppress(OdometryError), _telling(self.image):
             stats = engine().api.stats(self.id, stream=False, one_shot=True)
-        except (APIError, OSError):
-            return Ended(0, 0.0, 0.0)
         memory = stats.get("memory_stats", {})
         # Files that were read may be forgotten at any time.
         cached = memory.get("stats", {})
@@ -357,49 +345,34 @@ class Container:
     def _exec(
         self, command: Sequence[str], environment: Mapping[str, str] | None, detach: bool
     ) -> tuple[str, bytes]:
-        from docker.errors import APIError
-
-        try:
+        with _telling(self.image):
             made = engine().api.exec_create(
                 self.id, list(command), environment=dict(environment or {})
             )
             output = engine().api.exec_start(made["Id"], detach=detach)
-        except APIError as error:
-            raise OdometryError(_refusal(self.image, error)) from error
-        except OSError as error:
-            raise _silent(error) from error
         return made["Id"], b"" if detach else output
 
     def finished(self, name: str) -> int | None:
         """Exit code of a command that `run` began; None while it runs."""
         from docker.errors import APIError
 
-        try:
-            state = engine().api.exec_inspect(name)
-        except APIError:
-            return -9  # with its container
-        except OSError as error:
-            raise _silent(error) from error
+        with _telling(self.image):
+            try:
+                state = engine().api.exec_inspect(name)
+            except APIError:
+                return -9  # with its container
         return None if state["Running"] else int(state["ExitCode"] or 0)
 
     def last_lines(self) -> str:
         """The last lines that it wrote."""
-        from docker.errors import APIError
+        return processes.plain_lines(self.log(_TAIL))
 
-        try:
-            return processes.plain_lines(engine().api.logs(self.id, tail=_TAIL))
-        except (APIError, OSError):
-            return ""
-
-    def log(self) -> bytes:
-        """All that it wrote."""
-        from docker.errors import APIError
-
-        try:
-            written: bytes = engine().api.logs(self.id)
-        except (APIError, OSError):
-            return b""
-        return written
+    def log(self, lines: int | Literal["all"] = "all") -> bytes:
+        """What it wrote."""
+        with contextlib.suppress(OdometryError), _telling(self.image):
+            written: bytes = engine().api.logs(self.id, tail=lines)
+            return written
+        return b""
 
     def close(self) -> None:
         """End and remove it, with its volumes; what is asked of it later finds none."""

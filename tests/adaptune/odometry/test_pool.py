@@ -52,7 +52,7 @@ def test_it_says_what_a_study_must_know():
     assert both.identity == {"name": "gicp, coarse", "settings": settings}
     assert {"small_gicp", "open3d"} <= set(both.versions)
     assert not both.apart
-    assert both.allowing(user_code=True).user_code
+    assert all(one.user_code for one in both.allowing(user_code=True).factories.values())
 
 
 def test_it_pickles():
