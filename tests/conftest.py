@@ -71,7 +71,6 @@ SLOW = [
     "adaptune/test_interrupt.py",
     "adaptune/report/test_page.py",
     "offline/test_pictures.py",
-    "adaptune/odometry/test_guarded.py",
     "adaptune/reference/test_picture.py",
     "adaptune/test_mistakes.py",
     "offline/test_tuning.py",

@@ -172,7 +172,7 @@ def image_digest(name: str) -> str:
 
 
 def _image(name: str) -> Any:
-    from docker.errors import ImageNotFound
+    from docker.errors import APIError, ImageNotFound
 
     with _telling(name):
         try:
@@ -180,6 +180,8 @@ def _image(name: str) -> Any:
         except ImageNotFound as error:
             help_ = f"`docker pull {name}`, or `docker build` it"
             raise EngineError(f"there is no image {name!r} on this machine: {help_}") from error
+        except APIError as error:
+            raise EngineError(f"image {name!r}: {error.explanation or error}") from error
 
 
 @contextlib.contextmanager

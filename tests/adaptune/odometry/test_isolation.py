@@ -1,9 +1,9 @@
 import io
 import os
+import pickle
 import re
 import subprocess
 import sys
-import time
 
 import drives
 import faulty
@@ -15,9 +15,11 @@ from setups import setup_of
 from adaptune import processes
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
+from adaptune.odometry.base import MOST_FAULTS
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
 from adaptune.odometry.registry import make_here
-from adaptune.odometry.remote import SERVICE, Isolated, Limits
+from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server
 from adaptune.recording import Imu, Scan
@@ -30,65 +32,108 @@ from online.replay import replay
 TOLD = {
     "abort": "ended by SIGABRT: about to go wrong",
     "segmentation fault": "ended by SIGSEGV: about to go wrong",
-    "exit": "ended",
-    "raise": r"ended with code 1: .*RuntimeError: no planes here",
-    "hang": r"a scan took longer than isolation.seconds = 0\.3: about to go wrong",
     "memory": r"out of isolation\.memory = 1 GB",
-    "NaN": "a pose that is not finite",
-    "not rigid": "a pose that is not rigid",
-    "mirrored": "a pose that is not rigid",
-    "shape": r"a pose of shape \(3, 4\)",
+    "mirrored": "it gave a pose that is not rigid",
 }
+"""Faults of classes in processes of their own."""
+HERE = {
+    "init": "RuntimeError: no planes in init",
+    "prepare": "RuntimeError: no planes in prepare",
+    "start": "RuntimeError: no planes in start",
+    "raise": "RuntimeError: no planes here",
+    "exit": "SystemExit|ended with code 0: about to go wrong|ended",
+    "hang": r"a scan took longer than isolation\.seconds = 0\.3",
+    "hangs in init": r"a scan took longer than isolation\.seconds = 0\.3",
+    "nothing": "TypeError: register returned None, not a Registration",
+    "NaN": "it gave a pose that is not finite",
+    "not rigid": "it gave a pose that is not rigid",
+    "shape": r"it gave a pose of shape \(3, 4\)",
+}
+"""Those that clean classes have in this process, too."""
+CASES = [*((f, False) for f in TOLD | HERE), *((f, True) for f in HERE)]
+
+
+def factory(fault="none", here=False, name="faulty:Clean"):
+    limits = Limits(seconds=0.3 if "hang" in fault else 60.0, memory=1.0)
+    return OdometryFactory(name, {"fault": fault}, faulty.Clean.space, limits, user_code=here)
 
 
 def isolated(fault, **parameters):
-    settings = faulty.Settings(fault=fault)
-    return Isolated("faulty:Faulty", parameters, settings, Limits(seconds=0.3, memory=1.0))
+    return factory(fault)(parameters)
 
 
 def scan(i):
     return Scan(i * 10**8, np.zeros((5, 3), np.float32))
 
 
-@pytest.mark.parametrize("fault", faulty.FAULTS)
-def test_every_fault_is_told_and_another_start_goes_on(fault):
-    odometry = isolated(fault)
-    odometry.start(scan(0), np.eye(4))
-    first = 1 if fault == "shape" else 3
-    for i in range(1, first):
-        assert odometry.register(scan(i)).T_odom_sensor[0, 3] == pytest.approx(0.1 * i)
-    for i in range(first, 6):
-        T, registered = odometry.register(scan(i))
-        assert np.isnan(T).all()
-        assert not registered
-    (told,) = odometry.faults
+def drive(odometry, n=6):
+    """Poses of some scans along x, NaN where there is none."""
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    poses = [odometry.register(odometry.prepare(scan(i))).T_odom_sensor for i in range(1, n)]
+    return np.array([T[0, 3] for T in poses])
 
-    assert re.search(TOLD[fault], told), told
+
+@pytest.mark.parametrize(("fault", "here"), CASES)
+def test_every_fault_is_told_and_another_start_goes_on(fault, here):
+    odometry = factory(fault, here)()
+    assert isinstance(odometry, Guarded) == here
+    x, n = drive(odometry), 0 if fault in (*faulty.ELSEWHERE, "shape") else 2
+    np.testing.assert_allclose(x[:n], 0.1 * np.arange(1, n + 1))
+    assert np.isnan(x[n:]).all()
+    (told,) = odometry.faults
+    assert re.search((TOLD | HERE)[fault], told), told
     T = np.eye(4)
     T[1, 3] = 4.0
-    odometry.start(scan(6), T)
-    if fault != "shape":
-        T, registered = odometry.register(scan(7))
+    odometry.start(odometry.prepare(scan(6)), T)
+    T, registered = odometry.register(odometry.prepare(scan(7)))
+    if n:
         np.testing.assert_allclose(T[:3, 3], [0.1, 4.0, 0.0])
         # The class counts its instances in a variable of its module.
-        assert registered
+        assert registered or here
+    if "hang" not in fault:
+        for _ in range(20):
+            odometry.start(odometry.prepare(scan(0)), np.eye(4))
+            odometry.register(odometry.prepare(scan(3)))
+        assert len(odometry.faults) == MOST_FAULTS
 
 
-def test_one_that_cannot_begin_is_given_up():
-    odometry = isolated("never begins")
-    begin = time.perf_counter()
-    for _ in range(30):
-        odometry.start(scan(0), np.eye(4))
-        assert np.isnan(odometry.register(scan(1)).T_odom_sensor).all()
-    assert len(odometry.faults) == 10
-    assert time.perf_counter() - begin < 5.0
+def test_only_who_says_so_runs_clean_classes_here():
+    assert isinstance(factory()(), Isolated)
+    assert isinstance(factory(here=True)(isolated=True), Isolated)
+    assert isinstance(factory(here=True, name="faulty:Faulty")(), Isolated)
+    assert isinstance(pickle.loads(pickle.dumps(factory(here=True)))(), Guarded)
+    assert factory().module == "faulty"
+
+
+def test_a_class_is_the_same_odometry_here_and_there():
+    here, there = (factory(here=here)({"x": 0.2}) for here in (True, False))
+    np.testing.assert_array_equal(drive(here), drive(there))
+    for odometry in (here, there):
+        odometry.apply(Selection(0, {"x": 0.95}))
+    for i in (6, 7):
+        a, b = (o.register(o.prepare(scan(i))).T_odom_sensor for o in (here, there))
+        np.testing.assert_array_equal(a, b)
+        assert a[0, 3] == pytest.approx(0.5 + 0.3 * (i - 5))
+        np.testing.assert_array_equal(
+            here.motions.T_previous_current, there.motions.T_previous_current
+        )
+    assert here.usage.cpu > 0.0
+    assert here.usage.memory is None
+    # A process that begins later has the parameters, too.
+    for odometry in (here, there):
+        np.testing.assert_allclose(drive(odometry, 2), [0.3])
+
+
+def test_settings_are_checked_in_another_process():
+    with pytest.raises(OdometryError, match=r"faulty:Clean: settings: fualt: .*'fault'"):
+        OdometryFactory("faulty:Clean", {"fualt": "hang"}, faulty.Clean.space, Limits())
 
 
 def test_a_server_that_was_killed_is_replaced():
     odometry = isolated("none")
     odometry.start(scan(0), np.eye(4))
-    server(SERVICE, "faulty:Faulty").process.kill()
-    server(SERVICE, "faulty:Faulty").process.wait()
+    server(SERVICE, "faulty:Clean").process.kill()
+    server(SERVICE, "faulty:Clean").process.wait()
     # Those it has forked live on.
     assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
     odometry.start(scan(2), np.eye(4))
@@ -100,17 +145,6 @@ def test_what_it_refuses_is_an_error():
     odometry = Isolated("ntd", {}, faulty.Settings(), Limits())
     with pytest.raises(OdometryError, match="there is no odometry 'ntd': did you mean 'ndt'"):
         odometry.start(scan(0), np.eye(4))
-
-
-def test_parameters_change_between_scans():
-    odometry = isolated("none", x=0.1)
-    odometry.start(scan(0), np.eye(4))
-    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
-    odometry.apply(Selection(0, {"x": 0.95}))
-    assert odometry.register(scan(2)).T_odom_sensor[0, 3] == pytest.approx(0.4)
-    # A process that begins later has them too.
-    odometry.start(scan(3), np.eye(4))
-    assert odometry.register(scan(4)).T_odom_sensor[0, 3] == pytest.approx(0.3)
 
 
 def test_it_is_the_same_odometry_in_another_process():
@@ -132,7 +166,7 @@ def faulty_study(study_file, tmp_path, fault):
         "odometry.name=faulty:Faulty",
         "odometry.parameters=",
         f"odometry.settings={{fault: {fault}, at: {drives.FIRST_STAMP + 12 * 10**8}}}",
-        "isolation={seconds: 0.3, memory: 1}",
+        "isolation={seconds: 60, memory: 1}",
         "lost_track=100",
     ]
     return load_study(study_file, overrides, tmp_path / "study")
@@ -162,6 +196,27 @@ def test_the_campaign_goes_on(study_file, tmp_path):
     with Workers(setup_of(study), 1, 1e9) as workers:
         results = [result for _, result, _ in run(workers, tasks)]
     assert ["SIGSEGV" in result.trials[0].faults[0] for result in results] == [True, True]
+
+
+def setup_with(study_file, tmp_path, fault):
+    overrides = ["odometry.name=faulty:Clean", "odometry.parameters=", "odometry.settings="]
+    return setup_of(
+        load_study(study_file, overrides, tmp_path / "study"), factory(fault, here=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("leaves", "its process ended with code 3"), ("prepare", "no planes in prepare")],
+)
+def test_a_class_that_ends_the_worker_then_runs_apart(study_file, tmp_path, fault, words):
+    with Workers(setup_with(study_file, tmp_path, fault), 1, 1e9) as workers:
+        ((_, result, _),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
+        (worker,) = workers._workers.values()
+        # It may end its process group.
+        assert os.getpgid(worker.process.pid) == worker.process.pid
+    assert result.frames is not None
+    assert words in result.trials[0].faults[0]
 
 
 def test_a_replay_goes_on_at_the_last_healthy_motion():
