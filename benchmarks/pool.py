@@ -46,7 +46,7 @@ from offline.labelled import LabelledData
 from offline.train import fit, tuned
 from offline.tuning import figures
 from offline.validate import PAIRED, Validation, leave_one_out
-from online.replay import Replay, replay
+from online.replay import ReplayRecord, replay
 
 DRIVEN_LENGTH = 40.0
 """Metres of each scene that is driven through."""
@@ -102,7 +102,7 @@ def model_of(data: LabelledData) -> ErrorModel:
     return tuned(model, data, SwitchingConfig())
 
 
-def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, Replay]]:
+def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, ReplayRecord]]:
     """Replay a course in all modes; the mean error in percent and the replay of each."""
     scans, make = list(simulate(course)), pool()
     trials = {"baseline": 0, **model.rivals, "fixed": model.fixed}
@@ -118,7 +118,7 @@ def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, Replay]]:
     return found
 
 
-def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> Replay:
+def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> ReplayRecord:
     """Replay scans with the model's bank."""
     sets = {trial: model.sets[trial] for trial in model.bank}
     bank = Bank(pool(), sets)

@@ -37,7 +37,7 @@ from adaptune.simulation.record import SimulatedScan, simulate
 from offline.labelled import LabelledData
 from offline.train import fit
 from offline.tuning import Policy, choose
-from online.replay import Replay, replay
+from online.replay import ReplayRecord, replay
 
 ORDERS = (
     ("cave", "open", "street"),
@@ -145,7 +145,7 @@ def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, W
     return {name: make() for name, make in made.items() if name == "fixed" or name in modes}
 
 
-def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[Replay]:
+def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[ReplayRecord]:
     """Replay a course in all ways."""
     replays = []
     for make, selector in compared.values():
@@ -155,7 +155,7 @@ def replays_of(scans: list[SimulatedScan], compared: Mapping[str, Way]) -> list[
     return replays
 
 
-def mean_error(scans: list[SimulatedScan], result: Replay) -> float:
+def mean_error(scans: list[SimulatedScan], result: ReplayRecord) -> float:
     """Mean capped error of a replay in percent."""
     T_world_sensor = np.array([scan.T_world_sensor for scan in scans])
     errors = sub_trajectory_rte(T_world_sensor, result.trajectory.T_world_sensor, SUB_TRAJECTORY)

@@ -28,7 +28,7 @@ from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from offline.config import load_study
 from online.live import CLOUD
-from online.replay import Progressed
+from online.replay import ReplayRecord
 from online.robot import RobotDrive
 
 RATE = 10.0
@@ -135,7 +135,7 @@ def main(folder: Path, hours: float) -> None:
     megabytes: list[float] = []
     begin = time.perf_counter()
 
-    def look(_: str, __: int, at: Progressed) -> None:
+    def look(_: str, __: int, at: ReplayRecord) -> None:
         robot.free.release()
         if at.done % round(EVERY * RATE) == 0:
             seconds.append(at.done / RATE)

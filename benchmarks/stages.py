@@ -34,7 +34,7 @@ from adaptune.trajectory import read_kitti
 from offline.config import OfflineStudy, load_study
 from offline.train import train
 from offline.trial import TrialSettings, TrialSetup
-from online.replay import Replay, replay
+from online.replay import ReplayRecord, replay
 
 REPETITIONS = 5
 UNCACHED = [f"sequences.{name}.cache=false" for name in ("hall_begin", "hall_end", "street")]
@@ -116,7 +116,7 @@ def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
     street = study.sequences.open("street")
     settings = study.odometry.settings
 
-    def replayed(selector: Selector) -> Replay:
+    def replayed(selector: Selector) -> ReplayRecord:
         selector.reset()
         return replay(street, study.odometry(fixed), HealthCheck(), selector)
 

@@ -22,7 +22,7 @@ from adaptune.ros.link import LinkError, RosLink
 from adaptune.selection import Selection
 from adaptune.selector import BACK
 from online.real_time import Arrival
-from online.replay import RealTimeRecord
+from online.replay import ReplayRecord
 
 SILENCE = 2.0
 """Seconds without a scan after which the log says so."""
@@ -407,7 +407,7 @@ class Status:
     restarts: int = 0
 
     @classmethod
-    def of(cls, record: RealTimeRecord, ignored: int) -> Self:
+    def of(cls, record: ReplayRecord, ignored: int) -> Self:
         """The counts of a drive."""
         late = record.late[-1] if record.late else 0.0
         return cls(record.dropped, record.missed, ignored, late)

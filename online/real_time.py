@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune import processes
-from adaptune.bank.bank import Bank
+from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
 from adaptune.odometry import wire
 from adaptune.odometry.base import Motions, OdometryInstance
@@ -29,7 +29,7 @@ from adaptune.recording.scan import Imu, Scan, joined
 from adaptune.selection import Selection
 from adaptune.selector import AnySelector, Schedule, TimedSelector
 from adaptune.study.config import RealTimeConfig
-from online.replay import Choice, Driver, Meter, Progressed, RealTimeRecord, Replay, Watch, recorded
+from online.replay import Choice, Driver, ReplayRecord, Watch
 
 # A selector in a process of its own: it describes a scan while the odometry works on it.
 
@@ -38,7 +38,7 @@ SLOTS = 4
 """Scans on their way."""
 _START = 60.0
 """Seconds in which the process must be ready."""
-MOST_LATE = 100
+MAX_TOO_LATE = 100
 """Selections that came too late and are remembered."""
 _NICE = 10
 """By how much the priority of live evidence is lower."""
@@ -54,14 +54,6 @@ class Answer(NamedTuple):
     selection: Selection | None  # None where none was due
     seconds: float  # from the scan's arrival in the process
     cpu: float  # seconds that the process has used
-
-
-class LateSelection(NamedTuple):
-    """A selection that nobody waited for."""
-
-    stamp: int  # nanoseconds, of its scan
-    selection: Selection
-    seconds: float  # that it took in the process
 
 
 class SelectorProcess:
@@ -100,7 +92,7 @@ class SelectorProcess:
         self._slots: list[SharedMemory] = []
         self._free: list[int] = []
         self._moved: Motions | None = None  # over the scans that were not shown
-        self._too_late: deque[LateSelection] = deque(maxlen=MOST_LATE)
+        self._too_late: deque[Answer] = deque(maxlen=MAX_TOO_LATE)
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])
         self._here, there = context.Pipe()
@@ -172,16 +164,14 @@ class SelectorProcess:
             self._keep(answers)
         return None
 
-    def too_late(self) -> "list[LateSelection]":
-        """Selections that came after nobody waited for them, since this was last asked."""
+    def too_late(self) -> list[Answer]:
+        """Answers with a selection that nobody waited for, since this was last asked."""
         late = list(self._too_late)
         self._too_late.clear()
         return late
 
-    def _keep(self, answers: "Sequence[Answer]") -> None:
-        for stamp, selection, seconds, _ in answers:
-            if selection is not None:
-                self._too_late.append(LateSelection(stamp, selection, seconds))
+    def _keep(self, answers: Sequence[Answer]) -> None:
+        self._too_late += [answer for answer in answers if answer.selection is not None]
 
     def _take_answers(self, seconds: float = 0.0) -> list[Answer]:
         """The answers that are there, or the first that come in so many seconds."""
@@ -292,11 +282,13 @@ class Arrival(NamedTuple):
     """A scan that the odometry takes."""
 
     scan: Scan
-    due: float  # when the sensor gave it, on the clock of `time.perf_counter`
+    due: float  # when the sensor gave it, by the drive's clock
     dropped: int  # scans before it that waited too long
 
 
-def arrivals(scans: Iterable[Scan], rate: float, queue: int) -> Iterator[Arrival]:
+def arrivals(
+    scans: Iterable[Scan], rate: float, queue: int, clock: Clock = CLOCK
+) -> Iterator[Arrival]:
     """Scans, each when it is due or as soon as it is asked for after that.
 
     What an IMU measured before a scan that is dropped goes to the scan after it.
@@ -307,22 +299,24 @@ def arrivals(scans: Iterable[Scan], rate: float, queue: int) -> Iterator[Arrival
         In order of time.
     rate, queue
         See `RealTimeConfig`.
+    clock
+        That the sensor goes by.
     """
     source = iter(scans)
     ahead = next(source, None)
     if ahead is None:
         return
-    first, begin = ahead.stamp, time.perf_counter()
+    first, begin = ahead.stamp, clock.now()
     waiting: deque[tuple[Scan, float]] = deque()
     imus: list[Imu] = []
     dropped = 0
     while ahead is not None or waiting:
         while ahead is not None:
             due = begin + (ahead.stamp - first) * 1e-9 / rate
-            if due > (now := time.perf_counter()):
+            if due > (now := clock.now()):
                 if waiting:
                     break
-                time.sleep(due - now)
+                clock.sleep(due - now)
                 continue
             waiting.append((ahead, due))
             if queue and len(waiting) > queue:
@@ -395,7 +389,8 @@ def replay_in_real_time(
     watch: Watch = lambda _: None,
     what: str = "the replay",
     core_ms: float = np.nan,
-) -> Replay:
+    clock: Clock = CLOCK,
+) -> ReplayRecord:
     """Replay a recording at the sensor's rate.
 
     While the odometry prepares a scan, the selector's process describes it.
@@ -412,6 +407,8 @@ def replay_in_real_time(
         Called after every scan.
     core_ms
         Milliseconds that a scan keeps the busiest core at work, if they are known.
+    clock
+        That the sensor goes by.
 
     Raises
     ------
@@ -422,18 +419,13 @@ def replay_in_real_time(
     first = list(islice(source, _AHEAD // 2))
     if said := outlook([scan.stamp for scan in first], settings, core_ms):
         _log.info("%s: %s", what, said)
-    steps, choices, meter = list[RegisteredScan](), list[Choice](), Meter()
-    drive = RealTimeDrive(odometry, health, settings, selector, choices.append, what)
-    for arrival in arrivals(chain(first, source), settings.rate, settings.queue):
-        meter.begin()
-        steps.append(drive.step(arrival))
-        meter.end()
-        done, newest = len(steps) + drive.record.dropped, choices[-1] if choices else None
-        watch(Progressed(done, steps[-1], newest, drive.record))
-    usage = odometry.usage
-    if selector is not None:
-        usage = usage._replace(elsewhere=usage.elsewhere + selector.cpu)
-    return recorded(steps, choices, meter, usage, drive.finished())
+    record = ReplayRecord(settings.rate)
+    drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
+    for arrival in arrivals(chain(first, source), settings.rate, settings.queue, clock):
+        drive.step(arrival)
+        watch(record)
+    drive.finish()
+    return record.finish(odometry.usage, 0.0 if selector is None else selector.cpu)
 
 
 class RealTimeDrive:
@@ -443,15 +435,10 @@ class RealTimeDrive:
 
     Parameters
     ----------
-    odometry, health, settings, selector, what
+    odometry, health, settings, selector, what, clock
         See `replay_in_real_time`.
-    note
-        Called with every choice, also with those that are not applied.
-
-    Attributes
-    ----------
-    record : RealTimeRecord
-        How it keeps up.
+    record
+        Receives what becomes of each scan and each selection.
     """
 
     def __init__(
@@ -460,29 +447,31 @@ class RealTimeDrive:
         health: HealthCheck,
         settings: RealTimeConfig,
         selector: SelectorProcess | None,
-        note: Callable[[Choice], None],
+        record: ReplayRecord,
         what: str,
+        clock: Clock = CLOCK,
     ):
-        self.record = RealTimeRecord(settings.rate)
+        self.record, self._clock = record, clock
         self._odometry, self._selector = odometry, selector
-        self._deadline, self._note = settings.deadline, note
+        self._deadline = settings.deadline
         self._schedule = Schedule(1.0 if selector is None else selector.period * 1e9)
         fixed = None if selector is None else selector.fixed
-        self._driver = Driver(odometry, health, fixed, what, note)
+        self._driver = Driver(odometry, health, fixed, what, record.note)
 
     def step(self, arrival: Arrival) -> RegisteredScan:
         """Select if that is due, and find the pose of a scan."""
         scan, due, dropped = arrival
+        self.record.begin()
         self.record.dropped += dropped
-        begin = time.perf_counter()
+        begin = self._clock.now()
         prepared = self._prepare(scan, due)
-        seconds = time.perf_counter() - begin
-        found = self._driver.register_prepared(scan, prepared, seconds)
-        self.record.late.append(time.perf_counter() - due)
-        return found
+        step = self._driver.register(scan, prepared, self._clock.now() - begin)
+        self.record.late.append(self._clock.now() - due)
+        self.record.end(step)
+        return step
 
-    def finished(self) -> RealTimeRecord:
-        """The record, with what selector and bank have counted."""
+    def finish(self) -> None:
+        """Record what selector and bank have counted."""
         if self._selector is not None:
             self.record.unseen = self._selector.unseen
         if isinstance(self._odometry, Bank):
@@ -490,7 +479,6 @@ class RealTimeDrive:
             pairs = zip(trials, late.scans.tolist(), strict=True)
             self.record.late_members = {trial: scans for trial, scans in pairs if scans}
             self.record.removed = tuple(np.array(trials)[late.removed].tolist())
-        return self.record
 
     def _prepare(self, scan: Scan, due: float) -> Any:
         """Prepare a scan with the parameters that it is registered with.
@@ -506,9 +494,9 @@ class RealTimeDrive:
         shown = selector.show(scan.stamp, scan, odometry.motions, wait)
         if not wanted:
             return odometry.prepare(scan)
-        begin = time.perf_counter()
+        begin = self._clock.now()
         answer = selector.answer_to(scan.stamp, 0.5 * self._left(due)) if shown else None
-        self.record.waited.append(time.perf_counter() - begin)
+        self.record.waited.append(self._clock.now() - begin)
         if answer is not None:
             self._take(answer, scan.stamp, due)
             return odometry.prepare(scan)
@@ -522,12 +510,13 @@ class RealTimeDrive:
         """Apply what was selected, if it is there."""
         assert self._selector is not None
         for old in self._selector.too_late():
-            self._note(Choice(old.stamp, old.selection, old.seconds, "too late"))
+            assert old.selection is not None
+            self.record.note(Choice(old.stamp, old.selection, old.seconds, "too late"))
         if answer is None or answer.selection is None:
             self.record.missed += 1
             return
-        self._driver.take(stamp, answer.selection, time.perf_counter() - due)
+        self._driver.take(stamp, answer.selection, self._clock.now() - due)
 
     def _left(self, due: float) -> float:
         """Seconds to the deadline."""
-        return max(self._deadline - (time.perf_counter() - due), 0.0)
+        return max(self._deadline - (self._clock.now() - due), 0.0)

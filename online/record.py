@@ -19,7 +19,7 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.strict import in_one_line
 from adaptune.study.study import differences
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
-from online.replay import Choice, Replay
+from online.replay import Choice, ReplayRecord
 
 _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
@@ -184,7 +184,7 @@ class StoredReplay:
 
 
 def write_replay(
-    folder: Path, replay: Replay, about: ReplayIdentity, model_file: Path | None
+    folder: Path, replay: ReplayRecord, about: ReplayIdentity, model_file: Path | None
 ) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
@@ -203,8 +203,8 @@ def write_replay(
     _write_selections(folder / "selections.csv", replay)
     rows = [frame_row(step, math.nan) for step in replay.steps]
     columns: tuple[str, ...] = FRAME_COLUMNS[:-1]
-    if replay.real_time is not None:
-        columns, late = FRAME_COLUMNS, replay.real_time.late
+    if replay.rate is not None:
+        columns, late = FRAME_COLUMNS, replay.late
         rows = [frame_row(*pair) for pair in zip(replay.steps, late, strict=True)]
     _write_csv(folder / "frames.csv", columns, (row[: len(columns)] for row in rows))
     stamps = replay.trajectory.stamps
@@ -227,20 +227,20 @@ def write_replay(
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
 
 
-def kept_up(replay: Replay) -> dict[str, float] | None:
+def kept_up(replay: ReplayRecord) -> dict[str, float] | None:
     """Counts, and medians and 99th percentiles in milliseconds, of a replay in real time."""
-    if (record := replay.real_time) is None:
+    if replay.rate is None:
         return None
     found: dict[str, float] = {
-        "rate": record.rate,
-        "dropped_scans": record.dropped,
-        "missed_selections": record.missed,
-        "unseen_scans": record.unseen,
-        "late_members_scans": sum(record.late_members.values()),
-        "removed_members": len(record.removed),
+        "rate": replay.rate,
+        "dropped_scans": replay.dropped,
+        "missed_selections": replay.missed,
+        "unseen_scans": replay.unseen,
+        "late_members_scans": sum(replay.late_members.values()),
+        "removed_members": len(replay.removed),
     }
     latencies = [choice.seconds for choice in replay.choices]
-    named = {"pose": record.late, "selection": latencies, "waited": record.waited}
+    named = {"pose": replay.late, "selection": latencies, "waited": replay.waited}
     for name, seconds in named.items():
         for q in (50, 99):
             value = 1e3 * float(np.percentile(seconds, q)) if seconds else 0.0
@@ -248,14 +248,14 @@ def kept_up(replay: Replay) -> dict[str, float] | None:
     return found
 
 
-def _lost_seconds(replay: Replay) -> float:
+def _lost_seconds(replay: ReplayRecord) -> float:
     """Seconds from selections at which the bank was lost to the next ones."""
     stamps = [*(choice.stamp for choice in replay.choices), int(replay.trajectory.stamps[-1])]
     spans = zip(replay.choices, itertools.pairwise(stamps), strict=True)
     return 1e-9 * sum(end - start for choice, (start, end) in spans if choice.selection.lost)
 
 
-def _mean_estimated(replay: Replay) -> float | None:
+def _mean_estimated(replay: ReplayRecord) -> float | None:
     """Mean of the estimated errors, where there are any."""
     errors = [choice.selection.estimated_error for choice in replay.choices]
     known = [error for error in errors if math.isfinite(error)]
@@ -272,7 +272,7 @@ FRAME_COLUMNS = ("stamp_ns", "registered", "restarted", "prepare_ms", "register_
 """Columns of ``frames.csv``."""
 
 
-def _write_selections(path: Path, replay: Replay) -> None:
+def _write_selections(path: Path, replay: ReplayRecord) -> None:
     # Sets of several odometries have other parameters.
     every = (name for choice in replay.choices for name in choice.selection.parameters)
     names = list(dict.fromkeys(every))

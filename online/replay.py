@@ -1,11 +1,12 @@
 """Replay a recording in lockstep, selecting parameters on the way."""
 
 import logging
+import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, MutableSequence, Sequence
+from collections.abc import Callable, Iterable, MutableSequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,10 @@ from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.selector import NEW, Schedule, Selects
+from adaptune.selector import NEW, REMEMBERED, Schedule, Selects
 from adaptune.trajectory import Trajectory
 
 # Applies what is selected, and returns to the fixed set where that or the odometry goes wrong.
-
-
-AVOIDED = 60 * 10**9
-"""Nanoseconds for which a set is not applied after the odometry failed with it."""
 
 
 class Choice(NamedTuple):
@@ -42,8 +39,8 @@ class Driver:
 
     Where the health check finds no pose or an impossible one, where a switch fails, and where the
     odometry ends, it returns to the fixed set. A single set with which that happened is not applied
-    for `AVOIDED`; a bank keeps its members. Where the baseline has just taken the place of another
-    set, the odometry only restarts: it was lost already.
+    for `REMEMBERED` seconds; a bank keeps its members. Where the baseline has just taken the place
+    of another set, the odometry only restarts: it was lost already.
 
     Parameters
     ----------
@@ -95,14 +92,13 @@ class Driver:
         self._applied = selection
         self._note(choice)
 
-    def register(self, scan: Scan) -> RegisteredScan:
-        """Find the pose of the next scan."""
+    def register(
+        self, scan: Scan, prepared: Any = None, seconds: float | None = None
+    ) -> RegisteredScan:
+        """Find the pose of the next scan, which the odometry may have prepared in so long."""
         self._first = scan.stamp if self._first is None else self._first
-        return self._tracker.register(scan)
-
-    def register_prepared(self, scan: Scan, prepared: Any, seconds: float) -> RegisteredScan:
-        """Find the pose of the next scan, which the odometry has prepared."""
-        self._first = scan.stamp if self._first is None else self._first
+        if seconds is None:
+            return self._tracker.register(scan)
         return self._tracker.register_prepared(scan.stamp, prepared, seconds, scan)
 
     def _unhealthy(self, stamp: int, what: str) -> bool:
@@ -125,7 +121,7 @@ class Driver:
         fixed = self._fixed
         assert fixed is not None
         if failed.weights is None and failed.trial != fixed.trial:
-            self._avoided[failed.trial] = stamp + AVOIDED
+            self._avoided[failed.trial] = stamp + round(REMEMBERED * 1e9)
         seconds = self._seconds(stamp)
         # Where that fails, too, the next selection tries again.
         self._applied = fixed
@@ -166,53 +162,97 @@ _SAMPLED = 10
 _log = logging.getLogger(__name__)
 
 
-@dataclass
-class RealTimeRecord:
-    """How a replay in real time kept up."""
+@dataclass(eq=False)
+class ReplayRecord:
+    """What a replay, or a drive, did at each scan and at each selection so far."""
 
-    rate: float  # times as fast as it was recorded
+    rate: float | None = None  # times as fast as it was recorded; None if in lockstep
+    tell: Callable[[Choice], None] = lambda _: None  # called with every choice
+    steps: MutableSequence[RegisteredScan] = field(default_factory=list)  # (n,)
+    choices: MutableSequence[Choice] = field(default_factory=list)  # those that were applied
+    rejected: MutableSequence[Choice] = field(default_factory=list)  # those that were not
+    newest: Choice | None = None  # applied or not
+    seconds: float = 0.0  # the whole replay, reading included
+    cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
+    memory: float = 0.0  # most megabytes of all processes
+    # In real time:
     dropped: int = 0  # scans that the odometry did not get
     missed: int = 0  # selections that were not there at their deadline
     unseen: int = 0  # scans that the selector did not get
-    late: MutableSequence[float] = field(
-        default_factory=list
-    )  # (n,): seconds from a scan's arrival to its pose
+    # (n,): seconds from a scan's arrival to its pose
+    late: MutableSequence[float] = field(default_factory=list)
     waited: MutableSequence[float] = field(default_factory=list)  # seconds for each selection
     late_members: dict[int, int] = field(default_factory=dict)  # scans at which they were, by trial
     removed: tuple[int, ...] = ()  # trials of members that were always late
 
+    def __post_init__(self) -> None:
+        self._cpu, self._n = 0.0, 0
+        self._started = time.perf_counter()
 
-class Progressed(NamedTuple):
-    """How far a replay is."""
+    @property
+    def done(self) -> int:
+        """Scans so far, with those that were dropped."""
+        return self._n + self.dropped
 
-    done: int  # scans, with those that were dropped
-    step: RegisteredScan  # the newest
-    choice: Choice | None  # the newest, applied or not
-    real_time: RealTimeRecord | None = None  # in real time
+    @property
+    def trajectory(self) -> Trajectory:
+        """The odometry's."""
+        stamps = np.array([step.stamp for step in self.steps], np.int64)
+        return Trajectory(stamps, np.array([step.T_odom_sensor for step in self.steps]))
+
+    @property
+    def restarted(self) -> NDArray[np.bool_]:
+        """Frames at which the health check restarted the odometry, of shape (n,)."""
+        return np.array([step.unhealthy is not None for step in self.steps])
+
+    @property
+    def registered(self) -> NDArray[np.bool_]:
+        """False where the scan was too poor and the last motion went on, of shape (n,)."""
+        return np.array([step.registered for step in self.steps])
+
+    @property
+    def unhealthy(self) -> dict[str, int]:
+        """How often the health check found what."""
+        return dict(Counter(s.unhealthy for s in self.steps if s.unhealthy is not None))
+
+    def note(self, choice: Choice) -> None:
+        """Note a selection."""
+        self.newest = choice
+        (self.rejected if choice.why_not else self.choices).append(choice)
+        self.tell(choice)
+
+    def begin(self) -> None:
+        """A scan is there: its CPU time counts from now on."""
+        self._begun = time.process_time()
+
+    def end(self, step: RegisteredScan) -> None:
+        """It is done."""
+        self._cpu += time.process_time() - self._begun
+        if self._n % _SAMPLED == 0:
+            self.memory = max(self.memory, resident_megabytes())
+        self._n += 1
+        self.steps.append(step)
+
+    def finish(self, usage: Usage, elsewhere: float = 0.0) -> Self:
+        """Sum up, with what the odometry used, and what else took CPU seconds.
+
+        Raises
+        ------
+        AdaptuneError
+            If there was no scan.
+        """
+        if not self._n:
+            raise AdaptuneError("there is no scan to replay; check start, stop and views")
+        self.seconds = time.perf_counter() - self._started
+        self.cpu_ms = 1e3 * (self._cpu + usage.elsewhere + elsewhere) / self._n
+        self.memory += usage.memory or 0.0
+        return self
 
 
-Watch = Callable[[Progressed], None]
+Watch = Callable[[ReplayRecord], None]
 """Called after every scan."""
-Look = Callable[[str, int, Progressed], None]
+Look = Callable[[str, int, ReplayRecord], None]
 """Called after every scan with what is driven, and how many scans there are (0: nobody knows)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """One way through a recording."""
-
-    trajectory: Trajectory  # the odometry's
-    restarted: NDArray[np.bool_]  # (n,): frames at which the health check restarted the odometry
-    # (n,): false where the scan was too poor to register and the last motion went on.
-    registered: NDArray[np.bool_]
-    steps: Sequence[RegisteredScan]  # (n,)
-    choices: list[Choice]  # those that were applied
-    rejected: list[Choice]  # those that were not
-    seconds: float  # the whole replay, reading included
-    unhealthy: dict[str, int]  # how often the health check found what
-    cpu_ms: float  # milliseconds of CPU time a scan, in all processes, without reading it
-    memory: float  # most megabytes of all processes
-    real_time: RealTimeRecord | None = None  # in real time
 
 
 def replay(
@@ -224,7 +264,7 @@ def replay(
     watch: Watch = lambda _: None,
     what: str = "the replay",
     fixed: Selection | None = None,
-) -> Replay:
+) -> ReplayRecord:
     """Replay a recording, as fast as it goes and always the same way.
 
     Selections are made as `Schedule` says, from a scan and before it is registered.
@@ -246,7 +286,7 @@ def replay(
     what
         What is replayed, for the log.
     fixed
-        What an adaptive mode returns to where it fails, see `online.safety.Driver`.
+        What an adaptive mode returns to where it fails, see `Driver`.
 
     Raises
     ------
@@ -255,11 +295,10 @@ def replay(
     OdometryError
         If the odometry cannot change its parameters, and there is no `fixed` to return to.
     """
-    choices, steps = list[Choice](), list[RegisteredScan]()
-    driver = Driver(odometry, health, fixed, what, choices.append)
-    schedule, meter = Schedule(period * 1e9), Meter()
+    record, schedule = ReplayRecord(), Schedule(period * 1e9)
+    driver = Driver(odometry, health, fixed, what, record.note)
     for scan in scans:
-        meter.begin()
+        record.begin()
         if selector is not None:
             selector.observe(scan.stamp, scan, odometry.motions)
             if schedule.due(scan.stamp):
@@ -267,62 +306,6 @@ def replay(
                 selection = selector.select()
                 driver.take(scan.stamp, selection, time.perf_counter() - t)
                 selector.measure()
-        steps.append(driver.register(scan))
-        meter.end()
-        watch(Progressed(len(steps), steps[-1], choices[-1] if choices else None))
-    return recorded(steps, choices, meter, odometry.usage)
-
-
-class Meter:
-    """Measures CPU time and memory, scan by scan."""
-
-    def __init__(self) -> None:
-        self._cpu = self._memory = 0.0
-        self._n = 0
-        self._started = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        """Since this was made."""
-        return time.perf_counter() - self._started
-
-    def begin(self) -> None:
-        """A scan is there."""
-        self._begin = time.process_time()
-
-    def end(self) -> None:
-        """It is done."""
-        self._cpu += time.process_time() - self._begin
-        if self._n % _SAMPLED == 0:
-            self._memory = max(self._memory, resident_megabytes())
-        self._n += 1
-
-    def used(self, odometry: Usage) -> tuple[float, float]:
-        """Milliseconds a scan, and megabytes, with what the odometry used in other processes."""
-        ms = 1e3 * (self._cpu + odometry.elsewhere) / self._n
-        return ms, self._memory + (odometry.memory or 0.0)
-
-
-def recorded(
-    steps: Sequence[RegisteredScan],
-    choices: Sequence[Choice],
-    meter: Meter,
-    usage: Usage,
-    real_time: RealTimeRecord | None = None,
-) -> Replay:
-    """A replay from what became of its scans, and of all selections."""
-    if not steps:
-        raise AdaptuneError("there is no scan to replay; check start, stop and views")
-    stamps, poses, registered, unhealthy, _, _ = zip(*steps, strict=True)
-    return Replay(
-        Trajectory(np.array(stamps, np.int64), np.array(poses)),
-        np.array([what is not None for what in unhealthy]),
-        np.array(registered),
-        steps,
-        [choice for choice in choices if not choice.why_not],
-        [choice for choice in choices if choice.why_not],
-        meter.seconds,
-        dict(Counter(what for what in unhealthy if what is not None)),
-        *meter.used(usage),
-        real_time,
-    )
+        record.end(driver.register(scan))
+        watch(record)
+    return record.finish(odometry.usage)

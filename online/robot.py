@@ -37,7 +37,7 @@ from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive, SelectorProcess, outlook
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
-from online.replay import Choice, Look, Progressed, RealTimeRecord
+from online.replay import Choice, Look, ReplayRecord
 
 # What a drive leaves on disk, written while it lasts.
 
@@ -291,7 +291,7 @@ class DriveRecord(NamedTuple):
 
     folder: Path  # of its trajectory, selections and scans
     scans: int
-    record: RealTimeRecord  # of its last part, where the clock went back
+    record: ReplayRecord  # of its last part, where the clock went back
     ignored: int  # scans that came twice or too late
 
 
@@ -414,23 +414,23 @@ class RobotDrive:
             publisher.begin(log)
             if selector is not None:
                 self._begin_with(odometry, selector.fixed, goes_on=done > 0)
-            health, note = self._study.config.health, publisher.choice
-            drive = RealTimeDrive(odometry, health, self._settings, selector, note, "drive")
-            drive.record.late = deque(maxlen=_KEPT)
-            drive.record.waited = deque(maxlen=_KEPT)
+            record = ReplayRecord(1.0, publisher.choice)
+            for name in ("steps", "choices", "rejected", "late", "waited"):
+                setattr(record, name, deque(maxlen=_KEPT))
+            health = self._study.config.health
+            drive = RealTimeDrive(odometry, health, self._settings, selector, record, "drive")
             arrived: list[int] = []
             if self._stopped:
                 self._scans.stop()
             try:
                 for arrival in self._scans.arrivals():
-                    step = drive.step(arrival)
-                    done += 1 + arrival.dropped
+                    publisher.step(drive.step(arrival), record)
                     self._tell_of_rate(arrived, arrival.due)
-                    publisher.step(step, drive.record)
-                    look("drive", 0, Progressed(done, step, publisher.newest, drive.record))
+                    look("drive", 0, record)
             except KeyboardInterrupt:
                 self._scans.stop()
-            return DriveRecord(folder, done, drive.finished(), self._scans.ignored)
+            drive.finish()
+            return DriveRecord(folder, done + record.done, record, self._scans.ignored)
 
     def _begin_with(self, odometry: OdometryInstance, fixed: Selection, *, goes_on: bool) -> None:
         """Apply the fixed set; an error at the start of the drive if that fails."""
@@ -469,7 +469,6 @@ class _Publisher:
     def begin(self, log: DriveLog) -> None:
         """Begin a drive, which has a log of its own."""
         self._log = log
-        self.newest: Choice | None = None
         self._uncertainty = Uncertainty(self._length)
         self._last: RegisteredScan | None = None
         self._told: int | None = None
@@ -477,13 +476,12 @@ class _Publisher:
 
     def choice(self, choice: Choice) -> None:
         """Tell of a selection."""
-        self.newest = choice
         self._log.choice(choice)
         if not choice.why_not:
             self._uncertainty.learn(choice.selection)
         self._selection(self._messages.selection(choice.stamp, choice.selection, choice.why_not))
 
-    def step(self, step: RegisteredScan, record: RealTimeRecord) -> None:
+    def step(self, step: RegisteredScan, record: ReplayRecord) -> None:
         """Tell of a pose."""
         self._log.scan(step, record.late[-1])
         if self._last is not None:
@@ -497,7 +495,7 @@ class _Publisher:
         self._status.restarts += step.unhealthy is not None
         if self._told is None or step.stamp - self._told >= _EVERY:
             self._told = step.stamp
-            selection = None if self.newest is None else self.newest.selection
+            selection = None if record.newest is None else record.newest.selection
             before, self._status = self._status, Status.of(record, self._scans.ignored)
             message = self._messages.diagnostics(step.stamp, selection, self._status, before)
             self._diagnostics(message)

@@ -28,7 +28,7 @@ from online.record import (
     write_reference,
     write_replay,
 )
-from online.replay import Look, Progressed, Replay, Watch, replay
+from online.replay import Look, ReplayRecord, Watch, replay
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -206,11 +206,11 @@ def _replay_due(
             warn_of_scant_evidence(what, selections, fixed)
 
 
-def _watch(progress: Progress, look: Look | None, what: str, n: int, at: Progressed) -> None:
+def _watch(progress: Progress, look: Look | None, what: str, n: int, record: ReplayRecord) -> None:
     """Pass on how far a replay is."""
-    progress(what, at.done, n)
+    progress(what, record.done, n)
     if look is not None:
-        look(what, n, at)
+        look(what, n, record)
 
 
 def _renew_reference(study: Study, name: str, replayed: Path) -> None:
@@ -225,7 +225,7 @@ def _renew_reference(study: Study, name: str, replayed: Path) -> None:
 
 def _in_lockstep(
     config: StudyConfig, sequence: Recording, run: _Run, modes: _Modes, watch: Watch
-) -> Replay:
+) -> ReplayRecord:
     odometry, selector = modes.setup.start(run.mode, modes.model, run.sequence)
     with closing(odometry):
         return replay(
@@ -242,7 +242,7 @@ def _in_lockstep(
 
 def _in_real_time(
     config: StudyConfig, sequence: Recording, run: _Run, modes: _Modes, watch: Watch
-) -> Replay:
+) -> ReplayRecord:
     assert config.online.real_time is not None
     mode = modes.setup.mode(run.mode, modes.model)
     odometry = modes.setup.instance(mode, run.sequence)

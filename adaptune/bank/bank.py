@@ -201,6 +201,16 @@ class _Cloud:
 # Members of a bank that do not keep up with the sensor.
 
 
+class Clock(NamedTuple):
+    """What tells the time, and waits; both in seconds."""
+
+    now: Callable[[], float]
+    sleep: Callable[[float], None]
+
+
+CLOCK = Clock(time.perf_counter, time.sleep)
+"""The machine's."""
+
 ALWAYS = 5.0
 """A member that is late at every scan for so many seconds is removed."""
 _INTERVALS = 11
@@ -222,6 +232,8 @@ class Lateness:
         Of the bank.
     rate
         Times as fast as recorded at which scans come; None if the bank waits for everybody.
+    clock
+        By which members are late.
 
     Attributes
     ----------
@@ -238,12 +250,17 @@ class Lateness:
     """
 
     def __init__(
-        self, members: Sequence[OdometryInstance], names: Sequence[str], rate: float | None
+        self,
+        members: Sequence[OdometryInstance],
+        names: Sequence[str],
+        rate: float | None,
+        clock: Clock = CLOCK,
     ):
         n = len(members)
         self.scans = np.zeros(n, np.intp)
         self.removed, self.resting, self.absent, self.away = np.zeros((4, n), np.bool_)
         self._members, self._names, self._rate = members, names, rate
+        self._clock = clock
         self._owing = np.zeros(n, np.bool_)
         self._behind = np.zeros(n)  # seconds for which each member has been late
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
@@ -259,7 +276,7 @@ class Lateness:
 
     def begin(self) -> None:
         """A scan is there: take what came late. Members that still work are absent."""
-        self._begun = time.perf_counter()
+        self._begun = self._clock.now()
         if self._rate is None:
             self.absent = self.resting.copy()
             return
@@ -311,7 +328,7 @@ class Lateness:
     def _is_in_time(self, i: int) -> bool:
         if self.absent[i] or self._rate is None:
             return not self.absent[i]
-        left = self._begun + median(self._intervals) / self._rate - time.perf_counter()
+        left = self._begun + median(self._intervals) / self._rate - self._clock.now()
         return self._members[i].ready(left)
 
     def _note(self, i: int, interval: float) -> None:
@@ -394,6 +411,8 @@ class Bank(OdometryInstance):
         Times as fast as recorded at which scans come: members that are late are not waited for,
         see `Lateness`, and those that restart see scans of the past `CATCH_UP` at a time. None
         waits for all.
+    clock
+        By which members are late.
 
     Attributes
     ----------
@@ -411,6 +430,7 @@ class Bank(OdometryInstance):
         lost_track: float = 3.0,
         cores: int = 1,
         rate: float | None = None,
+        clock: Clock = CLOCK,
     ):
         self.trials = tuple(sets)
         self.restarts = 0
@@ -428,7 +448,7 @@ class Bank(OdometryInstance):
             for trial, of in sets.items()
         ]
         self._told: set[int] = set()
-        self.late = Lateness(self._members, self._names, rate)
+        self.late = Lateness(self._members, self._names, rate, clock)
         self._rate = rate
         # In real time, there is no time for scans of the past.
         self.rewinds = rate is None

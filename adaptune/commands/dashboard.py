@@ -11,7 +11,7 @@ from rich.text import Text
 
 from adaptune.report.paper import plain
 from adaptune.selection import Selection
-from online.replay import Progressed
+from online.replay import ReplayRecord
 
 NEWEST = 1000
 """Scans, and selections, whose milliseconds are shown."""
@@ -29,7 +29,7 @@ class Dashboard:
     def __init__(self) -> None:
         self._what = ""
 
-    def look(self, what: str, total: int, progressed: Progressed) -> None:
+    def look(self, what: str, total: int, record: ReplayRecord) -> None:
         """Take note of a scan.
 
         Parameters
@@ -38,19 +38,19 @@ class Dashboard:
             What is replayed or driven; where it changes, all begins anew.
         total
             How many scans there are; 0 if nobody knows.
-        progressed
-            How far it is.
+        record
+            What became of the scans so far.
         """
         now = time.perf_counter()
         if what != self._what:
             self._what, self._begun = what, now
-            self._first = progressed.step.stamp
+            self._first = record.steps[-1].stamp
             self._scan_ms: deque[float] = deque(maxlen=NEWEST)
             self._selection_ms: deque[float] = deque(maxlen=NEWEST)
             self._restarts = self._n_choices = self._rejected = 0
             self._choice = None
-        step, choice = progressed.step, progressed.choice
-        self._now, self._total, self._progressed = now, total, progressed
+        step, choice = record.steps[-1], record.newest
+        self._now, self._total, self._record = now, total, record
         self._scan_ms.append(1e3 * (step.prepare_seconds + step.register_seconds))
         self._restarts += step.unhealthy is not None
         if choice is not None and choice is not self._choice:
@@ -68,19 +68,19 @@ class Dashboard:
         return table
 
     def _lines(self) -> Iterator[_Line]:
-        at, real_time = self._progressed, self._progressed.real_time
-        driven = (at.step.stamp - self._first) * 1e-9
+        record = self._record
+        driven = (record.steps[-1].stamp - self._first) * 1e-9
         speed = driven / max(self._now - self._begun, 1e-9)
         yield _Line(self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded")
         of = f" of {self._total}" if self._total else ""
         restarts = f", restarted {self._restarts} times" if self._restarts else ""
-        yield _Line("scans", f"{at.done}{of}{restarts}; {_in_ms(self._scan_ms)} a scan")
-        if real_time is not None:
-            late = 1e3 * np.array(list(real_time.late)[-NEWEST:])
-            words = f"pose {_in_ms(late)} after the scan; scans dropped: {real_time.dropped}"
-            if real_time.missed:
-                words += f", selections missed: {real_time.missed}"
-            is_late = real_time.dropped + real_time.missed > 0
+        yield _Line("scans", f"{record.done}{of}{restarts}; {_in_ms(self._scan_ms)} a scan")
+        if record.rate is not None:
+            late = 1e3 * np.array(list(record.late)[-NEWEST:])
+            words = f"pose {_in_ms(late)} after the scan; scans dropped: {record.dropped}"
+            if record.missed:
+                words += f", selections missed: {record.missed}"
+            is_late = record.dropped + record.missed > 0
             yield _Line("latency", words, "yellow" if is_late else "")
         if self._choice is None:
             return

@@ -17,7 +17,7 @@ from adaptune.trajectory import Trajectory
 from offline.config import load_study
 from online.record import ReplayIdentity, StoredReplayError, write_reference, write_replay
 from online.recordings import record_replays, topic
-from online.replay import Choice, RealTimeRecord, Replay
+from online.replay import Choice, ReplayRecord
 from online.run import shared_identity
 
 N = 40
@@ -31,17 +31,17 @@ def along_x(drift=0.0):
     return Trajectory(STAMPS, T)
 
 
-def replay_of(trajectory, choices=(), real_time=None):
+def replay_of(trajectory, choices=(), **record):
     steps = [
         RegisteredScan(stamp, T, True, "max_speed" if i == 7 else None, i * 1e-3, i * 2e-3)
         for i, (stamp, T) in enumerate(
             zip(trajectory.stamps.tolist(), trajectory.T_world_sensor, strict=True)
         )
     ]
-    yes, restarted = np.ones(N, bool), np.arange(N) == 7
-    kept = [choice for choice in choices if not choice.why_not]
-    others = [choice for choice in choices if choice.why_not]
-    return Replay(trajectory, restarted, yes, steps, kept, others, 4.0, {}, 1.0, 1.0, real_time)
+    made = ReplayRecord(steps=steps, seconds=4.0, cpu_ms=1.0, memory=1.0, **record)
+    for choice in choices:
+        made.note(choice)
+    return made
 
 
 def selections():
@@ -67,11 +67,11 @@ def study(study_file, tmp_path):
     study = load_study(study_file, [], tmp_path / "run")
     folder = study.folder / "replays/three"
     shared = shared_identity(study, "three")
-    in_time = RealTimeRecord(1.0, late=[0.02] * N)
+    in_time = {"rate": 1.0, "late": [0.02] * N}
     for mode, made, kept in (
         ("baseline", replay_of(along_x(0.02)), {"max_correspondence_distance": 2.0}),
         ("fixed", replay_of(along_x(0.01)), FIXED),
-        ("adaptive", replay_of(along_x(0.005), list(selections()), in_time), None),
+        ("adaptive", replay_of(along_x(0.005), list(selections()), **in_time), None),
     ):
         about = ReplayIdentity(mode=mode, parameters=kept, model=None, switching=None, **shared)
         write_replay(folder / mode, made, about, None)

@@ -8,7 +8,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from adaptune.selection import Selection
 from online.live import UNKNOWN, RosMessages, Status, Uncertainty
-from online.replay import RealTimeRecord
+from online.replay import ReplayRecord
 
 MESSAGES = RosMessages(local_link.STORE, "odom")
 
@@ -101,6 +101,6 @@ def test_diagnostics(selection, status, before, level, said):
 
 
 def test_the_status_of_a_drive():
-    record = RealTimeRecord(1.0, dropped=3, missed=2, late=[0.5, 0.25])
+    record = ReplayRecord(1.0, dropped=3, missed=2, late=[0.5, 0.25])
     assert Status.of(record, 7) == Status(3, 2, 7, 0.25)
-    assert Status.of(RealTimeRecord(1.0), 0) == Status()
+    assert Status.of(ReplayRecord(1.0), 0) == Status()

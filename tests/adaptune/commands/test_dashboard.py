@@ -4,7 +4,7 @@ from rich.console import Console
 from adaptune.commands.dashboard import Dashboard
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.selection import Selection
-from online.replay import Choice, Progressed, RealTimeRecord
+from online.replay import Choice, ReplayRecord
 
 TENTH = 10**8
 SET = Selection(
@@ -34,12 +34,12 @@ def test_it_is_empty_before_the_first_scan():
 
 
 def test_a_single_odometry_in_lockstep():
-    dashboard = Dashboard()
-    choice = Choice(0, SET, 0.005)
+    dashboard, record = Dashboard(), ReplayRecord()
+    record.note(Choice(0, SET, 0.005))
     for i in range(21):
-        dashboard.look(
-            "home", 100, Progressed(i + 1, step(i, "max_speed" if i == 9 else None), choice)
-        )
+        record.begin()
+        record.end(step(i, "max_speed" if i == 9 else None))
+        dashboard.look("home", 100, record)
     found = shown(dashboard)
     assert found["home"].startswith("2.0 s driven, ")
     assert found["home"].endswith(" times as fast as recorded")
@@ -53,9 +53,12 @@ def test_a_single_odometry_in_lockstep():
 
 def test_a_bank_in_real_time_that_is_lost():
     dashboard = Dashboard()
-    record = RealTimeRecord(1.0, dropped=3, missed=1, late=[0.02] * 50)
+    record = ReplayRecord(1.0, dropped=3, missed=1, late=[0.02] * 50)
     lost = SET._replace(weights={7: 0.25, 3: 0.75}, lost=True, estimated_error=np.nan)
-    dashboard.look("home", 0, Progressed(4, step(0), Choice(0, lost, 0.03, "too late"), record))
+    record.note(Choice(0, lost, 0.03, "too late"))
+    record.begin()
+    record.end(step(0))
+    dashboard.look("home", 0, record)
     found = shown(dashboard)
     assert found["scans"].startswith("4; ")
     late = "pose 20.0 ms (99 %: 20.0) after the scan"
@@ -69,8 +72,13 @@ def test_a_bank_in_real_time_that_is_lost():
 
 def test_another_replay_begins_anew():
     dashboard = Dashboard()
-    dashboard.look("home", 9, Progressed(1, step(0, "max_speed"), Choice(0, SET, 0.005)))
-    dashboard.look("away", 9, Progressed(1, step(50), None))
+    for what, made in (("home", step(0, "max_speed")), ("away", step(50))):
+        record = ReplayRecord()
+        record.begin()
+        record.end(made)
+        if what == "home":
+            record.note(Choice(0, SET, 0.005))
+        dashboard.look(what, 9, record)
     found = shown(dashboard)
     assert found["away"].startswith("0.0 s driven")
     assert found["scans"].startswith("1 of 9; ")
