@@ -636,11 +636,6 @@ if __name__ == "__main__":
 # Which cores a process may use.
 
 
-def installed_memory() -> int:
-    """Bytes of memory that the machine has."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
 def resident_megabytes() -> float:
     """Memory that this process takes at present, without the files that it maps.
 

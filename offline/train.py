@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
-from adaptune.processes import available, installed_memory
+from adaptune.processes import available
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
 from adaptune.report import tables
@@ -283,7 +284,7 @@ def trial_workers(
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
     odometry = study.odometry.allowing(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
-    memory = 0.25 * installed_memory()
+    memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return Cluster(setup, names, memory, cluster) if cluster else Workers(setup, n, memory)
 
 

@@ -617,7 +617,10 @@ def _without_oracle(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonR
     if not names:
         return []
     where = "" if len(names) == len(judged) else f" on {', '.join(names)}"
-    return [f"What the best set would have gained{where} is not known; `adaptune oracle` tells."]
+    return [
+        f"What the best set would have gained{where} is not known; "
+        "`adaptune online --oracle` tells."
+    ]
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import typer
 
 from adaptune.commands import offline, online, reference, report, tools
-from adaptune.commands import tools as importing
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -29,22 +28,18 @@ app = typer.Typer(
         "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
         "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
-        "    adaptune oracle   configs/demo.yaml    # what was there to gain, in hindsight?\n\n"
         "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
         "    adaptune report   configs/demo.yaml    # all of it as a page to look at\n\n"
         "    adaptune record   configs/demo.yaml    # replays to look at in Foxglove or Rerun"
     ),
 )
 
-models = typer.Typer(no_args_is_help=True, cls=Commands, help="Look at error models.")
-models.command()(tools.show)
-app.add_typer(models, name="model")
 for _command in (
     *(tools.inspect, tools.cache, tools.serve),
     *(offline.simulate, reference.reference),
-    *(offline.offline, offline.trials, offline.validate, offline.oracle),
+    *(offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
-    *(report.report, importing.import_rustle),
+    *(report.report, tools.import_rustle),
 ):
     app.command()(_command)
 

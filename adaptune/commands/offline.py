@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from adaptune.commands.terminal import (
+    Cluster,
     Folder,
     Override,
     StudyFile,
@@ -21,15 +22,6 @@ from adaptune.commands.terminal import (
     say_next_online,
 )
 from adaptune.errors import AdaptuneError
-
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Run the trials on a Dask cluster, as tcp://scheduler:8786.",
-        show_default="processes of this machine",
-    ),
-]
 
 
 def simulate(
@@ -100,36 +92,6 @@ def offline(
     say(driven(loaded, model).words)
     say(f"Error model: {loaded.model_path}")
     say_next_of_trained(bool(model.expected), loaded.config.test, study, override, folder)
-
-
-def oracle(
-    study: StudyFile,
-    override: Override = [],  # noqa: B006
-    folder: Folder = None,
-    sets: Annotated[int, typer.Option(help="Number of sets to run.", min=2)] = 16,
-    cluster: Cluster = None,
-) -> None:
-    """Run sets of the model on the test sequences, to know the best choice in hindsight.
-
-    Runs them as trials, which restart at the reference after a lost track, and keeps them apart:
-    nothing is learned from them. The sets are the fixed one, the members of the bank, and those
-    that complement each other best in training.
-    """
-    loaded = load(study, override, folder)
-    from adaptune.report import tables
-    from offline.oracle import run_oracle
-
-    with progress() as show:
-        rows = run_oracle(loaded, sets, show, cluster)
-    console.print(
-        tables.table(
-            f"RTE [%] over {loaded.config.sub_trajectory:g} m on test sequences, as trials",
-            rows,
-            "The best set is known only in hindsight: no rule can rely on it.",
-        )
-    )
-    say(f"Trials: {loaded.folder / 'oracle'}/")
-    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
 
 
 def trials(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from adaptune.commands.terminal import (
+    Cluster,
     Folder,
     Override,
     StudyFile,
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+ORACLE_SETS = 16
+"""Sets that run on the test sequences in hindsight."""
+
 Rate = Annotated[
     float | None,
     typer.Option(
@@ -48,28 +52,36 @@ Mode = Annotated[
 ]
 
 
+Model = Annotated[
+    Path | None,
+    typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
+]
+Untrained = Annotated[
+    bool, typer.Option("--untrained", help="Only the baseline, and a bank that needs no model.")
+]
+Thorough = Annotated[
+    bool, typer.Option("--thorough", help="All modes that there are to compare with, too.")
+]
+Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")]
+Oracle = Annotated[
+    bool, typer.Option("--oracle", help="Run sets as trials: what was there to gain?")
+]
+
+
 def online(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
-    model: Annotated[
-        Path | None,
-        typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
-    ] = None,
+    model: Model = None,
     again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
     rate: Rate = None,
-    untrained: Annotated[
-        bool,
-        typer.Option("--untrained", help="Only the baseline, and a bank that needs no model."),
-    ] = False,
-    thorough: Annotated[
-        bool, typer.Option("--thorough", help="All modes that there are to compare with, too.")
-    ] = False,
+    untrained: Untrained = False,
+    thorough: Thorough = False,
     ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
-    ros2: Annotated[
-        bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")
-    ] = False,
+    ros2: Ros2 = False,
     mode: Mode = None,
+    oracle: Oracle = False,
+    cluster: Cluster = None,
 ) -> None:
     """Replay the test sequences: baseline, fixed, and adaptive by every rule.
 
@@ -87,7 +99,17 @@ def online(
     so are scans that wait too long.
 
     With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C.
+
+    With `--oracle`, it replays nothing. It runs sets of the model on the test sequences as trials,
+    to know the best choice in hindsight: the fixed set, the members of the bank, and those that
+    complement each other best in training. Nothing is learned from them.
     """
+    if oracle:
+        _oracle(load(study, override, folder), cluster)
+        say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+        return
+    if cluster is not None:
+        raise AdaptuneError("--cluster is for the trials of --oracle")
     if untrained:
         _check_untrained(model, mode)
     if thorough and (untrained or ros or ros2):
@@ -105,6 +127,23 @@ def online(
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+
+
+def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
+    """Run sets of the model on the test sequences as trials."""
+    from adaptune.report import tables
+    from offline.oracle import run_oracle
+
+    with progress() as show:
+        rows = run_oracle(loaded, ORACLE_SETS, show, cluster)
+    console.print(
+        tables.table(
+            f"RTE [%] over {loaded.config.sub_trajectory:g} m on test sequences, as trials",
+            rows,
+            "The best set is known only in hindsight: no rule can rely on it.",
+        )
+    )
+    say(f"Trials: {loaded.folder / 'oracle'}/")
 
 
 def _check_untrained(model: Path | None, mode: str | None) -> None:

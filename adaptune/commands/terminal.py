@@ -264,6 +264,14 @@ Folder = Annotated[
         help="The study's folder.", show_default="the YAML's name, under runs/", file_okay=False
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run the trials on a Dask cluster, as tcp://scheduler:8786.",
+        show_default="processes of this machine",
+    ),
+]
 
 
 def load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStudy":

@@ -19,12 +19,17 @@ if TYPE_CHECKING:
     from adaptune.recording.inspect import Inspection
     from adaptune.reference.check import MeasuredReference
 
+MODEL_SUFFIX = ".safetensors"
+"""Of files of error models."""
+
 
 def inspect(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="A bag, a folder, or a file of poses.", show_default=False
+            metavar="FILE",
+            help="A bag, a folder, a file of poses, an error model, or a study's folder.",
+            show_default=False,
         ),
     ],
     png: Annotated[
@@ -32,7 +37,13 @@ def inspect(
     ] = None,
     deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
 ) -> None:
-    """Show what is in a recording, what each stage lacks, and how to name it in a study."""
+    """Show what is in a recording, what each stage lacks, and how to name it in a study.
+
+    Of an error model, or of a study's folder, show its sets, sequences, provenance and validation.
+    """
+    if file.suffix == MODEL_SUFFIX or (file / f"model{MODEL_SUFFIX}").exists():
+        _show_model(file)
+        return
     from adaptune.recording.inspect import draw_inspection, render_inspection
     from adaptune.recording.inspect import inspect as inspect_file
 
@@ -51,7 +62,20 @@ def inspect(
         say(f"First scan: {png}")
 
 
-UNKNOWN = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
+def _show_model(file: Path) -> None:
+    from adaptune.model import ErrorModel
+    from adaptune.model.error_model import render
+    from adaptune.study.study import CONFIGURATION, MODEL
+
+    file = file / MODEL if file.is_dir() else file
+    console.print(render(ErrorModel.load(file), file))
+    if (study := file.parent / CONFIGURATION).exists():
+        other = [] if file.name == MODEL else ["--model", file]
+        why = "replay the test sequences with it"
+        say_next(why, "online", study, "--folder", file.parent, *other)
+
+
+UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
 """The length of sub-trajectories to propose where the path is not known."""
 
 
@@ -95,7 +119,7 @@ def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> N
             "serve, write `reference: estimated`"
         )
         return
-    share, length = f"{100 * TRAINING:.0f}", UNKNOWN
+    share, length = f"{100 * TRAINING:.0f}", UNKNOWN_LENGTH
     if found.reference is not None:
         length = str(proposed_sub_trajectory(found.reference, measured))
     say(
@@ -157,27 +181,6 @@ def serve(
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         serving.serve(sys.stdin.buffer, writer, odometry)
-
-
-def show(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE", help="An error model, or a study's folder.", show_default=False
-        ),
-    ],
-) -> None:
-    """Describe an error model: its sets, sequences, provenance, and validation."""
-    from adaptune.model import ErrorModel
-    from adaptune.model.error_model import render
-    from adaptune.study.study import CONFIGURATION, MODEL
-
-    file = file / MODEL if file.is_dir() else file
-    console.print(render(ErrorModel.load(file), file))
-    if (study := file.parent / CONFIGURATION).exists():
-        other = [] if file.name == MODEL else ["--model", file]
-        why = "replay the test sequences with it"
-        say_next(why, "online", study, "--folder", file.parent, *other)
 
 
 # Studies from the files of other programs.

@@ -338,7 +338,7 @@ def _other_files(before: Sequence[str], now: Sequence[str], files: Sequence[Path
 
 # Trials on the test sequences, for what the best choice in hindsight would have been.
 #
-# `adaptune oracle` runs them into an archive of their own. Nothing learns from it.
+# `adaptune online --oracle` runs them into an archive of their own. Nothing learns from it.
 
 
 class OracleErrors(NamedTuple):
@@ -389,7 +389,7 @@ def oracle_changes(study: Study, name: str) -> list[str]:
 
 
 def read_oracle(study: Study, name: str, model: ErrorModel) -> OracleErrors | None:
-    """The errors of a model's sets on a test sequence; None where `adaptune oracle` ran none.
+    """The errors of a model's sets on a test sequence; None where the oracle ran none.
 
     Trials that were run with something else than the study has now are left out, with a warning.
 
@@ -409,7 +409,8 @@ def read_oracle(study: Study, name: str, model: ErrorModel) -> OracleErrors | No
     """
     if changes := oracle_changes(study, name):
         _log.warning(
-            "%s: the oracle's trials were run with another %s; run `adaptune oracle` again",
+            "%s: the oracle's trials were run with another %s; run `adaptune online --oracle` "
+            "again",
             name,
             ", ".join(changes),
         )

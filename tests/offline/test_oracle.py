@@ -27,8 +27,10 @@ def load(study_file, trained_folder, tmp_path):
 def oracle(study_file, trained_folder, tmp_path_factory):
     """A study, and what the oracle's command printed; not to be changed."""
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("oracle") / "study")
-    words = [str(study_file), "--folder", str(folder), "--sets", str(N)]
-    return load_study(study_file, [], folder), CliRunner().invoke(app, ["oracle", *words])
+    words = ["online", str(study_file), "--folder", str(folder), "--oracle"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("adaptune.commands.online.ORACLE_SETS", N)
+        return load_study(study_file, [], folder), CliRunner().invoke(app, words)
 
 
 def test_the_sets_are_the_fixed_one_the_bank_and_others(oracle):
@@ -83,7 +85,7 @@ def test_it_resumes_and_renews_what_has_changed(load, caplog):
     # The same recording seen in another way.
     other = load("sequences.three.stop=3")
     assert read_oracle(other, "three", model) is None
-    assert "run with another sequence.stop; run `adaptune oracle` again" in caplog.text
+    assert "run with another sequence.stop; run `adaptune online --oracle` again" in caplog.text
     (row,) = run_oracle(other, 2)
     assert row["sets"] == 2
     assert len(read_oracle(other, "three", model).stamps) < 40

@@ -50,7 +50,7 @@ def test_model_show_prints_what_a_file_says_as_it_is(trained_folder, tmp_path):
     file = tmp_path / "my[v2].safetensors"
     dataclasses.replace(model, provenance={"made by": ODD}).save(file)
     (tmp_path / "study.yaml").touch()
-    done = CliRunner().invoke(app, ["model", "show", str(file)])
+    done = CliRunner().invoke(app, ["inspect", str(file)])
     assert ODD in " ".join(done.stdout.split())
     assert f"--model '{file}'" in done.stdout
 

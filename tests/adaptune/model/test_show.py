@@ -45,7 +45,7 @@ def model():
 
 def shown(model, folder):
     model.save(folder / "model.safetensors")
-    result = CliRunner().invoke(app, ["model", "show", str(folder / "model.safetensors")])
+    result = CliRunner().invoke(app, ["inspect", str(folder / "model.safetensors")])
     assert result.exit_code == 0, result.output
     return re.sub(r"\s+", " ", result.output)
 
@@ -143,7 +143,7 @@ def test_sets_that_a_sequence_lacks_are_shown(model, tmp_path):
 
 def test_a_file_that_is_no_model_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "model.safetensors").write_bytes(b"no")
-    result = CliRunner().invoke(app, ["model", "show", str(tmp_path / "model.safetensors")])
+    result = CliRunner().invoke(app, ["inspect", str(tmp_path / "model.safetensors")])
     assert result.exit_code == 2
     assert "Traceback" not in result.output
 
