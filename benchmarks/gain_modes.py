@@ -12,7 +12,7 @@ from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.bank_simulation import chained
 from offline.labelled import LabelledData, LabelledSequence, periods
-from offline.tuning import cancelling_members, on_labelled, simulated_with
+from offline.tuning import bank_errors, cancelling_members
 from offline.validate import Validation, leave_one_out, leave_out
 
 Errors = dict[str, NDArray[np.float64]]
@@ -105,12 +105,7 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     }
     n_periods = len(periods(sequence.simulation.period)[0])
     return {
-        mode: on_labelled(
-            sequence,
-            simulated_with(
-                sequence, MemberWeights(tuple(members), np.tile(weights, (n_periods, 1)))
-            ),
-        )
+        mode: bank_errors(sequence, MemberWeights(tuple(members), np.tile(weights, (n_periods, 1))))
         for mode, weights in modes.items()
     }
 

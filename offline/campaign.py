@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,8 +61,7 @@ class _Campaign:
             self._tally.begin(at_work)
             begun = False
             for m in rungs(self._config.pruning == "wilcoxon", batch, len(at_work[0].sequences)):
-                missing = [Missing(search.missing(m), search.parameters) for search in at_work]
-                if tasks := self._tasks(missing):
+                if tasks := self._tasks([of for search in at_work for of in search.missing(m)]):
                     begun = True
                     with clock.running(batch):
                         self._tally.watch(self._archive, self._workers, tasks)
@@ -106,13 +105,15 @@ class _Campaign:
             if any(verdict.feasible for verdict in search.verdicts):
                 number = best_by_trials(self._config, search.done)
                 best[number] = search.done[number]
-        missing = {name: [n for n in best if n not in self._finished[name]] for name in self._names}
-        tasks = self._tasks([Missing(missing, lambda n: best[n].parameters)])
+        missing = [
+            (name, {n: v.parameters for n, v in best.items() if n not in self._finished[name]})
+            for name in self._names
+        ]
         what = "best sets of each on the others"
-        watch_tasks(self._archive, self._workers, tasks, what, self._progress)
+        watch_tasks(self._archive, self._workers, self._tasks(missing), what, self._progress)
         self._counted |= dict.fromkeys(best, self._names)
 
-    def _tasks(self, missing: Sequence["Missing"]) -> list[Task]:
+    def _tasks(self, missing: Sequence[tuple[str, Mapping[int, ParameterSet]]]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []
         n_workers = len(self._workers.workers())
         return trial_tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
@@ -126,45 +127,32 @@ class _Campaign:
         )
 
 
-class Missing(NamedTuple):
-    """What is still to be run."""
-
-    numbers: Mapping[str, Sequence[int]]  # on every sequence, of the trials
-    parameters: Callable[[int], ParameterSet]  # the set of a trial
-
-
 def trial_tasks(
-    missing: Sequence[Missing],
+    missing: Sequence[tuple[str, Mapping[int, ParameterSet]]],
     without_frames: Sequence[str],
     n_workers: int,
     one_by_one: bool = False,
 ) -> list[Task]:
-    """Split the trials of every sequence between the workers.
+    """Split the trials that are missing on sequences, sets by number, between the workers.
 
     Those of the last sequence are split into ever smaller pieces, so that all workers end together.
     A sequence whose frames are missing, but no trial, is a task of its own. If trials run
     `one_by_one`, so is every trial.
     """
-    lacking = [
-        (name, numbers, some.parameters)
-        for some in missing
-        for name, numbers in some.numbers.items()
-        if numbers
-    ]
-    to_read = [name for name in without_frames if name not in {n for n, *_ in lacking}]
+    lacking = [(name, list(sets.items())) for name, sets in missing if sets]
+    to_read = [name for name in without_frames if name not in dict(lacking)]
     tasks = [Task(name, (), (), frames=True) for name in to_read]
     n_workers = max(1, n_workers)  # those of a cluster may all be on their way back
-    for last, (name, numbers, parameters) in enumerate(lacking, 1 - len(lacking)):
+    for last, (name, sets_of) in enumerate(lacking, 1 - len(lacking)):
+        left = sets_of
         # The first task of a sequence returns what all trials on it share.
-        first = numbers[0] if name in without_frames else None
-        left = numbers
+        first = left[0] if name in without_frames else None
         while left:
             size = 1 if one_by_one else math.ceil(len(left) / n_workers / (1 if last else 2))
-            tasks += [
-                Task(name, tuple(n), tuple(map(parameters, n)), frames=n[0] == first)
-                for share in range(n_workers)
-                if (n := left[share * size : (share + 1) * size])
-            ]
+            for share in range(n_workers):
+                if some := left[share * size : (share + 1) * size]:
+                    numbers, sets = zip(*some, strict=True)
+                    tasks.append(Task(name, numbers, sets, frames=some[0] is first))
             left = left[n_workers * size :]
     return tasks
 
@@ -190,114 +178,83 @@ class _Tally:
         self._progress, self._finished = progress, finished
         self._searches = searches
         self._done = self._failed = self._running = 0
-        self._under_way = _UnderWay(progress)
 
     def begin(self, at_work: Iterable[Search]) -> None:
         """Begin a batch; some of its trials may be finished already."""
         for search in at_work:
             for name in search.sequences:
                 self._add(name, [n for n in search.numbers if n in self._finished[name]])
-        self._show()
+        self._show(self._done)
 
     def watch(self, archive: Archive, workers: Pool[Any], tasks: list[Task]) -> None:
-        """Run tasks, and count trials scan by scan."""
-        for task, running in run_tasks(archive, workers, tasks, self._report):
-            self._under_way.end(task)
-            self._add(task.sequence, task.numbers)
-            self._running = running
-            self._show()
+        """Run tasks, store their results, and count trials scan by scan."""
+        before = self._done
 
-    def _report(self, task: Task, progress: TaskProgress) -> None:
-        self._under_way.report(task, progress)
-        self._show()
+        def show(what: str, done: float, of: int, remark: str = "", /) -> None:
+            if what == "runs":
+                self._show(before + done)
+            else:
+                self._progress(what, done, of, remark)
+
+        for task, result, self._running in watched(workers, tasks, "runs", show):
+            _store(archive, task, result)
+            self._add(task.sequence, task.numbers)
+            self._show(self._done)
 
     def catch_up(self) -> None:
         """Count trials that will not run as done, too."""
         self._done = sum(len(s.verdicts) * len(s.sequences) for s in self._searches)
-        self._show()
+        self._show(self._done)
 
     def _add(self, name: str, numbers: Iterable[int]) -> None:
         runs = [self._finished[name][n] for n in numbers]
         self._done += len(runs)
         self._failed += sum(run.lost > 0 or run.faults > 0 for run in runs)
 
-    def _show(self) -> None:
+    def _show(self, done: float) -> None:
         n = self._running
         remarks = [f"{n} worker{'s' if n > 1 else ''} at work"] if n else []
         remarks += [self.best] if self.best else []
         remarks += [f"{self._failed} lost track or failed"] if self._failed else []
         total = sum(search.total() for search in self._searches)
-        done = self._done + self._under_way.runs
         self._progress("runs", done, total, ", ".join(remarks))
-
-
-class _UnderWay:
-    """The tasks under way: the scans that they read, and the runs that they have done."""
-
-    def __init__(self, progress: Progress):
-        self._progress = progress
-        self._read: dict[str, int] = {}  # scans that were read, by what for
-        self._runs: dict[tuple[str, tuple[int, ...]], float] = {}
-
-    @property
-    def runs(self) -> float:
-        """Runs of tasks that are not finished."""
-        return sum(self._runs.values())
-
-    def report(self, task: Task, progress: TaskProgress) -> None:
-        """Note how far a task is; several workers may read the same sequence."""
-        name, (stage, done, total) = task.sequence, progress
-        if stage != "running":
-            what = f"{stage} {name}"
-            self._read[what] = max(done, self._read.get(what, 0))
-            self._progress(what, self._read[what], total, "")
-        else:
-            self._runs[task.key] = len(task.numbers) * done / max(total, 1)
-
-    def end(self, task: Task) -> None:
-        """Forget a task."""
-        self._runs.pop(task.key, None)
 
 
 def watch_tasks(
     archive: Archive, workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
 ) -> None:
     """Run tasks and store their results, see `watched`."""
-    for task, result in watched(workers, tasks, what, progress):
+    for task, result, _ in watched(workers, tasks, what, progress):
         _store(archive, task, result)
 
 
 def watched(
     workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
-) -> Iterator[tuple[Task, TaskResult]]:
-    """Run tasks; `progress` is called with `what` and the number of runs that are done."""
-    under_way, total = _UnderWay(progress), sum(len(task.numbers) for task in tasks)
-    done = 0
+) -> Iterator[tuple[Task, TaskResult, int]]:
+    """Run tasks, and yield each with its result and the number of workers that are at work.
+
+    `progress` is called with `what` and the number of runs that are done, and about scans that are
+    read: several workers may read the same sequence.
+    """
+    total, done = sum(len(task.numbers) for task in tasks), 0
+    read: dict[str, int] = {}  # scans, by what for
+    under_way: dict[tuple[str, tuple[int, ...]], float] = {}  # runs of unfinished tasks
 
     def report(task: Task, of_task: TaskProgress) -> None:
-        under_way.report(task, of_task)
-        progress(what, done + under_way.runs, total, "")
+        stage, scans, of = of_task
+        if stage == "running":
+            under_way[task.key] = len(task.numbers) * scans / max(of, 1)
+        else:
+            reading = f"{stage} {task.sequence}"
+            read[reading] = max(scans, read.get(reading, 0))
+            progress(reading, read[reading], of, "")
+        progress(what, done + sum(under_way.values()), total, "")
 
-    for task, result, _ in run(workers, tasks, report):
-        under_way.end(task)
-        done += len(task.numbers)
-        progress(what, done + under_way.runs, total, "")
-        yield task, result
-
-
-def run_tasks(
-    archive: Archive,
-    workers: Pool[Any],
-    tasks: list[Task],
-    report: Callable[[Task, TaskProgress], None] = lambda *_: None,
-) -> Iterator[tuple[Task, int]]:
-    """Run tasks; yield each one once it is in the archive, with the number of workers at work.
-
-    `report` is called about tasks that go on.
-    """
     for task, result, running in run(workers, tasks, report):
-        _store(archive, task, result)
-        yield task, running
+        under_way.pop(task.key, None)
+        done += len(task.numbers)
+        progress(what, done + sum(under_way.values()), total, "")
+        yield task, result, running
 
 
 def _store(archive: Archive, task: Task, result: TaskResult) -> None:
@@ -428,7 +385,8 @@ def run_baseline(
     baselines = _by_label(study.odometry.name, study.odometry.space)
     labels = list(baselines)
     done = []
-    for task, result in watched(workers, _tasks(study, archive, baselines), "baseline", progress):
+    tasks = _baseline_tasks(study, archive, baselines)
+    for task, result, _ in watched(workers, tasks, "baseline", progress):
         check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
         done.append((task, result))
     for task, result in done:
@@ -455,7 +413,7 @@ def _by_label(name: str, space: ParameterSpace) -> dict[str, ParameterSet]:
     return {name: space.baseline}
 
 
-def _tasks(
+def _baseline_tasks(
     study: OfflineStudy, archive: Archive, baselines: Mapping[str, ParameterSet]
 ) -> list[Task]:
     """The whole runs that are lacking; the first of a sequence returns its frames, if they are."""

@@ -21,7 +21,7 @@ from adaptune.study.inputs import (
     read_oracle,
 )
 from adaptune.study.references import ensure_references
-from offline.campaign import Missing, Progress, trial_tasks, watch_tasks
+from offline.campaign import Progress, trial_tasks, watch_tasks
 from offline.config import OfflineStudy
 from offline.train import trial_workers
 
@@ -134,9 +134,9 @@ def _run(
     cluster: str | None,
 ) -> None:
     with trial_workers(study, list(due), cluster) as workers:
-        missing = Missing(due, model.sets.__getitem__)
+        missing = [(name, {n: model.sets[n] for n in numbers}) for name, numbers in due.items()]
         n_workers, one_by_one = len(workers.workers()), study.odometry.one_by_one
-        tasks = trial_tasks([missing], without_frames, n_workers, one_by_one)
+        tasks = trial_tasks(missing, without_frames, n_workers, one_by_one)
         watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
 
 

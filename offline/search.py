@@ -284,12 +284,12 @@ class Search:
         self._alive = list(self.numbers)
         return True
 
-    def missing(self, m: int) -> dict[str, list[int]]:
-        """Trials of the batch still to be run, for each of the first `m` sequences."""
-        return {
-            name: [n for n in self._alive if n not in self._finished[name]]
+    def missing(self, m: int) -> list[tuple[str, dict[int, ParameterSet]]]:
+        """Sets by number of the trials still to be run, on each of the first `m` sequences."""
+        return [
+            (name, {n: self._sets[n] for n in self._alive if n not in self._finished[name]})
             for name in self.order[:m]
-        }
+        ]
 
     def parameters(self, number: int) -> ParameterSet:
         """The set of a trial of the batch."""

@@ -51,10 +51,15 @@ class _Kept:
     n_prepared: int = 0
 
 
+SharedScan = Callable[[OdometryInstance], Any]
+"""Gives a scan as an instance takes it."""
+
+
 class SharedScans:
     """The scans of a sequence, each prepared once for all instances with the same preparation.
 
-    Iterating yields a `SharedScan` for every scan, and does not end.
+    Iterating yields a function for every scan, which gives it as an instance takes it. It does not
+    end.
 
     Prepared scans that exceed `memory` bytes are read and prepared again on every pass. Of several
     preparations, those that a pass does not use make room.
@@ -71,11 +76,11 @@ class SharedScans:
         """Bytes that the prepared scans take."""
         return sum(kept.nbytes for kept in self._kept.values())
 
-    def __iter__(self) -> Iterator["SharedScan"]:
+    def __iter__(self) -> Iterator[SharedScan]:
         self._used = set()
         reader = _Reader(self._scans)
         for i in count():
-            yield SharedScan(self, i, partial(reader.read, i))
+            yield partial(self.prepared, i, partial(reader.read, i))
 
     def prepared(self, i: int, read: Callable[[], Scan], instance: OdometryInstance) -> Any:
         """Scan `i`, which `read` returns, as an instance takes it."""
@@ -114,17 +119,6 @@ class SharedScans:
             self._kept[key].scans.clear()
             self._kept[key].nbytes = 0
         return self.nbytes + size <= self._memory
-
-
-class SharedScan:
-    """A scan of `SharedScans`; `by` gives it as an instance takes it."""
-
-    def __init__(self, scans: SharedScans, i: int, read: Callable[[], Scan]):
-        self._scans, self._i, self._read = scans, i, read
-
-    def by(self, instance: OdometryInstance) -> Any:
-        """The scan as an instance takes it."""
-        return self._scans.prepared(self._i, self._read, instance)
 
 
 class _Reader:
@@ -213,12 +207,12 @@ class TrialRun:
             T = self._T_ref_sensor[i]
             T = np.eye(4) if np.isnan(T[0, 0]) else T
             odometry = self._started()
-            odometry.start(scan.by(odometry), T)
+            odometry.start(scan(odometry), T)
             self.T_odom_sensor[i] = T
             return
         assert self._odometry is not None
         odometry = self._odometry
-        prepared = scan.by(odometry)
+        prepared = scan(odometry)
         begin = time.perf_counter()
         T, self.registered[i] = odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
@@ -267,7 +261,7 @@ class DrivenRun(TrialRun):
     def _step(self, i: int, scan: SharedScan) -> None:
         if i == 0:
             self._tracker = Tracker(self._started(), self._health)
-        prepared = scan.by(self._tracker.odometry)
+        prepared = scan(self._tracker.odometry)
         found = self._tracker.register_prepared(self._stamps[i], prepared)
         self.T_odom_sensor[i], self.registered[i] = found.T_odom_sensor, found.registered
         self.seconds[i] = found.register_seconds if i else 0.0

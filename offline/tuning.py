@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from adaptune.metrics import cap, window_ends, worst_tenth
+from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, PairedExpectedRatio, PairedSettings, TrainingData
 from adaptune.model.rules import BASELINE, ERROR_FLOOR, Spending, complementary, mean_errors
 from adaptune.model.weights import (
@@ -217,7 +217,8 @@ def choose(
     if most is not None and len(folds) > most:
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
     fixed = data.fixed() if fixed is None else fixed
-    choosers = _choosers(bank, data) if _has_motions(data) else {}
+    simulable = all(s.simulation is not None for s in data.sequences)
+    choosers = _choosers(bank, data) if simulable else {}
     one_set = one_set and data.live and _may_measure(data, fixed)
     banks = {way: make(data, fixed) for way, make in choosers.items()}
     banks = {way: members for way, members in banks.items() if len(members) > 1}
@@ -274,10 +275,6 @@ def _with_elsewhere(losses: NDArray[np.float64], n_stretches: int) -> NDArray[np
     """Expected losses of banks, drawn to what they are elsewhere; one that never adapts has 0."""
     drawn = (n_stretches * losses + AS_MANY * ELSEWHERE) / (n_stretches + AS_MANY)
     return np.where(losses == 0.0, 0.0, drawn)
-
-
-def _has_motions(data: LabelledData) -> bool:
-    return all(s.simulation is not None for s in data.sequences)
 
 
 def _may_measure(data: LabelledData, fixed: int) -> bool:
@@ -355,19 +352,14 @@ def _bank_errors(
     near: dict[tuple[float, int], NearProducts] = {}
     votes: MemberWeights | None = None
     for settings in BANK_SETTINGS:
-        key = _evidence(settings)
+        key = settings.clip, settings.n_frames
         if key not in near:
             # Settings that share what is near follow each other: one at a time is kept.
             near = {key: bank_evidence(left_out, of_bank, pca, settings)}
         weights = weights_along(left_out, near[key], settings)
         # Who agrees takes long to find, and hangs on the settings but little.
         votes = weights if votes is None else votes
-        yield on_labelled(left_out, simulated_with(left_out, weights, votes))
-
-
-def _evidence(settings: BankSettings) -> tuple[float, int]:
-    """The settings on which `bank_evidence` depends."""
-    return settings.clip, settings.n_frames
+        yield bank_errors(left_out, weights, votes)
 
 
 def _paired_errors(
@@ -474,38 +466,16 @@ def weights_along(
     return MemberWeights(near.members, smooth_weights(weights))
 
 
-def simulated(
-    sequence: LabelledSequence, near: NearProducts, settings: BankSettings
-) -> NDArray[np.float64]:
-    """Capped errors of a simulated bank at the frames that have a sub-trajectory."""
-    return simulated_with(sequence, weights_along(sequence, near, settings))
-
-
-def simulated_with(
+def bank_errors(
     sequence: LabelledSequence, weights: MemberWeights, votes: MemberWeights | None = None
 ) -> NDArray[np.float64]:
-    """The same with weights that are given, and with those that vote about who agrees."""
+    """Capped errors of a simulated bank on the labelled frames, of shape (n,).
+
+    Members vote about who agrees with `votes`; with `weights` when left out.
+    """
     assert sequence.simulation is not None
     errors = sequence.simulation.errors(weights, votes)
-    return errors[~np.isnan(errors)]
-
-
-def bank_errors(
-    sequence: LabelledSequence, near: NearProducts, settings: BankSettings
-) -> NDArray[np.float64]:
-    """Capped errors of a simulated bank on the labelled frames."""
-    return on_labelled(sequence, simulated(sequence, near, settings))
-
-
-def on_labelled(sequence: LabelledSequence, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of the errors of a simulated bank, those on the labelled frames, of shape (n,)."""
-    simulation, extent = sequence.simulation, sequence.extent
-    if simulation is None or extent is None:
-        return errors
-    known = np.flatnonzero(window_ends(simulation.T_ref_sensor, simulation.length) >= 0)
-    of_frames = np.full(len(simulation.stamps), np.nan)
-    of_frames[known] = errors
-    return of_frames[extent.frames]
+    return errors[~np.isnan(errors) if sequence.extent is None else sequence.extent.frames]
 
 
 # Rivals of what is driven: what a user could have without adapting.

@@ -382,7 +382,7 @@ def _simulate(
     of_bank = bank_data(others, data, chosen.members)
     near = bank_evidence(sequence, of_bank, pca, chosen.bank)
     weights = weights_along(sequence, near, chosen.bank)
-    return bank_errors(sequence, near, chosen.bank), float(1.0 - weights.weights[:, 0].mean())
+    return bank_errors(sequence, weights), float(1.0 - weights.weights[:, 0].mean())
 
 
 # The command `adaptune validate`.

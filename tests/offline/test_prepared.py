@@ -42,7 +42,7 @@ class Read:
 
 def passes(shared, *instances):
     """What each instance gets on a pass."""
-    return [[int(scan.by(one)[0]) for one in instances] for scan in islice(shared, N)]
+    return [[int(scan(one)[0]) for one in instances] for scan in islice(shared, N)]
 
 
 def test_each_scan_is_prepared_once_for_all_that_are_alike():
