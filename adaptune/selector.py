@@ -25,8 +25,8 @@ from adaptune.model.descriptor import (
 from adaptune.model.rules import NOVEL, PairedExpectedRatio
 from adaptune.model.weights import (
     SMOOTHING,
-    among,
     measured_weights,
+    renormalised,
     smooth_weights,
     weighted_selection,
 )
@@ -304,7 +304,7 @@ class Selector:
         return self._weighted(selection, smooth_weights(weights)[-1])
 
     def _weighted(self, selection: Selection, weights: NDArray[np.float64]) -> Selection:
-        weights = among(weights, self._live.present())
+        weights = renormalised(weights, self._live.present())
         of_members = dict(zip(self.members, weights.tolist(), strict=True))
         weighted = weighted_selection(self._model.sets, of_members)
         return selection._replace(
@@ -626,7 +626,7 @@ class UntrainedSelector:
     def select(self) -> Selection:
         """Choose the weights to apply before the newest scan is registered."""
         weights = measured_weights(len(self.members), self._live.squares())
-        weights = among(weights, self._live.present())
+        weights = renormalised(weights, self._live.present())
         of_members = dict(zip(self.members, weights.tolist(), strict=True))
         return self._live.estimated(weighted_selection(self._sets, of_members))
 

@@ -338,7 +338,9 @@ def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:
     return {n: float(mean_value(np.array([of[n] for of in values]))) for n in sorted(numbers)}
 
 
-def rivalry(config: OfflineConfig, whole: Mapping[int, float], best: int, fixed: int) -> str | None:
+def baseline_warning(
+    config: OfflineConfig, whole: Mapping[int, float], best: int, fixed: int
+) -> str | None:
     """In words where the baseline is better than the trials suggested.
 
     `whole` has by trial number the first objective in whole runs, its mean over the sequences;

@@ -29,7 +29,15 @@ from offline.bank_simulation import (
 )
 from offline.campaign import mean_values, read_whole_runs, whole_errors, whole_values
 from offline.config import Metric, OfflineStudyConfig
-from offline.objective import affordable, choose_fixed, few, margin, mean_value, repeated, weighted
+from offline.objective import (
+    affordable,
+    best_candidates,
+    choose_fixed,
+    margin,
+    mean_value,
+    repeated,
+    weighted,
+)
 from offline.search import owner
 
 if TYPE_CHECKING:
@@ -248,8 +256,8 @@ class LabelledData(NamedTuple):
         whole = {n: value for n, value in self.whole().items() if n in trials}
         if not set(whole) - {0}:
             return min(bounds, key=lambda n: bounds[n])
-        unlost = {n: bounds[n] for n in few(bounds) if self._never_lost(n)}
-        known = {n: value for n, value in (unlost | whole).items() if n in few(bounds)}
+        unlost = {n: bounds[n] for n in best_candidates(bounds) if self._never_lost(n)}
+        known = {n: value for n, value in (unlost | whole).items() if n in best_candidates(bounds)}
         return choose_fixed(known or whole, bounds)
 
     def _never_lost(self, trial: int) -> bool:
@@ -412,7 +420,7 @@ def _with_whole_runs(
     config: OfflineStudyConfig,
 ) -> list[LabelledSequence]:
     """Add what is known of the whole runs of the candidates for the fixed set."""
-    rivals = [*few(LabelledData(labelled, sets).bounds()), *sets.defaults]
+    rivals = [*best_candidates(LabelledData(labelled, sets).bounds()), *sets.defaults]
     runs = read_whole_runs(archive, [s.name for s in labelled], rivals, config.health)
     whole = whole_values(config.offline, runs)
     # Whether the objective on some frames follows from the errors there.

@@ -39,13 +39,13 @@ UNITS: dict[Metric, str] = {
     "cpu": "% of a core",
     "memory": "MB",
 }
-BOUND = 1e6
+LARGEST_METRIC = 1e6
 """The largest value of a metric, also where it cannot be computed: sums stay finite."""
 CANDIDATES = 4
 """So many sets, the best by their trials, are candidates for the fixed set beside the baseline."""
-NEARLY = 1.02
+EQUAL_WITHIN = 1.02
 """Whole runs whose values differ by no larger factor count as equal."""
-SEVERITY = 10.0
+PENALTY = 10.0
 """A set that breaks a limit is worse by so many times the baseline's value."""
 
 Value = float | tuple[float, ...]
@@ -107,7 +107,7 @@ def trajectory_metrics(
             "rpe": relative_error(T_ref_sensor, T),
             "ape": absolute_error(T_ref_sensor, T) if np.abs(T).max() < 1e100 else np.inf,
         }
-    return {name: float(np.fmin(value, BOUND)) for name, value in found.items()}
+    return {name: float(np.fmin(value, LARGEST_METRIC)) for name, value in found.items()}
 
 
 def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
@@ -183,7 +183,7 @@ def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
 def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
     """Put limits into the values, for samplers without constraints.
 
-    A set that breaks limits is worse by `SEVERITY` times the baseline's value, and more with a
+    A set that breaks limits is worse by `PENALTY` times the baseline's value, and more with a
     larger excess: the sampler keeps away from it.
     """
     if not any(result.constraints for result in history):
@@ -192,7 +192,7 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
     for parameters, value, constraints in history:
         values, baseline = np.atleast_1d(value), np.atleast_1d(history[0].value)
         if (excess := exceeded(constraints)) > 0.0:
-            values = values + SEVERITY * np.where(baseline, baseline, 1.0) * (1.0 + excess)
+            values = values + PENALTY * np.where(baseline, baseline, 1.0) * (1.0 + excess)
         several = tuple(values.tolist())
         made.append(SamplerResult(parameters, several if len(several) > 1 else several[0]))
     return made
@@ -229,10 +229,10 @@ def candidates(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> list[i
             f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the "
             f"parameters, or run more trials"
         )
-    return few({n: verdicts[n].bound for n in feasible})
+    return best_candidates({n: verdicts[n].bound for n in feasible})
 
 
-def few(bounds: Mapping[int, float]) -> list[int]:
+def best_candidates(bounds: Mapping[int, float]) -> list[int]:
     """The `CANDIDATES` trials with the least values, the least first, and the baseline."""
     finite = [n for n, bound in bounds.items() if np.isfinite(bound)]
     best = sorted(finite, key=lambda n: bounds[n])[:CANDIDATES]
@@ -273,7 +273,7 @@ def choose_fixed(whole: Mapping[int, float], trials: Mapping[int, float]) -> int
     `whole` has by trial number the first objective in whole runs, its mean over the sequences, and
     `trials` the same in trials, see `Verdict.bound`.
     """
-    most = NEARLY * min(whole.values())
+    most = EQUAL_WITHIN * min(whole.values())
     return min((n for n, value in whole.items() if value <= most), key=lambda n: trials[n])
 
 

@@ -4,7 +4,6 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
@@ -86,12 +85,16 @@ class AnnealingSettings(StrictModel):
     steps: dict[str, Step] = Field(default_factory=dict)
 
 
+MOST_VALUES = 100_000
+"""Of one parameter in a grid."""
+
+
 class Span(StrictModel):
     """`count` values from `low` to `high`, evenly in ratio where the parameter's scale is log."""
 
     low: float
     high: float
-    count: int = Field(ge=1, le=10**6)
+    count: int = Field(ge=1, le=MOST_VALUES)
 
 
 class GridSettings(StrictModel):
@@ -170,46 +173,11 @@ SETTINGS: dict[str, type[BaseModel]] = {
 """Settings of adaptune's own samplers."""
 
 
-# Grids of parameter sets, whose points are computed when they are asked for.
+# Grids of parameter sets, whose points are made when they are asked for.
 
 
 LARGEST = 10_000
 """Points of the largest grid that a search without a budget may try."""
-
-
-@dataclass(frozen=True)
-class GridAxis:
-    """The values of one parameter that a grid tries."""
-
-    parameter: Float | Integer | Categorical
-    count: int  # number of values
-    first: float = 0.0  # the first number, in log scale if `log`
-    step: float = 0.0  # from one number to the next
-    log: bool = False
-    choices: tuple[Value, ...] = ()  # the values of a category
-
-    def __getitem__(self, i: int) -> Value:
-        if self.choices:
-            return self.choices[i]
-        value = self.first + i * self.step
-        value = math.exp(value) if self.log else value
-        if isinstance(self.parameter, Integer):
-            return round(value)
-        assert isinstance(self.parameter, Float)
-        for bound in (self.parameter.low, self.parameter.high):
-            if math.isclose(value, bound, abs_tol=1e-12):
-                return bound  # rounding may miss it
-        return value
-
-    def index(self, value: Value) -> int | None:
-        """Index of a value, up to rounding; None if it is not on the axis."""
-        if self.choices:
-            alike = (i for i, c in enumerate(self.choices) if type(c) is type(value) and c == value)
-            return next(alike, None)
-        x = float(value)
-        steps = ((math.log(x) if self.log else x) - self.first) / (self.step or 1.0)
-        i = min(max(round(steps), 0), self.count - 1)
-        return i if math.isclose(float(self[i]), x, rel_tol=1e-9, abs_tol=1e-12) else None
 
 
 class Grid:
@@ -221,40 +189,45 @@ class Grid:
         Number of points.
     """
 
-    def __init__(self, axes: Mapping[str, GridAxis]):
+    def __init__(self, axes: Mapping[str, Sequence[Value]]):
         self.axes = dict(axes)
-        self.size = math.prod(axis.count for axis in self.axes.values())
+        self.size = math.prod(map(len, self.axes.values()))
 
     def __getitem__(self, index: int) -> ParameterSet:
         values: ParameterSet = {}
         for name, axis in reversed(self.axes.items()):
-            index, i = divmod(index, axis.count)
+            index, i = divmod(index, len(axis))
             values[name] = axis[i]
         return {name: values[name] for name in self.axes}
 
     def index(self, parameters: ParameterSet) -> int | None:
-        """Index of a point; None if it is not on the grid."""
+        """Index of a point, up to rounding; None if it is not on the grid."""
         index = 0
         for name, axis in self.axes.items():
-            i = axis.index(parameters[name])
+            i = next((i for i, v in enumerate(axis) if _alike(v, parameters[name])), None)
             if i is None:
                 return None
-            index = index * axis.count + i
+            index = index * len(axis) + i
         return index
 
     @classmethod
     def of(cls, space: ParameterSpace) -> "Grid | None":
         """All sets of a space; None if there are infinitely many."""
-        axes = {}
+        axes: dict[str, Sequence[Value]] = {}
         for name, p in space.parameters.items():
             if isinstance(p, Float):
                 return None
-            axes[name] = (
-                GridAxis(p, len(p.choices), choices=p.choices)
-                if isinstance(p, Categorical)
-                else GridAxis(p, int(p.high - p.low) + 1, p.low, 1.0)
-            )
+            if isinstance(p, Categorical):
+                axes[name] = p.choices
+            else:
+                axes[name] = range(int(p.low), int(p.high) + 1)
         return cls(axes)
+
+
+def _alike(one: Value, other: Value) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
+    return type(one) is type(other) and one == other
 
 
 def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]]) -> Grid:
@@ -264,19 +237,28 @@ def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]])
 
 def _axis(
     parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None
-) -> GridAxis:
+) -> Sequence[Value]:
+    """The values of a parameter; a ValueError says what is wrong with them."""
     if isinstance(parameter, Categorical):
         return _choices(parameter, parameter.choices if given is None else given)
     if given is None:
         raise ValueError("is missing; give [first, step, count] or {low, high, count}")
-    axis = _span(parameter, given) if isinstance(given, Span) else _steps(parameter, given)
-    for end in (axis[0], axis[axis.count - 1]):
+    numbers = _span(parameter, given) if isinstance(given, Span) else _steps(parameter, given)
+    whole = isinstance(parameter, Integer)
+    values: list[Value] = [round(x) if whole else _within(parameter, x) for x in numbers]
+    for end in (values[0], values[-1]):
         if not parameter.contains(end):
             raise ValueError(f"{end:g} is outside {describe(parameter)}")
-    return axis
+    return values
 
 
-def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> GridAxis:
+def _within(parameter: Float | Integer, x: float) -> float:
+    """The bound of a range where rounding has missed it, or the number itself."""
+    bounds = (parameter.low, parameter.high)
+    return next((b for b in bounds if math.isclose(x, b, abs_tol=1e-12)), x)
+
+
+def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> Sequence[Value]:
     if isinstance(given, Span) or not given:
         raise ValueError("give a list of its choices")
     for choice in given:
@@ -284,33 +266,35 @@ def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> GridAxis:
             raise ValueError(f"{choice!r} is not one of {describe(parameter)}")
     if len(set(map(repr, given))) < len(given):
         raise ValueError("choices repeat themselves")
-    return GridAxis(parameter, len(given), choices=tuple(given))
+    return given
 
 
-def _span(parameter: Float | Integer, given: Span) -> GridAxis:
+def _span(parameter: Float | Integer, given: Span) -> list[float]:
     low, high, count = given.low, given.high, given.count
     if low > high or (count > 1 and low == high):
         raise ValueError(f"low ({low:g}) must be less than high ({high:g})")
     if isinstance(parameter, Integer) and count > high - low + 1:
         raise ValueError(f"there are no {count} whole numbers from {low:g} to {high:g}")
+    if parameter.log and low <= 0:
+        raise ValueError(f"a log scale needs low ({low:g}) above 0")
     if parameter.log:
-        if low <= 0:
-            raise ValueError(f"a log scale needs low ({low:g}) above 0")
         low, high = math.log(low), math.log(high)
-    return GridAxis(parameter, count, low, (high - low) / max(count - 1, 1), parameter.log)
+    step = (high - low) / max(count - 1, 1)
+    numbers = [low + i * step for i in range(count)]
+    return [math.exp(x) for x in numbers] if parameter.log else numbers
 
 
-def _steps(parameter: Float | Integer, given: Sequence[Value]) -> GridAxis:
+def _steps(parameter: Float | Integer, given: Sequence[Value]) -> list[float]:
     if len(given) != 3 or any(isinstance(v, bool | str) for v in given):
         raise ValueError("give [first, step, count], three numbers, or {low, high, count}")
     first, step, count = map(float, given)
-    if not (count >= 1 and count.is_integer()):
-        raise ValueError("count, the last number, must be a whole one of at least 1")
+    if not (1 <= count <= MOST_VALUES and count.is_integer()):
+        raise ValueError(f"count, the last number, must be a whole one from 1 to {MOST_VALUES:,}")
     if step == 0 and count > 1:
         raise ValueError("a step of 0 gives the same value again and again")
     if isinstance(parameter, Integer) and not (first.is_integer() and step.is_integer()):
         raise ValueError("first and step must be whole numbers, as the parameter is")
-    return GridAxis(parameter, int(count), first, step)
+    return [first + i * step for i in range(int(count))]
 
 
 def check_grid(

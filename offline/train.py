@@ -33,8 +33,8 @@ from adaptune.study.study import BANK, ONE_SET, expected_in_words
 from offline.campaign import (
     Progress,
     WholeRuns,
+    baseline_warning,
     mean_values,
-    rivalry,
     run_baseline,
     run_batches,
     run_whole,
@@ -79,7 +79,7 @@ class Training(NamedTuple):
     fixed: int  # number of the trial of the fixed set
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
-    remark: str | None  # see `rivalry`
+    remark: str | None  # see `baseline_warning`
     references: Sequence[str] = ()  # see `estimates_beside_intervals`
     repeated: Sequence[str] = ()  # see `baseline_words`
     changed: Sequence[str] = ()  # see `changes`
@@ -166,7 +166,7 @@ def train(
         verdicts = run_batches(study, archive, workers, progress)
         best = candidates(config, _affordable(study, archive, verdicts))
         # Rivals may cost more.
-        rivals = {*candidates(config, verdicts), *_every_set(study, verdicts).defaults}
+        rivals = {*candidates(config, verdicts), *_sets_of(study, verdicts).defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
@@ -246,7 +246,7 @@ def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
     ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
 
 
-def _every_set(study: OfflineStudy, verdicts: Mapping[int, Verdict]) -> ParameterSets:
+def _sets_of(study: OfflineStudy, verdicts: Mapping[int, Verdict]) -> ParameterSets:
     parameters = tuple(verdict.parameters for verdict in verdicts.values())
     return ParameterSets(study.odometry.space, tuple(verdicts), parameters)
 
@@ -260,18 +260,18 @@ def _affordable(
         return dict(verdicts)
     names = study.training
     run = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in names}
-    costs = measured_costs(archive, run, _every_set(study, verdicts), study.odometry)
+    costs = measured_costs(archive, run, _sets_of(study, verdicts), study.odometry)
     return {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
 
 
 def _fixed(
     config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeRuns
 ) -> tuple[int, str | None]:
-    """Trial number of the fixed set, one of the best, and what `rivalry` says of it."""
+    """Trial number of the fixed set, one of the best, and what `baseline_warning` says of it."""
     rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
     values = mean_values(list(whole_values(config, rivals).values()))
     fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
-    return fixed, rivalry(config, values, best[0], fixed)
+    return fixed, baseline_warning(config, values, best[0], fixed)
 
 
 def trial_workers(
@@ -355,7 +355,7 @@ def _fit(
     from offline.labelled import labelled_data
 
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
-    sets = _every_set(study, feasible)
+    sets = _sets_of(study, feasible)
     run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
     data = labelled_data(
         archive,

@@ -36,7 +36,7 @@ from adaptune.study.study import (
     driven,
     expected_in_words,
 )
-from offline.campaign import rivalry
+from offline.campaign import baseline_warning
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
 from offline.labelled import LabelledData, LabelledSequence, comparable, labelled_data, periods
@@ -431,7 +431,7 @@ def validate(
         draw_chart(study.folder / "validation.png", chart)
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
-    said = [*_verdicts(study, online, validation), *_rivalry(study, data)]
+    said = [*_verdicts(study, online, validation), *_baseline_warning(study, data)]
     said += estimates_beside_intervals(study, study.training)
     return Validated(validation, rows, said)
 
@@ -442,10 +442,10 @@ def _bank(study: OfflineStudy, model: ErrorModel) -> int | list[int]:
     return switching.size if switching.sets is None else model.bank
 
 
-def _rivalry(study: OfflineStudy, data: LabelledData) -> list[str]:
+def _baseline_warning(study: OfflineStudy, data: LabelledData) -> list[str]:
     bounds = data.bounds()
     best = min(bounds, key=lambda n: bounds[n])
-    said = rivalry(study.config.offline, data.whole(), best, data.fixed())
+    said = baseline_warning(study.config.offline, data.whole(), best, data.fixed())
     return [] if said is None else [said]
 
 

@@ -243,7 +243,7 @@ def _untried(n_members: int) -> NDArray[np.float64]:
     return np.diag([1.0, *[DOUBT] * (n_members - 1)])
 
 
-def among(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
+def renormalised(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Weights of the members that are present, adding up to 1; the others have none.
 
     Both are of shape (n_members,).

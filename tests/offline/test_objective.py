@@ -19,7 +19,7 @@ from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 from offline.objective import (
-    SEVERITY,
+    PENALTY,
     SamplerResult,
     Verdict,
     baseline_words,
@@ -140,7 +140,7 @@ def test_samplers_receive_limits():
         [Verdict({"a": 0}, (2.0,), (-0.3,)), Verdict({"a": 1}, (1.0,), (0.5,))]
     )
     assert history == [SamplerResult({"a": 0}, 2.0, (-0.3,)), SamplerResult({"a": 1}, 1.0, (0.5,))]
-    assert penalised(history) == [({"a": 0}, 2.0, ()), ({"a": 1}, 1.0 + SEVERITY * 2.0 * 1.5, ())]
+    assert penalised(history) == [({"a": 0}, 2.0, ()), ({"a": 1}, 1.0 + PENALTY * 2.0 * 1.5, ())]
     several = sampler_results([Verdict({}, (0.0, 4.0)), Verdict({}, (1.0, 1.0), (1.0, -2.0))])
     assert [result.value for result in several] == [(0.0, 4.0), (1.0, 1.0)]
     assert [result.value for result in penalised(several)] == [(0.0, 4.0), (21.0, 81.0)]
