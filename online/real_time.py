@@ -12,16 +12,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, islice
 from multiprocessing.connection import Connection
-from multiprocessing.shared_memory import SharedMemory
 from queue import Queue
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import processes
 from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
-from adaptune.odometry import wire
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan
 from adaptune.processes import shared_cores
@@ -59,9 +56,8 @@ class Answer(NamedTuple):
 class SelectorProcess:
     """Runs a `TimedSelector` in another process.
 
-    Nothing waits longer than it is told to. Scans pass through memory that both processes share.
-    If the process is behind by `SLOTS` scans, it does not get the next one, but all of its motion
-    later.
+    Nothing waits longer than it is told to: a thread sends the scans. If the process is behind by
+    `SLOTS` scans, it does not get the next one, but all of its motion later.
 
     Parameters
     ----------
@@ -89,8 +85,7 @@ class SelectorProcess:
 
     def __init__(self, make: Make, period: float):
         self.period, self.unseen, self.cpu, self.alive = period, 0, 0.0, True
-        self._slots: list[SharedMemory] = []
-        self._free: list[int] = []
+        self._owed = 0  # answers
         self._moved: Motions | None = None  # over the scans that were not shown
         self._too_late: deque[Answer] = deque(maxlen=MAX_TOO_LATE)
         context = multiprocessing.get_context("forkserver")
@@ -100,6 +95,9 @@ class SelectorProcess:
         self._process = context.Process(target=_run, args=given, daemon=True)
         self._process.start()
         there.close()
+        self._to_send: Queue[Any] = Queue()
+        self._sender = threading.Thread(target=self._send, daemon=True)
+        self._sender.start()
         started: Selection | str = "it did not start in time"
         if self._here.poll(_START):
             with contextlib.suppress(EOFError, OSError):
@@ -115,38 +113,22 @@ class SelectorProcess:
         It waits at most so many seconds for the process to take another scan.
         """
         moved = motions if self._moved is None else _one_after_the_other(self._moved, motions)
-        arrays = {k: a for k, a in wire.scan_arrays(scan).items() if a is not None}
-        slot = self._slot(sum(_padded(array.nbytes) for array in arrays.values()), seconds)
-        if slot is None:
+        self._keep(self._take_answers())
+        if self._owed == SLOTS:
+            self._keep(self._take_answers(seconds))
+        if self._owed == SLOTS:
             self.unseen += 1
             self._moved = moved
             return False
-        layout, offset = [], 0
-        for name, array in arrays.items():
-            there = np.ndarray(array.shape, array.dtype, self._slots[slot].buf, offset)
-            there[...] = array
-            layout.append((name, array.dtype.str, array.shape, offset))
-            offset += _padded(array.nbytes)
+        self._owed += 1
         self._moved = None
-        with contextlib.suppress(OSError):
-            self._here.send((slot, self._slots[slot].name, layout, stamp, moved))
+        self._to_send.put((stamp, scan, moved))
         return True
 
-    def _slot(self, size: int, seconds: float) -> int | None:
-        """A free slot for so many bytes; None if there is none in so many seconds."""
-        self._keep(self._take_answers())
-        if not self._free and len(self._slots) == SLOTS:
-            self._keep(self._take_answers(seconds))
-            if not self._free:
-                return None
-        if not self._free:
-            self._slots.append(SharedMemory(create=True, size=max(size, 1)))
-            return len(self._slots) - 1
-        slot = self._free.pop()
-        if self._slots[slot].size < size:
-            _remove(self._slots[slot])
-            self._slots[slot] = SharedMemory(create=True, size=size)
-        return slot
+    def _send(self) -> None:
+        with contextlib.suppress(OSError):  # who waits for the answers notices it
+            while (shown := self._to_send.get()) is not None:
+                self._here.send(shown)
 
     def answer_to(self, stamp: int, seconds: float) -> Answer | None:
         """Wait for what becomes of the scan of this stamp, at most so long.
@@ -178,8 +160,8 @@ class SelectorProcess:
         found: list[Answer] = []
         try:
             while self.alive and self._here.poll(0.0 if found else seconds):
-                slot, answer = self._here.recv()
-                self._free.append(slot)
+                answer = self._here.recv()
+                self._owed -= 1
                 self.cpu = answer.cpu
                 found.append(answer)
         except (EOFError, OSError):
@@ -189,24 +171,16 @@ class SelectorProcess:
 
     def close(self) -> None:
         """End the process."""
+        self._to_send.put(None)
+        self._sender.join(2.0)
+        if self._sender.is_alive():
+            self._process.kill()  # it takes no scan
+            self._sender.join()
         self._here.close()
         self._process.join(2.0)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-        for memory in self._slots:
-            _remove(memory)
-        self._slots, self._free = [], []
-
-
-def _remove(memory: SharedMemory) -> None:
-    memory.close()
-    memory.unlink()
-
-
-def _padded(size: int) -> int:
-    """A multiple of eight bytes."""
-    return -(-size // 8) * 8
 
 
 def _one_after_the_other(first: Motions, second: Motions) -> Motions:
@@ -229,21 +203,12 @@ def _run(connection: Connection, make: Make, period: float, cores: list[int]) ->
         timed = TimedSelector(gentle, period)
         connection.send(gentle.fall_back())
         before = time.process_time()
-        seen: dict[int, SharedMemory] = {}
         while True:
-            slot, name, layout, stamp, motions = connection.recv()
+            stamp, scan, motions = connection.recv()
             begin = time.perf_counter()
-            if slot not in seen or seen[slot].name != name:
-                seen[slot] = SharedMemory(name)
-            arrays = {
-                key: np.ndarray(shape, kind, seen[slot].buf, offset).copy()
-                for key, kind, shape, offset in layout
-            }
-            scan = wire.to_scan(processes.Message({"stamp": stamp}, arrays))
             selection = timed.update(stamp, scan, motions)
             seconds = time.perf_counter() - begin
-            answer = Answer(stamp, selection, seconds, time.process_time() - before)
-            connection.send((slot, answer))
+            connection.send(Answer(stamp, selection, seconds, time.process_time() - before))
             timed.measure()
 
 

@@ -178,10 +178,8 @@ def test_a_refusal_gives_the_reason(link):
 
 
 def test_a_node_that_is_not_there_is_named(link):
-    begin = time.monotonic()
     with pytest.raises(LinkError) as error:
         link.set_parameters("/other", {"voxel_size": 1.0})
-    assert time.monotonic() - begin < 3.0
     assert str(error.value) == (
         "/other is not there: /other/set_parameters in ROS domain 0; "
         "the nodes there are /deaf, /robot/slam, /secret"
@@ -271,13 +269,11 @@ def test_another_domain_is_another_world(robot, monkeypatch):
 
 
 def test_a_router_must_answer():
-    begin = time.monotonic()
     with pytest.raises(
         LinkError, match=r"no Zenoh router answers at tcp/.*rmw_zenohd.*7447"
     ) as told:
         Ros2(f"127.0.0.1:{free_port()}")
     assert ".rs:" not in str(told.value)
-    assert time.monotonic() - begin < 5.0
     with pytest.raises(LinkError, match="'robot:here' is not the place of a Zenoh router"):
         Ros2("robot:here")
 
