@@ -96,25 +96,6 @@ def test_chains_begin_at_the_best_of_the_first_trials():
     assert [chain.energy for chain in sampler.chains(study)] == energies[:2]
 
 
-def test_trials_that_run_at_the_same_time_step_from_the_same_place():
-    sampler = AnnealingSampler(settings(chains=1, steps={"x": {"sigma": 0.02}}), seed=1)
-    study = optimize(20, sampler)
-    (chain,) = sampler.chains(study)
-    xs = [study.ask(SPACE).params["x"] for _ in range(8)]
-    assert len(set(xs)) == 8
-    assert all(abs(x - chain.params["x"]) < 0.2 for x in xs)
-
-
-@pytest.mark.parametrize("n_startup", [1, 6])
-def test_looking_for_a_stall_changes_nothing(n_startup):
-    def walked(**given):
-        return history(
-            optimize(30, AnnealingSampler(settings(**given), n_startup_trials=n_startup, seed=1))
-        )
-
-    assert walked(stall_best=1000) == walked()
-
-
 def test_stops_when_all_chains_have_stalled():
     sampler = AnnealingSampler(settings(chains=3, stall_best=5), seed=1)
     study = optuna.create_study(sampler=sampler)
@@ -194,24 +175,6 @@ def test_accepts_worse_ones_with_the_probability_of_metropolis(temperature, scal
         accepted += chain.params["x"]
     expected = math.exp(-0.2 / scale / temperature)
     assert stats.binomtest(accepted, 4000, expected).pvalue > 1e-4
-
-
-def test_visits_as_boltzmann_says():
-    """At a temperature that stays, places are visited as exp(-E / T)."""
-    energies = np.array([0.0, 1.0, 0.5, 2.0, 0.2])
-    chain = Chain(settings(initial_temperature=0.7, alpha=1.0))
-    chain.start({"n": 0}, energies[0])
-    rng = np.random.default_rng(1)
-    places = IntDistribution(0, 4)
-    visits = np.zeros(5)
-    for _ in range(20_000):
-        n = step_from(chain.params["n"], places, Step(delta_max=1), 0.7, rng)
-        chain.step({"n": n}, energies[n], 1.0, rng.random())
-        visits[chain.params["n"]] += 1
-    # A step beyond a bound is reflected, so that from an end its neighbour is twice as likely:
-    # the ends are visited half as often as places in between.
-    weights = np.exp(-energies / 0.7) * [0.5, 1, 1, 1, 0.5]
-    np.testing.assert_allclose(visits / visits.sum(), weights / weights.sum(), atol=0.04)
 
 
 def test_energies_are_divided_by_that_of_the_first_trial():

@@ -27,7 +27,7 @@ from offline.config import load_study
 from offline.labelled import LabelledSequence
 from offline.train import fit, tuned
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings
-from offline.validate import LeftOut, Validation, ValidationError, leave_one_out, validate
+from offline.validate import LeftOut, ValidationError, leave_one_out, validate
 
 
 @pytest.fixture(autouse=True)
@@ -104,12 +104,6 @@ def test_the_oracle_is_never_worse_than_anything():
     ratios = leave_one_out(labelled(sequences)).ratios
     for mode in ratios:
         assert (ratios["oracle, period"] <= ratios[mode] + 1e-12).all()
-
-
-def test_a_rule_that_never_adapted_has_no_estimate():
-    errors = {m: np.ones(9) for m in ("fixed", "adaptive")}
-    kept = [LeftOut(str(i), errors, {"adaptive": 0.0}, np.ones(6)) for i in range(6)]
-    assert Validation(kept).verdict("adaptive").startswith("`adaptive` kept the fixed set")
 
 
 def test_intervals_over_time():
@@ -254,23 +248,6 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
         match = f"one stretch cannot .* will drive {what} .* too little .* takes 80 m of rec"
         with pytest.raises(ValidationError, match=match):
             judged(alone, study, monkeypatch)
-
-
-def test_validate_says_that_the_baseline_is_better(study_file, tmp_path, monkeypatch):
-    data = labelled(two_kinds(np.random.default_rng(0)))
-    whole = {0: 1.0, 3: 4.0, 4: 3.0}
-    data = data._replace(sequences=[replace(s, whole=whole) for s in data.sequences])
-    assert data.fixed() == 0
-    study = load_study(study_file, ["online.switching.mechanism=live"], tmp_path)
-    monkeypatch.setattr(validation_of_study, "_checked_model", lambda _: model)
-    monkeypatch.setattr(validation_of_study, "_labelled", lambda *_: data)
-    model = replace(fit(data, 0, {}, 10.0, 1, {}), blocks={"ndt": 90})
-    said = validate(study).verdicts[-1]
-    assert said == (
-        "In whole runs with the health check, the baseline is better than the trials suggested: "
-        "its rte is 1, that of trial 4, the best by its trials, 3. "
-        "So the fixed set is the baseline."
-    )
 
 
 def test_stretches_of_one_recording_are_left_out():

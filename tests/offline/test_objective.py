@@ -1,19 +1,15 @@
 """What trials are judged by."""
 
-import csv
-
 import drives
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from pictures import texts
 from setups import made_of, setup_of
 
-from adaptune.archive import Archive, Frames, Summary
+from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import steps
 from adaptune.odometry import Registration
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.strict import ConfigurationError
@@ -32,7 +28,6 @@ from offline.objective import (
     pareto_front,
     penalised,
     sampler_results,
-    trajectory_metrics,
 )
 from offline.train import train
 
@@ -174,20 +169,6 @@ def test_new_starts_are_undone():
     np.testing.assert_array_equal(joined(T, {}), T)
 
 
-@given(st.integers(0, 1000))
-def test_joining_keeps_every_step(seed):
-    rng = np.random.default_rng(seed)
-    T, lost = np.tile(np.eye(4), (20, 1, 1)), {}
-    T[:, :3, 3] = rng.normal(size=(20, 3)).cumsum(axis=0)
-    for i in rng.choice(np.arange(1, 20), 4, replace=False):
-        lost[int(i)] = np.eye(4)
-        lost[int(i)][:3, 3] = rng.normal(size=3)
-    expected = steps(T)
-    for i, step in lost.items():
-        expected[i - 1] = step
-    np.testing.assert_allclose(steps(joined(T, lost)), expected, atol=1e-9)
-
-
 class Sideways(KeyframeGicp):
     """Loses 5 m to the side at scan 10."""
 
@@ -211,34 +192,6 @@ def test_a_lost_track_is_in_the_metrics_of_the_trajectory(study_file, tmp_path):
     assert trial.metrics["ape"] > 1.0
 
 
-def test_judged_by_time_within_limits(study_file, tmp_path):
-    overrides = [
-        "offline.objective=[rpe, {rte: 1.0, ape: 0.5}, ms_per_scan]",
-        "offline.limits={rte: {max: 0.775}}",
-    ]
-    study = load_study(study_file, overrides, tmp_path / "study")
-    training = train(study)
-    rows = list(csv.DictReader((study.folder / "trials.csv").open()))
-    front = list(csv.DictReader((study.folder / "pareto.csv").open()))
-    said = texts(study.folder / "pareto.png")
-    assert {"rpe [m]", "rte [%] + 0.5 ape [m]", "ms_per_scan [ms]", "baseline", "fixed"} <= set(
-        said
-    )
-    keep = [r for r in rows if max(float(r["one"]), float(r["two"])) <= 0.775]
-    assert 0 < len(keep) < len(rows)
-    assert all((float(r["excess"]) == 0.0) == (r in keep) for r in rows)
-    assert front
-    assert all(row in keep for row in front)
-    best = min(keep, key=lambda r: float(r["rpe"]))
-    assert int(best["trial"]) == training.fixed
-    assert list(training.model.sets) == [int(r["trial"]) for r in keep]
-    assert training.model.fixed == training.fixed
-    summary = Archive(study.folder / "trials").finished("one")[training.fixed]
-    assert summary.metrics["ms_per_scan"] > 0
-    with pytest.raises(ConfigurationError, match=r"other values of offline\.objective"):
-        load_study(study_file, overrides[1:], tmp_path / "study").check()
-
-
 def test_limits_that_no_set_keeps(study_file, tmp_path):
     overrides = ["offline.limits={ms_per_scan: {max: 1e-6}}", "offline.trials=4"]
     study = load_study(study_file, overrides, tmp_path / "study")
@@ -252,16 +205,6 @@ def test_kittis_error_needs_its_length(study_file, tmp_path):
         AdaptuneError, match=r"(one|two): its path holds no sub-trajectory of 100 m"
     ):
         train(study)
-
-
-@pytest.mark.parametrize(("metres", "known"), [(99.0, False), (120.0, True)])
-def test_kittis_error_is_there_where_it_is_known(metres, known):
-    T = np.tile(np.eye(4), (61, 1, 1))
-    T[:, 0, 3] = np.linspace(0.0, metres, 61)
-    frames = Frames(np.arange(61), T, np.zeros((61, 1), np.float32), {"ndt": 1}, np.zeros(61))
-    metrics = trajectory_metrics(frames, T, {})
-    assert set(metrics) == {"rpe", "ape"} | ({"kitti"} if known else set())
-    assert max(metrics.values()) < 1e-9
 
 
 def test_memory_is_that_of_a_process_of_its_own(study_file, tmp_path):

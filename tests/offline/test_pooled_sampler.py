@@ -60,11 +60,6 @@ def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
     assert min(collections.Counter(labels(history)).values()) >= 4
 
 
-def test_batches_smaller_than_the_pool_still_begin_with_every_baseline():
-    small = OfflineConfig(sampler="random", batch=2, initial=4, seed=5)
-    assert [s for s, _ in run(small, 2)[:3]] == SPACE.baselines
-
-
 def test_the_best_odometry_gets_the_largest_share(config):
     counts = collections.Counter(labels(run(config, 6)[16:]))
     assert counts["gicp"] > max(counts["ndt"], counts["kiss"]) > 0
@@ -74,26 +69,6 @@ def test_the_best_odometry_gets_the_largest_share(config):
 def test_resumes_exactly(config, known):
     history = run(config, 4)
     assert run(config, 4 - known, history[: 8 * known]) == history
-
-
-def test_another_seed_gives_other_sets(config):
-    other = config.model_copy(update={"seed": 6})
-    assert run(other, 1)[3:] != run(config, 1)[3:]
-
-
-def test_where_one_has_nothing_left_the_others_go_on():
-    space = PooledSpace(
-        {
-            "few": ParameterSpace.of(kernel=Categorical(choices=("a", "b"), baseline="a")),
-            "many": ParameterSpace.of(x=Float(low=0.0, high=1.0, baseline=0.5)),
-        }
-    )
-    sampler = make_sampler(space, OfflineConfig(sampler="random", batch=8, initial=8))
-    history = []
-    for _ in range(2):
-        history += [(s, 1.0) for s in sampler.propose(history)]
-    counts = collections.Counter(labels(history))
-    assert counts == {"few": 2, "many": 14}
 
 
 @pytest.mark.parametrize(
@@ -142,14 +117,6 @@ def test_a_finite_pool_is_tried_to_its_end(config, batch):
     assert len(history) == len({repr(s) for s, _ in history}) == 23
 
 
-def test_alike_odometries_begin_with_other_points():
-    space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
-    sets = make_sampler(space, OfflineConfig(sampler="random", batch=16)).propose([])[2:]
-    voxels = [{s["voxel"] for s in sets if s[ODOMETRY] == label} for label in space.spaces]
-    assert len(voxels[0]) == len(voxels[1]) == 7
-    assert not voxels[0] & voxels[1]
-
-
 def test_of_several_objectives_the_first_splits_the_batches():
     config = OfflineConfig(objective=["rte", "rpe"], batch=8, initial=8, seed=5)
     sampler, history = make_sampler(SPACE, config), []
@@ -169,23 +136,7 @@ def late_sets(limit):
     return [s for s, *_ in history[45:]]
 
 
-def test_samplers_are_told_of_limits():
-    free = late_sets(lambda _: ())
-    bound = late_sets(lambda s: (1.0 - s["voxel"],))
-    small = [sum(s["voxel"] < 0.9 for s in sets) for sets in (free, bound)]
-    assert small[1] < 0.6 * small[0]
-
-
 def test_sets_that_break_limits_earn_no_share():
     """What one of them does best, it may not do."""
     late = late_sets(lambda s: (1.0 if s[ODOMETRY] == "one" else -1.0,))
     assert collections.Counter(s[ODOMETRY] for s in late) == {"one": 9, "other": 18}
-
-
-def test_says_the_same_when_asked_again(config):
-    history = run(config, 3)
-    sampler = make_sampler(SPACE, config)
-    assert sampler.propose(history) == sampler.propose(history)
-    assert sampler.propose(history[:16]) == [s for s, _ in history[16:]]
-    with pytest.raises(ValueError, match="15 is not a multiple"):
-        sampler.propose(history[:15])

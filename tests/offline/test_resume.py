@@ -52,18 +52,6 @@ def trained(finished, tmp_path):
     return load(tmp_path)
 
 
-def test_parameters_are_told_once_where_no_set_beat_the_baseline(trained):
-    training = train(trained)._replace(remark="More of it.")
-    beaten, *baseline = training._replace(fixed=0).words
-    assert beaten.startswith("No set clearly beat the baseline's ")
-    assert beaten.endswith("(2 sequences); the fixed set is the baseline.")
-    assert [text.split(":")[0] for text in baseline] == ["Parameters of the baseline"]
-    gain, fixed, _, remark = training._replace(fixed=2).words
-    assert gain.startswith("Fixed: ")
-    assert fixed.startswith("Parameters of the fixed set: max_correspondence_distance ")
-    assert remark == "More of it."
-
-
 def test_frames_that_are_damaged_or_removed_are_made_again(trained):
     frames = trained.folder / "trials/one/frames.npz"
     before = timeless(frames)
@@ -116,19 +104,6 @@ def test_only_what_depends_on_another_recording_is_computed_again(trained, tmp_p
     check_inputs(study)
 
 
-def test_another_odometry_computes_everything_again(trained, tmp_path):
-    written = mtimes(trained.folder / "trials")
-    other = ["offline.trials=4", "odometry.settings.downsampling=0.6"]
-    study = load_study(tmp_path / "small.yaml", other, trained.folder)
-    with pytest.raises(ConfigurationError, match=r"downsampling has another value.* the model\."):
-        train(study)
-    train(study, again=True)
-    after = mtimes(trained.folder / "trials")
-    assert after.keys() >= {path for path in written if "whole" not in path.name}
-    assert not any(after.get(path) == written[path] for path in written)
-    assert b'"adaptune trial":3' in (trained.folder / "optuna.log").read_bytes()
-
-
 def test_with_nothing_to_do_nothing_is_done(trained):
     """And the validation stays."""
     validate(trained)
@@ -164,44 +139,11 @@ def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
     assert heavy.isdisjoint(done.stdout.split()), heavy.intersection(done.stdout.split())
 
 
-def test_sequences_are_added_and_removed(trained, tmp_path):
-    written = mtimes(trained.folder / "trials")
-    drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
-    four = "sequences.four={bag: four.bag, points: /points, reference: /truth}"
-
-    def run(*names):
-        given = ["offline.trials=4", four, f"training=[{', '.join(names)}]"]
-        return train(load_study(tmp_path / "small.yaml", given, trained.folder)).model
-
-    added = run("one", "two", "four")
-    assert added.sequences == ["one", "two", "four"]
-    assert not np.isnan(added.errors).any()
-    after = mtimes(trained.folder / "trials")
-    assert {path.parts[0] for path in after.keys() - written.keys() if path.stem.isdigit()} == {
-        "four"
-    }
-    assert all(after[path] == time for path, time in written.items())
-    assert run("one", "four").sequences == ["one", "four"]
-    # It counts again, and nothing is run for it.
-    again = run("one", "two", "four")
-    assert again.digest == added.digest
-    assert mtimes(trained.folder / "trials").items() >= after.items()
-
-
 @pytest.mark.parametrize("place", [("two", 2), ("one", 3)])
 def test_a_trial_copied_over_another_is_named(trained, place):
     folder = trained.folder / "trials"
     shutil.copy2(folder / "one/00002.npz", Archive(folder).trial_path(*place))
     with pytest.raises(AdaptuneError, match=r"holds trial 2 on one, so it was copied over"):
-        train(trained)
-
-
-def test_trials_that_changed_places_are_named(trained):
-    one, two = (trained.folder / "trials" / name / "00001.npz" for name in ("one", "two"))
-    one.rename(one.with_name("x"))
-    two.rename(one)
-    one.with_name("x").rename(two)
-    with pytest.raises(AdaptuneError, match=r"one/00001\.npz: holds trial 1 on two"):
         train(trained)
 
 

@@ -1,17 +1,13 @@
 """Sets that are searched for on one sequence alone, beside those that all share."""
 
-import csv
 import itertools
 from functools import partial
 
 import drawn
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from adaptune.archive import Archive, Summary
-from adaptune.commands.cli import app
-from adaptune.model import ErrorModel
 from adaptune.space import Categorical, ParameterSets, ParameterSpace
 from adaptune.strict import ConfigurationError
 from offline.campaign import run_batches
@@ -20,7 +16,6 @@ from offline.labelled import labelled_data
 from offline.objective import best_by_trials
 from offline.samplers import make_sampler
 from offline.search import Search, make_searches, owner
-from offline.train import train
 from offline.validate import leave_one_out
 
 NAMES = ["one", "two", "three"]
@@ -195,13 +190,6 @@ def test_a_search_that_is_over_waits_for_the_others(study_of):
     assert list(verdicts) == list(seen)
 
 
-def test_views_search_for_themselves(study_of):
-    study = study_of(sets="own", augment="[{reverse: true}]")
-    searches = searches_of(study)
-    assert [search.sequences for search in searches] == [[name] for name in study.training]
-    assert len(searches) == 6
-
-
 def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     study = study_of(sets="own")
     verdicts, _, archive = run(study)
@@ -235,32 +223,6 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
             if owner_of(archive, n) != left_out.name
         ]
         assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
-
-
-def test_from_end_to_end(study_file, tmp_path):
-    folder = tmp_path / "study"
-    given = ["--folder", str(folder)]
-    for override in ("offline.sets=own", "offline.trials=5", "sub_trajectory=3.0"):
-        given += ["-o", override]
-    for command in ("offline", "trials", "validate", "online", "compare"):
-        done = CliRunner().invoke(app, [command, str(study_file), *given])
-        assert done.exit_code == 0, done.output
-    model = ErrorModel.load(folder / "model.safetensors")
-    rows = list(csv.DictReader((folder / "trials.csv").open()))
-    assert len(rows) == len(model.sets) == 1 + 2 * 4
-    run_everywhere = [row for row in rows if row["mean"]]
-    assert 1 <= len(run_everywhere) <= 3
-    assert float(rows[model.sets.column(model.fixed)]["mean"]) == min(
-        float(row["mean"]) for row in run_everywhere
-    )
-    for s, name in enumerate(("one", "two")):
-        missing = np.isnan(model.errors[model.sequence == s])
-        assert (missing.all(axis=0) == missing.any(axis=0)).all()
-        assert missing.all(axis=0).tolist() == [row[name] == "" for row in rows]
-    before = (folder / "model.safetensors").read_bytes()
-    train(load_study(study_file, given[3::2], folder))
-    assert ErrorModel.load(folder / "model.safetensors").errors.tobytes() == model.errors.tobytes()
-    assert len(before) > 1000
 
 
 def test_pruning_needs_sets_that_are_shared(study_file):

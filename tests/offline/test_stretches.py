@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 from labelled_places import in_stretches, labelled, with_motions
 
 from adaptune.metrics import travelled, window_ends
-from adaptune.model.weights import MemberWeights
 from offline.bank_simulation import PER_STRETCH, Extent, cut, stretches_of_view
 from offline.labelled import LabelledSequence
-from offline.tuning import bank_errors
 
 LENGTH = 10.0
 
@@ -113,18 +111,6 @@ def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
     # It goes from its start back to its end.
     assert ((kept.positions[:, 0] < first) | (kept.end_positions[:, 0] > last - LENGTH)).all()
     assert len(kept.frames)
-
-
-def test_a_part_of_a_simulation_is_that_of_its_stretch():
-    rng = np.random.default_rng(3)
-    one = in_stretches(with_motions("one", rng, 700))
-    for number in np.unique(one.cuts):
-        left = one.left_out(int(number))
-        assert len(left.simulation.stamps) < 400
-        # The errors of a bank of one are those of the set.
-        weights = MemberWeights((3,), np.ones((len(np.unique(left.simulation.period)), 1)))
-        of_frames = np.linalg.norm(left.vectors[3], axis=1)
-        np.testing.assert_allclose(bank_errors(left, weights), of_frames, rtol=1e-4)
 
 
 def test_with_six_recordings_whole_ones_are_left_out():

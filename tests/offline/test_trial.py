@@ -64,16 +64,6 @@ def test_trials_side_by_side_are_those_one_by_one(study):
     assert not np.array_equal(together[0].T_odom_sensor, together[1].T_odom_sensor)
 
 
-@pytest.mark.parametrize("memory", [0.0, 2e6])
-def test_scans_that_do_not_fit_are_read_again(study, memory):
-    whole = setup_of(study).prepare("one", 1e9)
-    part = setup_of(study).prepare("one", memory)
-    assert part.nbytes <= memory < whole.nbytes
-    for _ in range(2):
-        (a,), (b,) = setup_of(study).run(whole, [GOOD]), setup_of(study).run(part, [GOOD])
-        np.testing.assert_array_equal(a.T_odom_sensor, b.T_odom_sensor)
-
-
 class Slipping(KeyframeGicp):
     """Loses track by a given distance at given scans, and stays beside the track."""
 
@@ -229,13 +219,6 @@ def test_the_baseline_may_have_more_runs(study):
         sequence, [baseline, GOOD | {"keyframe_interval": 2.0}, baseline], whole=True
     )
     assert [len(trial.repeats) for trial in trials] == [2, 0, 2]
-
-
-def test_whole_runs_as_trials(study):
-    sequence = setup_of(study).prepare("one", 1e9)
-    (a,) = setup_of(study, runs="whole", repeats=1).run(sequence, [GOOD])
-    (b,) = setup_of(study).run(sequence, [GOOD], whole=True)
-    np.testing.assert_array_equal(a.errors, b.errors)
 
 
 def test_a_reference_of_another_time_is_refused(study, tmp_path):

@@ -209,24 +209,6 @@ def test_smoothed_weights_are_means_of_the_last(n, seed):
     assert (smooth_weights(np.eye(2)[[0] * n]) == [1.0, 0.0]).all()
 
 
-def test_the_more_even_the_more_even():
-    squares = np.diag([1.0, 4.0])
-    np.testing.assert_allclose(minimum_variance_weights(squares, 0.0), [0.8, 0.2], atol=1e-6)
-    spread = [np.ptp(minimum_variance_weights(squares, even)) for even in (0.05, 1.0, 100.0)]
-    assert spread == sorted(spread, reverse=True)
-    assert spread[-1] < 0.05
-
-
-def test_a_lost_track_costs_as_much_as_the_clip():
-    data = places(np.random.default_rng(9))
-    of = {
-        clip: BankRule(BankSettings(clip=clip)).fit(data).predict(data.features[0])
-        for clip in (6.0, 18.0)
-    }
-    np.testing.assert_allclose(of[18.0][3], 3.0 * of[6.0][3], rtol=1e-6)
-    np.testing.assert_allclose(of[18.0][:3], of[6.0][:3])
-
-
 def test_members_that_rest_have_no_weight_and_change_nothing():
     rng = np.random.default_rng(3)
     data = places(rng)

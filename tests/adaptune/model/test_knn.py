@@ -11,8 +11,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from tables import table
 
 from adaptune.model import TrainingData
-from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor, nearest_of_groups
-from adaptune.model.rules import mean_errors
+from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 
 modest = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -55,15 +54,6 @@ def test_predictions_are_those_of_a_regressor_on_all_pairs(seed, n_frames, n_set
     rule, want = NearestNeighbours(k).fit(data), regressor(data, k)
     for feature in np.random.default_rng(seed).normal(size=(3, 4)):
         np.testing.assert_allclose(rule.predict(feature), want(feature), rtol=1e-6)
-
-
-def test_five_neighbours_unless_told_otherwise():
-    data = random_data(1, 20, 6)
-    feature = np.zeros(4)
-    np.testing.assert_array_equal(
-        NearestNeighbours().fit(data).predict(feature),
-        NearestNeighbours(5).fit(data).predict(feature),
-    )
 
 
 @modest
@@ -109,47 +99,6 @@ def test_fewer_pairs_than_neighbours():
     data = random_data(2, 2, 2)
     want = np.full(2, np.minimum(data.errors, 30.0).mean())
     np.testing.assert_allclose(NearestNeighbours(5).fit(data).predict(np.zeros(4)), want, rtol=1e-6)
-
-
-def test_a_single_set_and_frame():
-    data = TrainingData(
-        np.zeros((1, 3)),
-        np.zeros(1, int),
-        np.full((1, 1), 2.5, np.float32),
-        table(np.full((1, 2), 0.4)),
-        0,
-    )
-    selection = NearestNeighbours().fit(data).select(np.ones(3))
-    assert (selection.trial, selection.predicted_error) == (0, 2.5)
-
-
-@modest
-@given(seeds, st.integers(1, 40), st.integers(1, 45))
-def test_nearest_frames(seed, n_frames, k):
-    rng = np.random.default_rng(seed)
-    # Few places, so that distances are often the same.
-    features = rng.integers(0, 3, (n_frames, 2)).astype(float)
-    feature = rng.integers(0, 3, 2).astype(float)
-    want = sorted((float(((f - feature) ** 2).sum()), i) for i, f in enumerate(features))[:k]
-    squared, frames, _ = nearest_of_groups(features, np.array([0, len(features)]), feature, k)
-    assert list(zip(squared.tolist(), frames.tolist(), strict=True)) == want
-
-
-def test_mean_errors_weigh_sequences_alike():
-    errors = np.array([[1, 4], [3, np.inf], [50, 10], [2, 6], [2, 0]], np.float32)
-    sequence = np.array([7, 7, 2, 7, 7])
-    want = [(30.0 + 8.0 / 4) / 2, (10.0 + 40.0 / 4) / 2]
-    np.testing.assert_allclose(mean_errors(errors, sequence), want)
-
-
-@pytest.mark.parametrize("n_frames", [1, 50])
-def test_the_same_scan_again_finds_its_own_frame(n_frames):
-    data = random_data(5, n_frames, 5)
-    rule = NearestNeighbours(1).fit(data)
-    for i in range(0, n_frames, 7):
-        np.testing.assert_allclose(
-            rule.predict(data.features[i]), np.minimum(data.errors[i], 30.0), rtol=1e-6
-        )
 
 
 @parametrize_with_checks([ProductKNeighborsRegressor()])
@@ -241,19 +190,3 @@ def test_frames_and_sets_without_any_pair_change_nothing():
 def test_what_does_not_go_together_is_refused(sets, y, k, message):
     with pytest.raises(ValueError, match=message):
         ProductKNeighborsRegressor(sets, k).fit(np.zeros((3, 2)), y)
-
-
-def test_sets_that_a_sequence_lacks():
-    data = random_data(7, 40, 8)
-    data.errors[data.sequence == 1, 3:6] = np.nan
-    rule, feature = NearestNeighbours().fit(data), np.zeros(4)
-    assert np.isfinite(rule.predict(feature)).all()
-    means = mean_errors(data.errors, data.sequence)
-    # Nothing can be said of all sequences for a set that one of them lacks.
-    assert np.isinf(means[3:6]).all()
-    assert np.isfinite(np.delete(means, [3, 4, 5])).all()
-
-
-def test_frames_that_lack_a_set_do_not_count_for_it():
-    errors = np.array([[1, 4], [3, np.nan], [5, 10]], np.float32)
-    np.testing.assert_allclose(mean_errors(errors, np.array([0, 0, 1])), [3.5, 7.0])
