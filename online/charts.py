@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.geometry import invert
 from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
 from adaptune.report.charts import (
@@ -24,14 +25,14 @@ from adaptune.report.charts import (
     Spans,
     charts_of,
 )
-from adaptune.report.paper import plain
+from adaptune.report.drawing import plain
 from adaptune.space import ParameterSpace
-from adaptune.study.study import Study
+from adaptune.study.study import Study, named
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_modes
+from online.modes import UNTRAINED
 from online.record import StoredReplay, damaged, read_applied, read_columns
-from online.replay_picture import Track
-from online.statistics import ALL, ComparisonRow, Reference, reference_of, seen_from, track_of
+from online.statistics import ALL, ComparisonRow, Reference, reference_of
 from online.verdict import of_lengths, short_replays
 
 # The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
@@ -167,25 +168,64 @@ def scene_spans(
 # The replays of a sequence in all modes that there are, as charts need them.
 
 
-class ModeReplay(NamedTuple):
-    """A replay in one mode, with what was measured on the way."""
+_MOST_RESTARTS = 60
+"""Most restarts that are marked."""
 
-    track: Track
+
+class ModeReplay(NamedTuple):
+    """Errors, selections and times of one mode along a sequence: n scans, m selections."""
+
+    seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
+    xy: NDArray[np.float64]  # metres, seen from the reference's first pose, of shape (n, 2)
+    errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
+    errors_behind: NDArray[np.float64]  # the mean of those that ended in the last 30 s
+    restarted: NDArray[np.bool_]  # of shape (n,)
+    choice_seconds: NDArray[np.float64]  # of shape (m,)
+    choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
+    weights: Mapping[str, Sequence[float]]  # in a bank by member instead, of shape (m,)
+    # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
+    # interval; NaN where there is none.
+    estimated: NDArray[np.float64]
+    lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
     familiarity: NDArray[np.float64]  # (m,): of each selection, see `Selection`; NaN if unknown
     selection_ms: NDArray[np.float64]  # (m,): that it took; empty where none was made
     scan_ms: NDArray[np.float64]  # (n,): to prepare and register a scan
     late_ms: NDArray[np.float64]  # (n,): from a scan to its pose, in real time; empty otherwise
 
+    @property
+    def span(self) -> NDArray[np.float64]:
+        """When each choice was made, and the end, until which the last one holds."""
+        return np.append(self.choice_seconds, self.seconds[-1])
+
+    @property
+    def lost_spans(self) -> list[tuple[float, float]]:
+        """When the bank was lost, from a selection to the first one at which it was not."""
+        spans: list[tuple[float, float]] = []
+        for begin, end in np.column_stack([self.span[:-1], self.span[1:]])[self.lost].tolist():
+            goes_on = spans and spans[-1][1] == begin
+            spans.append((spans.pop()[0] if goes_on else begin, end))
+        return spans
+
+    @property
+    def restarts(self) -> list[int]:
+        """Frames of the restarts to mark: of those in close succession the first."""
+        marked: list[int] = []
+        apart = self.seconds[-1] / _MOST_RESTARTS
+        for i in np.flatnonzero(self.restarted).tolist():
+            if not marked or self.seconds[i] - self.seconds[marked[-1]] > apart:
+                marked.append(i)
+        return marked
+
     def selection_at(self) -> NDArray[np.intp]:
         """Number of the selection that holds at each frame, of shape (n,)."""
-        after = np.searchsorted(self.track.choice_seconds, self.track.seconds, side="right")
+        after = np.searchsorted(self.choice_seconds, self.seconds, side="right")
         return np.maximum(after - 1, 0)
 
     @property
     def adapts(self) -> bool:
         """Whether anything was selected along the way."""
-        return len(self.track.choice_seconds) > 1
+        return len(self.choice_seconds) > 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +237,7 @@ class ReplayedSequence:
     modes: Mapping[str, ModeReplay]  # in the order in which lines lie on each other
     space: ParameterSpace
     scenes: Spans | None = None  # of a simulated course
+    reference: NDArray[np.float64] | None = None  # (k, 2): places, metres; None if there is none
     estimated: bool = False  # whether the reference was computed from the recording
     refused: Sequence[str] = ()  # sentences about replays that are not among them
 
@@ -214,10 +255,9 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     """
     folder = study.folder / "replays" / name
     space, reference = study.odometry.space, reference_of(study, name)
-    model = None
     # Of a single odometry, numbers name the members of a bank.
-    if len(space.baselines) > 1 and study.model_path.exists():
-        model = ErrorModel.load(study.model_path)
+    several = len(space.baselines) > 1 and study.model_path.exists()
+    model = ErrorModel.load(study.model_path) if several else None
     current = current_modes(study, name)
     replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
     replays, short = _whole(name, replays)
@@ -234,6 +274,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         modes,
         space,
         scenes,
+        None if reference.trajectory is None else _seen_from(reference.trajectory),
         reference.estimated,
         [*current.refused, *short],
     )
@@ -266,7 +307,15 @@ def scenes_along(study: Study, name: str, stamps: NDArray[np.int64]) -> Spans | 
 def _read_mode(
     folder: Path, replay: StoredReplay, reference: Reference, model: ErrorModel | None
 ) -> ModeReplay:
-    track = track_of(replay, reference, model)
+    """Read a replay; `model` names the members of a bank."""
+    stamps, truth = replay.trajectory.stamps, reference.trajectory
+    # The odometry's own frame begins elsewhere: both are drawn from the first common pose.
+    start = 0 if truth is None else int(np.argmax(np.isin(stamps, truth.stamps)))
+    xy = _seen_from(replay.trajectory, start)
+    places = xy
+    if truth is not None and len(known := np.flatnonzero(np.isin(stamps, truth.stamps))):
+        places = np.full((len(stamps), 2), np.nan)
+        places[known] = _seen_from(truth)[np.searchsorted(truth.stamps, stamps[known])]
     applied, frames = read_applied(folder / "selections.csv"), read_columns(folder / "frames.csv")
     try:
         familiarity = _numbers(applied.get("familiarity", []))
@@ -275,17 +324,38 @@ def _read_mode(
         late_ms = _numbers(frames.get("late_ms", []))
     except (KeyError, ValueError) as error:
         raise damaged(folder, error) from error
-    if not len(familiarity):
-        familiarity = np.full(len(track.choice_seconds), np.nan)
-    places = track.xy
-    if reference.trajectory is not None:
-        stamps = replay.trajectory.stamps
-        known = np.flatnonzero(np.isin(stamps, reference.trajectory.stamps))
-        if len(known):
-            seen = seen_from(reference.trajectory)
-            places = np.full((len(stamps), 2), np.nan)
-            places[known] = seen[np.searchsorted(reference.trajectory.stamps, stamps[known])]
-    return ModeReplay(track, places, familiarity, selection_ms, scan_ms, late_ms)
+    return ModeReplay(
+        (stamps - stamps[0]) * 1e-9,
+        xy,
+        reference.errors(replay.trajectory),
+        reference.errors_behind(replay.trajectory),
+        replay.restarted,
+        np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
+        replay.choices,
+        {_member(replay, model, number): of for number, of in replay.weights.items()},
+        replay.estimated,
+        replay.lost,
+        places,
+        familiarity if len(familiarity) else np.full(len(replay.choice_stamps), np.nan),
+        selection_ms,
+        scan_ms,
+        late_ms,
+    )
+
+
+def _member(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
+    """What a member of a bank is called. Those of a bank without a model are no trials."""
+    if replay.summary.about.mode == UNTRAINED:
+        return f"untrained set {number}" if number else "baseline's set"
+    if model is None or number not in model.sets:
+        return f"trial {number}"
+    return f"trial {named(model, number)}"
+
+
+def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
+    """Positions in the plane of the sensor at a pose: x forward, y to the left."""
+    T = trajectory.T_world_sensor
+    return np.asarray((invert(T[start]) @ T)[:, :2, 3])
 
 
 def _numbers(texts: Collection[str]) -> NDArray[np.float64]:
@@ -305,7 +375,7 @@ def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
     if not known:
         return None
     drawn: list[Drawn] = [] if replayed.scenes is None else [replayed.scenes]
-    drawn += [Line(of.track.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
+    drawn += [Line(of.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
     y = Axis("familiarity [-]", limits=(0.0, 1.02))
     panels = [Panel(Axis("time [s]"), y, tuple(drawn))]
     fixed = replayed.modes.get("fixed")
@@ -335,11 +405,11 @@ def period_ratios(of: ModeReplay, fixed: ModeReplay) -> NDArray[np.float64]:
 
     NaN where either is unknown.
     """
-    edges = of.track.span
+    edges = of.span
 
     def means(one: ModeReplay) -> NDArray[np.float64]:
-        kept = np.isfinite(one.track.errors)
-        seconds, errors = one.track.seconds[kept], one.track.errors[kept]
+        kept = np.isfinite(one.errors)
+        seconds, errors = one.seconds[kept], one.errors[kept]
         number = np.searchsorted(edges, seconds, side="right") - 1
         number = np.clip(number, 0, len(edges) - 2)
         counts = np.bincount(number, minlength=len(edges) - 1)
@@ -389,7 +459,7 @@ def _positive(ms: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _scan_period(modes: Mapping[str, ModeReplay]) -> float:
     """Milliseconds from scan to scan."""
-    seconds = next(iter(modes.values())).track.seconds
+    seconds = next(iter(modes.values())).seconds
     return 1e3 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else np.nan
 
 
@@ -416,6 +486,8 @@ _MOST_PLACES = 200
 _MOST_MAPS = 12
 _SLENDER, _LOW = 0.2, 0.35
 """A course whose height from above is a smaller share of its width has low panels."""
+_BESIDE = 0.5
+"""By how much of its extent a picture may reach beyond the reference."""
 _RESTARTED = "restarted by the health check"
 
 
@@ -435,6 +507,7 @@ def charts_of_replays(study: Study, sequence: str) -> Charts:
     return charts_of(
         (
             *replayed.refused,
+            path_chart(replayed),
             error_chart(replayed)
             or f"No errors of the replays of {sequence}: it has no reference.",
             choice_chart(replayed),
@@ -446,14 +519,51 @@ def charts_of_replays(study: Study, sequence: str) -> Charts:
     )
 
 
+def path_chart(replayed: ReplayedSequence) -> Chart:
+    """The trajectory of every mode from above, beside the reference."""
+    drawn: list[Drawn] = [
+        Line(of.xy[:, 0], of.xy[:, 1], mode) for mode, of in replayed.modes.items()
+    ]
+    if (reference := replayed.reference) is not None:
+        some = reference[np.linspace(0, len(reference) - 1, 40).astype(int)]
+        name = "estimated reference" if replayed.estimated else "reference"
+        drawn.append(Points(some[:, 0], some[:, 1], name, shape="circle"))
+    for mode, of in replayed.modes.items():
+        if restarts := of.restarts:
+            texts = [f"{mode}, {seconds:.1f} s" for seconds in of.seconds[restarts]]
+            x, y = of.xy[restarts].T
+            drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
+    drawn.append(Points([0.0], [0.0], "start", shape="cross"))
+    x_limits, y_limits = _path_limits(replayed).tolist()
+    x, y = Axis("x [m]", limits=tuple(x_limits)), Axis("y [m]", limits=tuple(y_limits))
+    return Chart(
+        f"{replayed.name}-paths",
+        f"{replayed.name}: trajectories from above",
+        (Panel(x, y, tuple(drawn), equal=True),),
+        "Every trajectory begins at the first pose of the reference, and is not aligned any "
+        "further. What leaves the picture has lost its way.",
+    )
+
+
+def _path_limits(replayed: ReplayedSequence) -> NDArray[np.float64]:
+    """Limits of x and y, of shape (2, 2): not far from the reference, where there is one."""
+    places = np.concatenate([of.xy for of in replayed.modes.values()])
+    if (reference := replayed.reference) is not None:
+        side = _BESIDE * max(float(np.ptp(reference, axis=0).max()), 1.0)
+        places = places.clip(reference.min(axis=0) - side, reference.max(axis=0) + side)
+        places = np.concatenate([places, reference])
+    beyond = 0.05 * float(np.ptp(places, axis=0).max()) + 0.1
+    return np.column_stack([places.min(axis=0) - beyond, places.max(axis=0) + beyond])
+
+
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
     """Error of every mode over time, with its switches; and what modes have measured themselves."""
     panels = []
-    if any(np.isfinite(of.track.errors).any() for of in replayed.modes.values()):
+    if any(np.isfinite(of.errors).any() for of in replayed.modes.values()):
         panels.append(_errors(replayed))
     for mode, of in replayed.modes.items():
-        if np.isfinite(of.track.estimated[:, 0]).any() or of.track.lost.any():
-            panels.append(_estimates(mode, of.track, replayed))
+        if np.isfinite(of.estimated[:, 0]).any() or of.lost.any():
+            panels.append(_estimates(mode, of, replayed))
     if not panels:
         return None
     measured = (
@@ -474,13 +584,13 @@ def error_chart(replayed: ReplayedSequence) -> Chart | None:
 
 def _errors(replayed: ReplayedSequence) -> Panel:
     drawn: list[Drawn] = _scenes(replayed)
-    for mode, (track, *_) in replayed.modes.items():
+    for mode, track in replayed.modes.items():
         drawn.append(Line(track.seconds, track.errors, mode))
         at = np.searchsorted(track.seconds, switches(track))
         at = at[at < len(track.seconds)]
         if len(at):
             drawn.append(Points(track.seconds[at], track.errors[at], mode))
-    for mode, (track, *_) in replayed.modes.items():
+    for mode, track in replayed.modes.items():
         if restarts := track.restarts:
             x, y = track.seconds[restarts], track.errors[restarts]
             texts = [f"{mode}, {seconds:.1f} s" for seconds in x]
@@ -489,7 +599,7 @@ def _errors(replayed: ReplayedSequence) -> Panel:
     return Panel(TIME, axis, tuple(drawn), height=1.6)
 
 
-def switches(track: Track) -> NDArray[np.float64]:
+def switches(track: ModeReplay) -> NDArray[np.float64]:
     """Seconds of the selections that changed a parameter; none of a bank, which changes weights."""
     if track.weights or len(track.choice_seconds) < 2:
         return np.empty(0)
@@ -499,7 +609,7 @@ def switches(track: Track) -> NDArray[np.float64]:
     return track.choice_seconds[changed]
 
 
-def _estimates(mode: str, track: Track, replayed: ReplayedSequence) -> Panel:
+def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Panel:
     seconds, (estimated, low, high) = track.choice_seconds, track.estimated.T
     drawn: list[Drawn] = []
     if spans := track.lost_spans:
@@ -535,7 +645,7 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
 
 
 def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
-    single = {mode: of.track for mode, of in replayed.modes.items() if not of.track.weights}
+    single = {mode: of for mode, of in replayed.modes.items() if not of.weights}
     for name in dict.fromkeys(name for track in single.values() for name in track.choices):
         chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
         names = _names(v for values in chosen.values() for v in values)
@@ -568,7 +678,7 @@ def _place(value: Any, names: tuple[str, ...] | None) -> float:
 
 
 def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
-    for mode, (track, *_) in replayed.modes.items():
+    for mode, track in replayed.modes.items():
         shares = 100.0 * np.array(list(track.weights.values()))
         if not _changes(shares):
             continue
@@ -611,13 +721,13 @@ def map_chart(replayed: ReplayedSequence) -> Chart | None:
 
 
 def _maps(mode: str, of: ModeReplay, replayed: ReplayedSequence) -> Iterator[Panel]:
-    if of.track.weights:
-        weights = 100.0 * np.array(list(of.track.weights.values()))
+    if of.weights:
+        weights = 100.0 * np.array(list(of.weights.values()))
         if _changes(weights):
             title = f"{mode}: heaviest other member"
             yield _map(of, weights[1:].max(axis=0), "weight [%]", title)
         return
-    for name, values in of.track.choices.items():
+    for name, values in of.choices.items():
         if any(isinstance(v, str) for v in values) or len(set(map(repr, values))) < 2:
             continue
         chosen = np.array(values, float)
@@ -632,7 +742,7 @@ def _map(
     known = np.flatnonzero(np.isfinite(of.places).all(axis=1))
     some = known[np.unique(np.linspace(0, len(known) - 1, _MOST_PLACES).astype(int))]
     x, y = of.places[some].T
-    texts = [f"{seconds:.1f} s" for seconds in of.track.seconds[some]]
+    texts = [f"{seconds:.1f} s" for seconds in of.seconds[some]]
     drawn = (
         Points(x, y, "", chosen[of.selection_at()][some], label, log, texts),
         Points(x[:1], y[:1], "start", shape="cross"),

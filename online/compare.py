@@ -11,11 +11,17 @@ from numpy.typing import NDArray
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means, worst_tenth
 from adaptune.model import ErrorModel
 from adaptune.report import tables as report
-from adaptune.report.paper import LINES
 from adaptune.study.config import ALSO
 from adaptune.study.inputs import check_model, read_oracle
 from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, PER_STRETCH, RIVALS, Study
-from online.modes import BASELINE, UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
+from online.modes import (
+    BASELINE,
+    MODES,
+    UNTRAINED,
+    WITHOUT_MODEL,
+    ReplaySetup,
+    sequences_without_model,
+)
 from online.record import (
     ReplaySummary,
     StoredReplay,
@@ -23,7 +29,6 @@ from online.record import (
     check_reference,
     read_repeats,
 )
-from online.replay_picture import draw_replays
 from online.run import shared_identity
 from online.statistics import (
     ALL,
@@ -40,8 +45,6 @@ from online.statistics import (
     mean_of,
     oracle_rows,
     reference_of,
-    seen_from,
-    track_of,
 )
 from online.tables import tables
 from online.verdict import CONTROLS, remarks
@@ -53,7 +56,7 @@ class ComparedModes(NamedTuple):
     """What is compared."""
 
     sequences: tuple[str, ...]
-    modes: tuple[str, ...]  # replayed on all of them, in the order of `LINES`
+    modes: tuple[str, ...]  # replayed on all of them, in the order of `MODES`
     # By mode that somebody may expect, the sequences on which it was not replayed.
     missing: Mapping[str, Sequence[str]]
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
@@ -104,7 +107,7 @@ def compared_modes(study: Study) -> ComparedModes:
     """
     setup = ReplaySetup.of(study)
     names, without_model = study.config.test, sequences_without_model(study.config)
-    of_model = [mode for mode in LINES if mode not in WITHOUT_MODEL]
+    of_model = [mode for mode in MODES if mode not in WITHOUT_MODEL]
     if not _any(study, names, of_model) and _any(study, without_model, [UNTRAINED]):
         made, unfinished = _finished(study, without_model, WITHOUT_MODEL)
         if made:
@@ -121,7 +124,7 @@ def compared_modes(study: Study) -> ComparedModes:
     also = _on_demand(study, setup, model)
     there = {
         mode: [name for name in names if _is_there(study, name, mode)]
-        for mode in LINES
+        for mode in MODES
         if mode in (BASELINE, *RIVALS, "fixed", *setup.rules, *also)
     }
     expected = (BASELINE, *setup.rules, *also)
@@ -157,7 +160,7 @@ def _on_demand(study: Study, setup: ReplaySetup, model: ErrorModel | None) -> li
 
 def _model(study: Study, name: str) -> ErrorModel | None:
     """The model of the replays of a sequence; None if its file is gone, or they need none."""
-    there = (mode for mode in LINES if _is_there(study, name, mode))
+    there = (mode for mode in MODES if _is_there(study, name, mode))
     summaries = (ReplaySummary.read(_folder(study, name, mode)) for mode in there)
     files = [s.model_file for s in summaries if s.model_file and s.about.model]
     path = Path(files[0]) if files else study.model_path
@@ -351,7 +354,7 @@ def with_gaps(
 class CurrentModes(NamedTuple):
     """The modes whose replays of a sequence are of what the study is now."""
 
-    modes: tuple[str, ...]  # in the order of `LINES`
+    modes: tuple[str, ...]  # in the order of `MODES`
     refused: tuple[str, ...]  # sentences about the others
 
 
@@ -398,7 +401,7 @@ def current_modes(study: Study, name: str) -> CurrentModes:
         If it would refuse all of them.
     """
     folder, setup = study.folder / "replays" / name, ReplaySetup.of(study)
-    there = [mode for mode in LINES if (folder / mode / "replay.json").exists()]
+    there = [mode for mode in MODES if (folder / mode / "replay.json").exists()]
     made = {mode: ReplaySummary.read(folder / mode) for mode in there}
     if not made:
         return CurrentModes((), ())
@@ -527,8 +530,8 @@ class ComparedReplays(NamedTuple):
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
 
 
-def compare(study: Study, write: bool = True) -> ComparedReplays:
-    """Compare the replays that were made, and write tables and pictures.
+def compare(study: Study) -> ComparedReplays:
+    """Compare the replays that were made, and write tables.
 
     A mode is compared if it was replayed on all sequences that are compared, see
     `online.compared_modes.compared_modes`. The untrained bank is compared with the baseline alone
@@ -537,11 +540,8 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
     Parameters
     ----------
     study
-        The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, the
-        tables as Markdown (``tables.md``) and LaTeX (``tables.tex``), and a picture (PNG and SVG)
-        for every sequence.
-    write
-        Whether it does.
+        The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, and
+        the tables as Markdown (``tables.md``) and LaTeX (``tables.tex``).
 
     Raises
     ------
@@ -565,26 +565,13 @@ def compare(study: Study, write: bool = True) -> ComparedReplays:
         if oracle is not None and model is not None:
             period = study.config.online.period
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
-        if not write:
-            continue
-        draw_replays(
-            study.folder / "comparison" / f"{name}.png",
-            f"{study.name}: {name}",
-            study.config.sub_trajectory,
-            {mode: track_of(replays[mode][0], reference, model) for mode in modes},
-            None if reference.trajectory is None else seen_from(reference.trajectory),
-            setup.odometry.space,
-            reference.estimated,
-        )
     rows = _rows(judged, oracles)
     words = [*remarks(rows), *_equal_cost(model, modes), *compared.words(study)]
     words += _missing_repeats(judged, study.config.online.repeats)
     words += _without_oracle(judged, oracles) if model is not None else []
-    if write:
-        folder = study.folder / "comparison"
-        report.write_rows(folder, "comparison", [row.columns() for row in rows])
-        made = tables(rows, study.config.sub_trajectory)
-        report.write_tables(folder, study.name, made, words)
+    folder = study.folder / "comparison"
+    report.write_rows(folder, "comparison", [row.columns() for row in rows])
+    report.write_tables(folder, study.name, tables(rows, study.config.sub_trajectory), words)
     return ComparedReplays(rows, words, compared.unfinished)
 
 
@@ -655,4 +642,4 @@ def _with_fixed_rivals(
         of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
         same |= dict.fromkeys(of_fixed, replays["fixed"])
     every = {**same, **replays}
-    return {mode: every[mode] for mode in LINES if mode in every}
+    return {mode: every[mode] for mode in MODES if mode in every}

@@ -15,7 +15,6 @@ from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.factory import Factory
 from adaptune.processes import together
 from adaptune.recording.scan import Scan, part_name
-from adaptune.report.paper import LINES
 from adaptune.selection import Selection
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets
@@ -33,6 +32,8 @@ from adaptune.study.study import (
 
 BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
 EVEN, UNTRAINED = "even", "untrained"
+MODES = (BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN, PAPER)
+"""All modes, in the order of tables and of lines that lie on each other."""
 WITHOUT_MODEL = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
 
@@ -169,13 +170,13 @@ class ReplaySetup:
         return ""
 
     def modes(self, model: ErrorModel) -> tuple[str, ...]:
-        """What is replayed with a model, in the order of `LINES`: what is possible of all modes.
+        """What is replayed with a model, in the order of `MODES`: what is possible of all modes.
 
         A rival that is the fixed set is not replayed again.
         """
         rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
         modes = {BASELINE, *rivals, FIXED, *self.rules, *self.also}
-        return tuple(name for name in LINES if name in modes and not self.obstacle(name, model))
+        return tuple(name for name in MODES if name in modes and not self.obstacle(name, model))
 
     def start(
         self, name: str, model: ErrorModel | None = None, sequence: str | None = None

@@ -17,11 +17,10 @@ from adaptune.geometry import invert
 from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages
 from adaptune.recording.scan import Recording
-from adaptune.report.paper import LINES
 from adaptune.selector import Schedule
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
-from online.modes import sequences_without_model
+from online.modes import MODES, sequences_without_model
 from online.record import (
     StoredReplay,
     StoredReplayError,
@@ -64,7 +63,7 @@ _TEXT = "std_msgs/msg/String"
 def replayed_modes(study: Study, name: str) -> list[str]:
     """The modes in which a sequence was replayed, in the order of their lines in pictures."""
     folder = study.folder / "replays" / name
-    return [mode for mode in LINES if (folder / mode / "replay.json").exists()]
+    return [mode for mode in MODES if (folder / mode / "replay.json").exists()]
 
 
 def replayed_sequences(study: Study, wanted: Sequence[str] = ()) -> list[str]:

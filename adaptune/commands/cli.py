@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from adaptune.commands import offline, online, reference, report, tools
+from adaptune.commands import offline, online, reference, tools
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -28,8 +28,7 @@ app = typer.Typer(
         "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
         "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
         "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
-        "    adaptune compare  configs/demo.yaml    # baseline, fixed and adaptive\n\n"
-        "    adaptune report   configs/demo.yaml    # all of it as a page to look at\n\n"
+        "    adaptune compare  configs/demo.yaml    # what adapting gained; a page\n\n"
         "    adaptune record   configs/demo.yaml    # replays to look at in Foxglove or Rerun"
     ),
 )
@@ -39,7 +38,7 @@ for _command in (
     *(offline.simulate, reference.reference),
     *(offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
-    *(report.report, tools.import_rustle),
+    tools.import_rustle,
 ):
     app.command()(_command)
 
@@ -69,7 +68,7 @@ def _main(
         datefmt="[%X]",
         handlers=[RichHandler(console=errors, show_path=False, show_level=False, **plain)],
     )
-    for chatty in ("matplotlib", "numba", "asyncio"):
+    for chatty in ("numba", "asyncio"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from adaptune.report.paper import plain
+from adaptune.report.drawing import plain
 from adaptune.selection import Selection
 from online.replay import ReplayRecord
 

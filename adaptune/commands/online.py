@@ -2,8 +2,10 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +26,8 @@ from adaptune.commands.terminal import (
 from adaptune.errors import AdaptuneError
 
 if TYPE_CHECKING:
+    from adaptune.report.charts import Charts
+    from adaptune.report.page import PageSection
     from offline.config import OfflineStudy
     from online.compare import ComparedReplays
     from online.statistics import ComparisonRow
@@ -229,15 +233,16 @@ def compare(
         typer.Option(help="Of several studies, where their tables go.", file_okay=False),
     ] = None,
 ) -> None:
-    """Compare the replays: what adapting gained, in words, tables and pictures.
+    """Compare the replays: what adapting gained, in words, tables and a page of charts.
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
     1, adapting is better. Intervals come from a paired block bootstrap. With six test sequences or
     more, they speak of other sequences like these, else of these alone. Where an estimated
     reference judged, they include its own error.
 
-    The study's folder receives CSV, JSON, Markdown, LaTeX, and a picture of every sequence. With
-    several studies, their errors also stand side by side.
+    The study's folder receives CSV, JSON, Markdown, LaTeX, and a page (HTML) of all that is known
+    of the study, also of one that is not finished. It opens without a network, and its charts lie
+    beside it as PNG and SVG. With several studies, their errors also stand side by side.
     """
     if len(studies) == 1:
         if to is not None:
@@ -255,7 +260,7 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
 
     loaded = load(study, override, folder)
     found = _compared(loaded)
-    say(f"Tables and pictures: {loaded.folder / 'comparison'}/")
+    say(f"Tables: {loaded.folder / 'comparison'}/")
     if found.rows[0].yardstick == "baseline":
         say_next_of_study("look for better sets", "offline", study, override, folder)
         return
@@ -272,23 +277,150 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
         why = "find out what adapting gains elsewhere"
         say_next_of_study(why, "offline", study, override, folder, first)
     else:
-        say_next_of_study("all of it as a page to look at", "report", study, override, folder)
+        say_next_of_study("replays to look at in Foxglove", "record", study, override, folder)
 
 
 def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
-    """Compare a study's replays, and print words and tables."""
+    """Compare a study's replays, print words and tables, and write the page."""
     from adaptune.report import tables as report
     from online.compare import compare as compare_replays
     from online.tables import tables
 
     loaded.check()
     begin_work()
-    found = compare_replays(loaded)
+    try:
+        found = compare_replays(loaded)
+    except AdaptuneError as error:
+        # A study that still runs has a page, too.
+        if (loaded.folder / "study.yaml").exists():
+            _write_page(loaded, f"No comparison: {error}.")
+        raise
     for said in found.words:
         say(said)
     for made in tables(found.rows, loaded.config.sub_trajectory):
         console.print(*report.tables_within(made, console.width), sep="\n")
+    _write_page(loaded, found)
     return found
+
+
+# The page of a study.
+
+
+_BEST = 50
+"""Trials of the page's table: the best ones."""
+_NEEDED = ("adaptune.report.page", "offline.charts", "online.charts")
+"""What the processes that make the sections import."""
+
+
+def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
+    """Write all that is known of a study as one page.
+
+    Parameters
+    ----------
+    study
+        Finished, or as far as it is.
+    found
+        The comparison, or why there is none.
+    """
+    from adaptune.processes import processes
+    from adaptune.report.page import Page, write_page
+    from online.modes import sequences_without_model
+
+    config = study.config
+    # Without a test, some may have been replayed without a model.
+    others = sequences_without_model(config)
+    replayed = [name for name in others if (study.folder / "replays" / name).exists()]
+    makers = [partial(_along, study, name) for name in config.test or replayed]
+    makers += [partial(make, study) for make in (_search, _validation, _settings)]
+    with progress() as show, processes(len(makers), _NEEDED) as pool:
+        sections = [_comparison(study, found)]
+        for section in pool.map(_called, makers):
+            sections.append(section)
+            show("page", len(sections) - 1, len(makers))
+    subtitle = (
+        f"{', '.join(config.odometries)}: trained on {len(config.training)} sequences, tested on "
+        f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
+    )
+    words = () if isinstance(found, str) else tuple(found.words)
+    path = study.folder / "report" / "report.html"
+    write_page(path, Page(study.name, subtitle, words, tuple(sections)))
+    say(f"Page: {path}; its charts as PNG and SVG: {path.parent}/figures/")
+
+
+def _called(make: "Callable[[], PageSection]") -> "PageSection":
+    return make()
+
+
+def _comparison(study: "OfflineStudy", found: "ComparedReplays | str") -> "PageSection":
+    from adaptune.report.page import PageSection
+    from online.charts import charts_of_comparison
+    from online.tables import modes_in_words, tables
+
+    title = "What adapting gained"
+    if isinstance(found, str):
+        return PageSection(title, missing=(found,))
+    charts, notes = charts_of_comparison(found.rows)
+    made = [*tables(found.rows, study.config.sub_trajectory), modes_in_words(found.rows)]
+    return PageSection(title, (), tuple(notes), tuple(charts), tuple(made))
+
+
+def _along(study: "OfflineStudy", sequence: str) -> "PageSection":
+    """The section of a test sequence."""
+    from online.charts import charts_of_replays
+
+    return _of_charts(f"Along {sequence}", partial(charts_of_replays, study, sequence))
+
+
+def _search(study: "OfflineStudy") -> "PageSection":
+    from adaptune import archive
+    from adaptune.archive import Archive
+    from adaptune.report.tables import Listing
+    from offline.charts import charts_of_trials
+
+    section = _of_charts("What was tried", partial(charts_of_trials, study))
+    try:
+        finished = archive.rows(Archive(study.folder / "trials"), study.training)
+    except AdaptuneError as error:
+        return replace(section, missing=(*section.missing, f"{error}."))
+    if not finished:
+        return section
+    best = archive.select([row for row in finished if row["mean"] is not None], [], "mean", _BEST)
+    title = f"The best {len(best)} of {len(finished)} trials, in training"
+    listed = archive.with_units(best, study.training, study.odometry.space.labels)
+    return replace(section, tables=(Listing(title, listed),))
+
+
+def _validation(study: "OfflineStudy") -> "PageSection":
+    from offline.charts import charts_of_validation
+
+    return _of_charts("With recordings left out", partial(charts_of_validation, study))
+
+
+def _settings(study: "OfflineStudy") -> "PageSection":
+    """The study's settings, a row each."""
+    from adaptune.report.page import PageSection
+    from adaptune.report.tables import Listing
+
+    def leaves(value: object, key: str) -> Iterator[tuple[str, object]]:
+        if isinstance(value, dict) and value:
+            for name, inner in value.items():
+                yield from leaves(inner, f"{key}.{name}" if key else str(name))
+        elif value is not None:
+            yield key, value
+
+    rows = [{"key": key, "value": str(v)} for key, v in leaves(study.config.resolved(), "")]
+    return PageSection("Settings", tables=(Listing("The study's YAML, with its defaults", rows),))
+
+
+def _of_charts(title: str, make: "Callable[[], Charts]") -> "PageSection":
+    """A section of charts; an error is told in their place."""
+    from adaptune.report.page import PageSection
+
+    try:
+        charts, notes = make()
+    except AdaptuneError as error:
+        return PageSection(title, missing=(f"{error}.",))
+    return PageSection(title, missing=tuple(notes), charts=tuple(charts))
 
 
 def _compare_several(studies: list[Path], override: list[str], to: Path | None) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from adaptune.metrics import KittiError
-from adaptune.report.paper import LINES
+from online.modes import MODES
 from online.statistics import ALL, ORACLES, ComparisonRow, StandardErrors
 from online.tables import modes_in_words, side_by_side, tables
 
@@ -64,9 +64,9 @@ def test_references_are_told_where_they_differ():
 
 
 def test_every_mode_that_may_be_shown_is_put_in_words():
-    shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*LINES, *ORACLES)]
+    shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*MODES, *ORACLES)]
     made = modes_in_words(shown)
-    assert [row["mode"] for row in made.rows] == [*LINES, *ORACLES]
+    assert [row["mode"] for row in made.rows] == [*MODES, *ORACLES]
 
 
 def test_oracles_are_among_the_modes_only():

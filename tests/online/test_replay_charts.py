@@ -1,14 +1,34 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
+from made_replays import SCENES, SECONDS, XY, bank, kept, replay, sequence
 
 from adaptune.report.charts import Band, Line, Points, Shares, Spans
 from offline.config import load_study
-from online.charts import charts_of_replays, choice_chart, error_chart, map_chart, switches
+from online.charts import (
+    charts_of_replays,
+    choice_chart,
+    error_chart,
+    map_chart,
+    path_chart,
+    switches,
+)
 
 
 def of_kind(panel, kind):
     return [d for d in panel.drawn if isinstance(d, kind)]
+
+
+def test_trajectories_stay_near_the_reference():
+    lost = replay(xy=1e6 * XY, restarted=np.arange(len(SECONDS)) == 50)
+    replayed = replace(sequence(fixed=kept(), paper=lost), reference=XY)
+    (panel,) = path_chart(replayed).panels
+    assert [line.name for line in of_kind(panel, Line)] == ["fixed", "paper"]
+    named = [points.name for points in of_kind(panel, Points)]
+    assert named == ["reference", "restarted by the health check", "start"]
+    assert panel.equal
+    assert panel.x.limits[1] - panel.x.limits[0] < 5.0 * np.ptp(XY[:, 0])
 
 
 def test_errors_of_all_modes_are_drawn_with_their_switches():
@@ -24,9 +44,9 @@ def test_errors_of_all_modes_are_drawn_with_their_switches():
 
 def test_only_changes_are_switches():
     nan = {"distance": [0.7, 0.7, 0.9], "resolution": [np.nan, np.nan, np.nan]}
-    np.testing.assert_array_equal(switches(replay(choices=nan).track), [9.0])
-    assert not len(switches(kept().track))
-    assert not len(switches(bank().track))
+    np.testing.assert_array_equal(switches(replay(choices=nan)), [9.0])
+    assert not len(switches(kept()))
+    assert not len(switches(bank()))
 
 
 def test_restarts_are_marked():

@@ -33,7 +33,7 @@ def test_replays_are_read_with_what_was_measured(study):
     assert list(replayed.modes) == ["baseline", "fixed", "adaptive", "paper"]
     assert replayed.scenes is None
     for mode, of in replayed.modes.items():
-        n, m = len(of.track.seconds), len(of.track.choice_seconds)
+        n, m = len(of.seconds), len(of.choice_seconds)
         assert of.places.shape == (n, 2)
         assert of.scan_ms.shape == (n,)
         assert of.familiarity.shape == (m,)
@@ -41,7 +41,7 @@ def test_replays_are_read_with_what_was_measured(study):
         assert of.adapts == (mode in ("adaptive", "paper"))
         # The reference goes straight on; the odometry nearly so.
         assert abs(of.places[:, 1]).max() < 1e-6
-        np.testing.assert_allclose(of.places, of.track.xy, atol=0.5)
+        np.testing.assert_allclose(of.places, of.xy, atol=0.5)
         assert (np.diff(of.selection_at()) >= 0).all()
         assert of.selection_at()[-1] == m - 1
     with (study.folder / "replays/three/paper/selections.csv").open() as file:

@@ -9,7 +9,7 @@ from online.charts import familiarity_chart, histograms, latency_chart, period_r
 def test_ratios_are_of_the_same_stretches_of_time():
     errors = np.where(SECONDS < 8.0, 2.0, np.where(SECONDS < 9.0, 3.0, 1.0))
     fixed = kept()
-    fixed = fixed._replace(track=fixed.track._replace(errors=np.full(len(SECONDS), 2.0)))
+    fixed = fixed._replace(errors=np.full(len(SECONDS), 2.0))
     mode = replay(errors=errors)
     np.testing.assert_allclose(period_ratios(mode, fixed), [1.0, 1.5, 0.5])
     # Where one is unknown, so is the ratio.

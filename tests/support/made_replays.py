@@ -5,7 +5,6 @@ import numpy as np
 from adaptune.report.charts import Spans
 from adaptune.space import Categorical, Float, ParameterSpace
 from online.charts import ModeReplay, ReplayedSequence
-from online.replay_picture import Track
 
 SECONDS = np.arange(0.0, 20.0, 0.1)
 XY = np.column_stack([SECONDS, np.sin(SECONDS)])
@@ -13,8 +12,9 @@ SCENES = Spans([0.0, 8.0, 20.0], ("cave", "open"))
 
 
 def replay(**changed):
-    """A replay of 20 s that changes its parameters twice; `changed` is of its track."""
-    track = Track(
+    """A replay of 20 s that changes its parameters twice."""
+    n = len(SECONDS)
+    made = ModeReplay(
         seconds=SECONDS,
         xy=XY,
         errors=np.where(SECONDS < 15.0, 0.7 + 0.1 * np.sin(SECONDS), np.nan),
@@ -25,18 +25,21 @@ def replay(**changed):
         weights={},
         estimated=np.full((3, 3), np.nan),
         lost=np.zeros(3, bool),
+        places=XY,
+        familiarity=np.full(3, np.nan),
+        selection_ms=np.full(3, 5.0),
+        scan_ms=np.linspace(1.0, 9.0, n),
+        late_ms=np.empty(0),
     )
-    track = track._replace(**changed)
-    m, n = len(track.choice_seconds), len(SECONDS)
-    ms = np.linspace(1.0, 9.0, n)
-    return ModeReplay(track, XY, np.full(m, np.nan), np.full(m, 5.0), ms, np.empty(0))
+    return made._replace(**changed)
 
 
 def kept():
     """A replay that keeps its parameters."""
     fixed = {"distance": [0.7], "kernel": ["none"]}
     one = {"choice_seconds": np.zeros(1), "choices": fixed, "lost": np.zeros(1, bool)}
-    return replay(**one, estimated=np.full((1, 3), np.nan))
+    unknown = np.full((1, 3), np.nan)
+    return replay(**one, estimated=unknown, familiarity=unknown[:, 0], selection_ms=np.full(1, 5.0))
 
 
 def bank(**changed):

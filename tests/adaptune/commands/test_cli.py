@@ -69,7 +69,7 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
         assert (command == "online") != ("Fixed set: my study[v2]/fixed.yaml" in done.stdout)
     assert "one_60-100" in done.stdout
     assert "# try 64 sets; 6 training recordings tell of other recordings" in done.stdout
-    assert (tmp_path / "my study[v2]/comparison/one_60-100.png").exists()
+    assert (tmp_path / "my study[v2]/report/figures/one_60-100-paths.png").exists()
 
 
 def test_what_inspect_prints_with_a_picture_is_a_study(study_file, tmp_path):
@@ -189,9 +189,9 @@ def test_the_whole_way(study_file, tmp_path):
         assert mode in done.stdout
     assert all(name in done.stdout for name in ("APE [m]", "RPE [m]"))
     assert done.stdout.startswith("Whether adapting gains is not known, on three: `adaptive` has ")
-    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Tables and pictures")]
+    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Page: ")]
     assert max(map(len, table.splitlines())) <= 80
-    assert (tmp_path / "runs/small/comparison/three.svg").exists()
+    assert (tmp_path / "runs/small/report/figures/three-errors.svg").exists()
 
 
 @pytest.mark.parametrize(

@@ -17,22 +17,18 @@ def finished(study_file, trained_folder, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_finished_study_has_a_page_of_everything(finished):
-    ended = call("report", finished)
+    ended = call("compare", finished)
     assert ended.exit_code == 0
+    assert "report/report.html" in "".join(ended.output.split())
     page = (finished / "report/report.html").read_text()
     for title in ("What adapting gained", "Along three", "What was tried", "Settings"):
         assert f"{title}</h2>" in page
-    # The first words are those of the comparison.
-    said = ended.output.splitlines()[0]
-    assert "`adaptive`" in said
-    assert "Not in it: No validation: run `adaptune validate`." in ended.output
+    assert "No validation: run <code>adaptune validate</code>." in page
     figures = {path.stem for path in (finished / "report/figures").glob("*.svg")}
-    assert {"comparison", "three-errors"} <= figures
+    assert {"comparison", "three-errors", "three-paths"} <= figures
     assert figures == {path.stem for path in (finished / "report/figures").glob("*.png")}
     for mode in ("baseline", "fixed", "adaptive", "paper"):
         assert f">{mode}</td>" in page
-    # The files of the comparison are those of `adaptune compare`.
-    assert not (finished / "comparison").exists()
 
 
 @pytest.mark.slow
@@ -40,28 +36,15 @@ def test_a_study_that_is_not_finished_has_one_too_that_says_what_is_missing(fini
     folder = shutil.copytree(finished, tmp_path / "half")
     shutil.rmtree(folder / "replays/three/fixed")
     (folder / "model.safetensors").unlink()
-    ended = call("report", folder)
-    assert ended.exit_code == 0
-    assert "There is no error model yet: `adaptune offline` has not finished." in ended.output
-    assert "Not in it: No comparison: " in ended.output
-    assert "What was tried</h2>" in (folder / "report/report.html").read_text()
+    assert call("compare", folder).exit_code == 2
+    page = (folder / "report/report.html").read_text()
+    assert "No comparison: " in page
+    assert "What was tried</h2>" in page
 
 
-@pytest.mark.slow
-def test_without_a_test_no_replays_are_missed(study_file, trained_folder, tmp_path):
-    folder = shutil.copytree(trained_folder, tmp_path / "study")
-    ended = call("report", study_file, "--folder", folder, "-o", "test=[]")
-    assert ended.exit_code == 0
-    assert "No comparison: test: name at least one sequence" in ended.output
-    assert "No replays of" not in ended.output
-
-
-def test_a_study_that_has_not_begun_has_nothing_to_report(study_file, tmp_path):
-    ended = call("report", study_file, "--folder", tmp_path / "none")
+def test_a_study_that_has_not_begun_has_nothing_to_compare(study_file, tmp_path):
+    ended = call("compare", study_file, "--folder", tmp_path / "none")
     assert ended.exit_code == 2
-    words = " ".join(ended.output.split())
-    assert "there is nothing yet; run `adaptune offline" in words
-    assert "Traceback" not in ended.output
     assert not (tmp_path / "none").exists()
 
 
