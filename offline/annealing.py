@@ -40,26 +40,14 @@ _Trial = tuple[int, dict[str, Any], float]
 
 
 class Chain:
-    """One chain of annealing.
-
-    Attributes
-    ----------
-    params : dict or None
-        The set that it steps from; None before its first trial.
-    energy, best : float
-        Error of that set, and the least error so far.
-    temperature : float
-    unaccepted, no_best : int
-        Steps since the last acceptance, and since the best trial.
-    reanneals : int
-        How often it was heated again.
-    """
+    """One chain of annealing."""
 
     def __init__(self, settings: AnnealingSettings):
         self.settings = settings
-        self.params: dict[str, Any] | None = None
-        self.energy = self.best = math.inf
+        self.params: dict[str, Any] | None = None  # it steps from; None before its first trial
+        self.energy = self.best = math.inf  # error of that set, and the least error so far
         self.temperature = settings.initial_temperature
+        # Steps since the last acceptance, and since the best trial; how often it was heated.
         self.unaccepted = self.no_best = self.reanneals = 0
         # Steps since the chain was last heated, for each of the three triggers.
         self._fixed = self._unaccepted = self._no_best = 0

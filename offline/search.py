@@ -199,20 +199,6 @@ class Search:
     Each search has a slot of trial numbers, see `adaptune.archive.OF_SLOT`; all of them share trial
     0, the baseline. So numbers depend neither on a budget nor on the other searches. A number keeps
     its set: one that ran on any sequence is not proposed anew where others are added.
-
-    Attributes
-    ----------
-    sequences : list of str
-    verdicts : list of Verdict
-        Verdicts of the trials of all batches that are closed.
-    best : int
-        Index of the best of them.
-    numbers : list of int
-        Trial numbers of the present batch.
-    order : list of str
-        The sequences in the order in which they are run.
-    end : str, optional
-        Why the search has ended.
     """
 
     def __init__(
@@ -225,12 +211,12 @@ class Search:
         slot: int = 0,
     ):
         self.sequences = list(sequences)
-        self.verdicts: list[Verdict] = []
+        self.verdicts: list[Verdict] = []  # of the trials of all batches that are closed
         self._closed: list[int] = []  # trial numbers of the verdicts
-        self.best = 0
-        self.numbers: list[int] = []
-        self.order = self.sequences
-        self.end: str | None = None
+        self.best = 0  # index of the best of them
+        self.numbers: list[int] = []  # trial numbers of the present batch
+        self.order = self.sequences  # in which they are run
+        self.end: str | None = None  # why the search has ended
         self.make_sampler, self._config = sampler, config
         self._limit = max_trials(config)
         self._finished = finished

@@ -173,81 +173,41 @@ class _Header(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """Everything that selection needs to know about a study.
+    """Everything that selection needs to know about a study."""
 
-    Attributes
-    ----------
-    odometry : dict
-        Name and settings of the odometry.
-    sets : ParameterSets
-        The parameter sets, by the numbers of their trials.
-    fixed : int
-        Trial number of the set that is best over all training sequences.
-    length : float
-        Metres of a sub-trajectory.
-    sequences : list of str
-        Names of the training sequences.
-    blocks : dict
-        By name, in order, the number of features of each descriptor.
-    window : int
-        Number of descriptors that are averaged: a selection's and those of the selections before.
-    descriptors : ndarray of shape (n_frames, n_features)
-        float32, averaged.
-    sequence : ndarray of shape (n_frames,)
-        Number of each frame's sequence.
-    errors : ndarray of shape (n_frames, n_sets)
-        float32 percent, infinite where the track was lost, NaN where the set was not run.
-    provenance : dict
-        Where the model comes from, for people.
-    stretch : ndarray of shape (n_frames,), optional
-        Number of each frame's stretch in its recording, the same in a view of it; by default each
-        recording is one stretch.
-    bank : list of int, optional
-        Trial numbers of its members, the fixed set's first; empty if there is no bank.
-    vectors : ndarray of shape (n_frames, len(bank), 3), optional
-        float32, their errors as vectors; see `TrainingData`.
-    elevations : list of float, optional
-        For each training sequence, degrees at which its scans' lowest points lie, see
-        `adaptune.model.descriptor.lowest_elevation`; empty if unknown.
-    paired : PairedSettings
-        Of the paired rule, chosen on the training sequences.
-    bank_settings : BankSettings
-        Of the bank's weights, chosen on the training sequences.
-    expected : dict
-        By name of a way to adapt (`BANK`, `ONE_SET`) what was expected of it when it was chosen,
-        see `offline.expected_loss.Figures`; empty where too little is known to compare.
-    validation : dict
-        By selection rule what `adaptune validate` found, for people; empty before.
-    budget : float, optional
-        Milliseconds of CPU time a scan that may be spent, live evidence included.
-    rivals : dict
-        By name, trial numbers of what could be driven instead, see `offline.rivals`.
-    costs : Costs, optional
-        What the sets cost; None if it was not measured.
-    """
-
-    odometry: dict[str, Any]
-    sets: ParameterSets
-    fixed: int
-    length: float
-    sequences: list[str]
-    blocks: dict[str, int]
+    odometry: dict[str, Any]  # its name and settings
+    sets: ParameterSets  # by the numbers of their trials
+    fixed: int  # trial number of the set that is best over all training sequences
+    length: float  # metres of a sub-trajectory
+    sequences: list[str]  # names of the training sequences
+    blocks: dict[str, int]  # by name, in order, the number of features of each descriptor
+    # Number of descriptors that are averaged: a selection's and those of the selections before.
     window: int
-    descriptors: NDArray[np.float32]
-    sequence: NDArray[np.intp]
+    descriptors: NDArray[np.float32]  # (n_frames, n_features): averaged
+    sequence: NDArray[np.intp]  # (n_frames,): number of each frame's sequence
+    # (n_frames, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
-    provenance: dict[str, Any]
+    provenance: dict[str, Any]  # where the model comes from, for people
+    # (n_frames,): number of each frame's stretch in its recording, the same in a view of it; by
+    # default each recording is one stretch.
     stretch: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
-    bank: list[int] = field(default_factory=list)
+    bank: list[int] = field(default_factory=list)  # its members' trials, the fixed set's first
+    # (n_frames, len(bank), 3): their errors as vectors, see `TrainingData`.
     vectors: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
+    # For each training sequence, degrees at which its scans' lowest points lie, see
+    # `adaptune.model.descriptor.lowest_elevation`; empty if unknown.
     elevations: list[float] = field(default_factory=list)
+    # Both are chosen on the training sequences.
     paired: PairedSettings = field(default_factory=PairedSettings)
     bank_settings: BankSettings = field(default_factory=BankSettings)
+    # By way to adapt (`BANK`, `ONE_SET`) what was expected of it when it was chosen, see
+    # `offline.tuning.Figures`; empty where too little is known to compare.
     expected: dict[str, dict[str, float]] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)
-    budget: float | None = None
+    validation: dict[str, Any] = field(default_factory=dict)  # by rule, what `validate` found
+    budget: float | None = None  # milliseconds of CPU time a scan, live evidence included
+    # By name, trial numbers of what could be driven instead, see `offline.tuning.rivals`.
     rivals: dict[str, int] = field(default_factory=dict)
-    costs: Costs | None = None
+    costs: Costs | None = None  # what the sets cost; None if it was not measured
 
     def __post_init__(self) -> None:
         if not len(self.stretch):

@@ -160,18 +160,10 @@ class SetCost(NamedTuple):
 
 @dataclass(frozen=True)
 class Costs:
-    """What sets cost, as it was measured in the trials.
+    """What sets cost, as it was measured in the trials."""
 
-    Attributes
-    ----------
-    sets : dict
-        By trial number, its `SetCost`.
-    evidence : float
-        Milliseconds of CPU time a scan that live evidence takes.
-    """
-
-    sets: Mapping[int, SetCost]
-    evidence: float
+    sets: Mapping[int, SetCost]  # by trial number
+    evidence: float  # milliseconds of CPU time a scan that live evidence takes
 
     def __contains__(self, trial: object) -> bool:
         return trial in self.sets
@@ -209,20 +201,11 @@ class Costs:
 
 
 class Spending(NamedTuple):
-    """How a bank may spend a budget.
-
-    Attributes
-    ----------
-    costs : Costs
-    budget : float
-        Milliseconds of CPU time a scan, all members and live evidence together.
-    thrifty : bool
-        Whether the next member is the one that lowers the error most for its cost.
-    """
+    """How a bank may spend a budget."""
 
     costs: Costs
-    budget: float = np.inf
-    thrifty: bool = False
+    budget: float = np.inf  # milliseconds of CPU time a scan, with all members and live evidence
+    thrifty: bool = False  # whether the next member is the one that gains most for its cost
 
     def allows(self, members: Sequence[int]) -> bool:
         """Whether a bank of these trials stays within the budget; of unknown cost, none does."""
@@ -236,39 +219,25 @@ class Spending(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Errors of parameter sets on the frames of several sequences.
+    """Errors of parameter sets on the frames of several sequences."""
 
-    Attributes
-    ----------
-    features : ndarray of shape (n_frames, n_features)
-        Descriptors of the frames' scans, scaled.
-    sequence : ndarray of shape (n_frames,)
-        Number of each frame's sequence. Views of a sequence share its number, for they show the
-        same place.
-    errors : ndarray of shape (n_frames, n_sets)
-        Sub-trajectory RTE in percent: infinite where the track was lost, NaN where the set was not
-        run (usually on all frames of a sequence, or on none). Every frame has a sub-trajectory.
-    sets : ParameterSets
-        The columns of `errors`.
-    fixed : int
-        Trial number of the fixed set.
-    candidates : tuple of int, optional
-        Trial numbers of the sets to choose among, the fixed one included; the rule finds them if
-        None.
-    allowed : tuple of int, optional
-        Trial numbers of the sets that a budget allows, the fixed one included; all sets if None.
-    vectors : ndarray of shape (n_frames, n_candidates, 3), optional
-        Errors of the candidates as vectors in the frame of the sub-trajectory's start; not finite
-        where the track was lost. See `adaptune.metrics.sub_trajectory_vectors`.
-    """
-
-    features: NDArray[np.float64]
+    features: NDArray[np.float64]  # (n_frames, n_features): descriptors, scaled
+    # (n_frames,): number of each frame's sequence. Views of a sequence share its number, for they
+    # show the same place.
     sequence: NDArray[np.intp]
+    # (n_frames, n_sets): sub-trajectory RTE in percent, infinite where the track was lost, NaN
+    # where the set was not run (usually on all frames of a sequence, or on none). Every frame has a
+    # sub-trajectory.
     errors: NDArray[np.float32]
-    sets: ParameterSets
-    fixed: int
+    sets: ParameterSets  # the columns of `errors`
+    fixed: int  # trial number of the fixed set
+    # Trial numbers of the sets to choose among, the fixed one included; the rule finds them if
+    # None.
     candidates: tuple[int, ...] | None = None
+    # (n_frames, n_candidates, 3): errors of the candidates as vectors in the frame of the
+    # sub-trajectory's start, not finite where the track was lost; see `sub_trajectory_vectors`.
     vectors: NDArray[np.float32] | None = None
+    # Trial numbers of the sets that a budget allows, the fixed one included; all sets if None.
     allowed: tuple[int, ...] | None = None
 
     def allows(self) -> NDArray[np.bool_]:
@@ -339,15 +308,9 @@ def complementary(data: TrainingData, size: int, spending: Spending | None = Non
 
 
 class Rule(ABC):
-    """A way to choose a parameter set for a scan.
+    """A way to choose a parameter set for a scan."""
 
-    Attributes
-    ----------
-    gated : bool
-        Whether the fixed set is kept for scans of another sensor than in training; class
-        attribute.
-    """
-
+    # Whether the fixed set is kept for scans of another sensor than in training.
     gated: ClassVar[bool] = False
 
     @abstractmethod
