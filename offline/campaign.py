@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import MOST_FAULTS
 from adaptune.odometry.program import contradiction
 from adaptune.odometry.tracker import HealthCheck
+from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
@@ -20,14 +21,11 @@ from offline.search import Clock, Finished, Search, assess, make_searches, rungs
 from offline.storage import Mirror, MirrorRow
 from offline.workers import Pool, Task, TaskProgress, TaskResult, run
 
-Progress = Callable[[str, float, int, str], None]
-"""Called with what is being done, how much of it is done, how much there is, and a remark."""
-
 _log = logging.getLogger(__name__)
 
 
 def run_batches(
-    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = lambda *_: None
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = unseen
 ) -> dict[int, Verdict]:
     """Run all trials that are not in the archive yet, and judge all of them by trial number."""
     return _Campaign(study, archive, workers, progress).run()

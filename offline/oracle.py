@@ -11,6 +11,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.model.rules import TrainingData, complementary, mean_errors
+from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.study.inputs import (
     FILE,
@@ -21,7 +22,7 @@ from adaptune.study.inputs import (
     read_oracle,
 )
 from adaptune.study.references import ensure_references
-from offline.campaign import Progress, trial_tasks, watch_tasks
+from offline.campaign import trial_tasks, watch_tasks
 from offline.config import OfflineStudy
 from offline.train import trial_workers
 
@@ -31,7 +32,7 @@ _log = logging.getLogger(__name__)
 def run_oracle(
     study: OfflineStudy,
     n_sets: int = 16,
-    progress: Progress = lambda *_: None,
+    progress: Progress = unseen,
     cluster: str | None = None,
 ) -> list[dict[str, Any]]:
     """Run some of the model's sets as trials on the test sequences, unless that was done before.

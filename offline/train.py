@@ -17,6 +17,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel, ModelError
 from adaptune.processes import available
+from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
 from adaptune.report import tables
@@ -31,7 +32,6 @@ from adaptune.study.references import (
 )
 from adaptune.study.study import BANK, ONE_SET, expected_in_words
 from offline.campaign import (
-    Progress,
     WholeRuns,
     baseline_warning,
     mean_values,
@@ -132,7 +132,7 @@ class Training(NamedTuple):
 
 def train(
     study: OfflineStudy,
-    progress: Progress = lambda *_: None,
+    progress: Progress = unseen,
     cluster: str | None = None,
     again: bool = False,
 ) -> Training:
@@ -243,7 +243,7 @@ def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
                 f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
                 f"topic or file, or leave `reference` out to have it estimated"
             )
-    ensure_references(study, study.training, lambda what, i, n: progress(what, i, n, ""))
+    ensure_references(study, study.training, progress)
 
 
 def _sets_of(study: OfflineStudy, verdicts: Mapping[int, Verdict]) -> ParameterSets:
