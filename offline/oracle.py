@@ -1,12 +1,10 @@
 """Trials of a model's sets on the test sequences, to know the best choice in hindsight."""
 
 import logging
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
@@ -64,7 +62,11 @@ def run_oracle(
     described = study.config.descriptor
     without_frames = [name for name in names if not archive.has_frames(name, described)]
     if any(due.values()) or without_frames:
-        _run(study, archive, due, without_frames, model, progress, cluster)
+        missing = [(name, {n: model.sets[n] for n in trials}) for name, trials in due.items()]
+        with trial_workers(study, list(due), cluster) as workers:
+            at_once, one_by_one = len(workers.workers()), study.odometry.one_by_one
+            tasks = trial_tasks(missing, without_frames, at_once, one_by_one)
+            watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
     found = {name: read_oracle(study, name, model) for name in names}
     return [_row(name, errors) for name, errors in found.items() if errors is not None]
 
@@ -91,9 +93,7 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
 
 def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
     """The test sequences that have a reference, or get an estimated one."""
-    refused = ensure_references(
-        study, study.config.test, lambda what, i, n: progress(what, i, n, ""), required=False
-    )
+    refused = ensure_references(study, study.config.test, progress, required=False)
     for name, said in refused.items():
         _log.warning("%s; so %s is left out", said, name)
     recordings = study.sequences.recordings
@@ -123,22 +123,6 @@ def _remove_stale(study: OfflineStudy, name: str, model: ErrorModel) -> None:
     for number, summary in archive.finished(name).items():
         if number in model.sets and summary.parameters != model.sets[number]:
             archive.trial_path(name, number).unlink()
-
-
-def _run(
-    study: OfflineStudy,
-    archive: Archive,
-    due: dict[str, list[int]],
-    without_frames: Sequence[str],
-    model: ErrorModel,
-    progress: Progress,
-    cluster: str | None,
-) -> None:
-    with trial_workers(study, list(due), cluster) as workers:
-        missing = [(name, {n: model.sets[n] for n in numbers}) for name, numbers in due.items()]
-        n_workers, one_by_one = len(workers.workers()), study.odometry.one_by_one
-        tasks = trial_tasks(missing, without_frames, n_workers, one_by_one)
-        watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
 
 
 def _row(name: str, found: OracleErrors) -> dict[str, Any]:

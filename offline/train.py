@@ -80,9 +80,7 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     remark: str | None  # see `baseline_warning`
-    references: Sequence[str] = ()  # see `estimates_beside_intervals`
-    repeated: Sequence[str] = ()  # see `baseline_words`
-    changed: Sequence[str] = ()  # see `changes`
+    said: Sequence[str] = ()  # further sentences
 
     @property
     def words(self) -> list[str]:
@@ -94,12 +92,11 @@ class Training(NamedTuple):
         sets, n = self.model.sets, len(self.rows)
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
-        first = [*self.changed, *self.references, *self.doubts, *self.repeated]
         if self.fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [*first, f"{beaten}; the fixed set is the baseline.", baseline]
+            return [*self.said, f"{beaten}; the fixed set is the baseline.", baseline]
         return [
-            *first,
+            *self.said,
             f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[self.fixed])}{self._cost}",
             baseline,
@@ -113,21 +110,21 @@ class Training(NamedTuple):
         ms = np.nan if costs is None else costs.alone(self.fixed)
         return f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
 
-    @property
-    def doubts(self) -> list[str]:
-        """A sentence about references that are hardly more accurate than the best sets."""
-        coarse = [
-            f"{row['sequence']} ({row['_reference_error']:.2g} against {row['own best']:.2g} %)"
-            for row in self.rows
-            if (row["_reference_error"] or 0.0) > COARSE * row["own best"]
-        ]
-        if not coarse:
-            return []
-        return [
-            f"The estimated reference is hardly more accurate than the best set on "
-            f"{', '.join(coarse)}: it pulls ratios towards 1, and sets that differ by less cannot "
-            f"be told apart. A longer sub_trajectory may help."
-        ]
+
+def doubts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A sentence about references that are hardly more accurate than the best sets, if any are."""
+    coarse = [
+        f"{row['sequence']} ({row['_reference_error']:.2g} against {row['own best']:.2g} %)"
+        for row in rows
+        if (row["_reference_error"] or 0.0) > COARSE * row["own best"]
+    ]
+    if not coarse:
+        return []
+    return [
+        f"The estimated reference is hardly more accurate than the best set on "
+        f"{', '.join(coarse)}: it pulls ratios towards 1, and sets that differ by less cannot "
+        f"be told apart. A longer sub_trajectory may help."
+    ]
 
 
 def train(
@@ -147,49 +144,59 @@ def train(
     Raises
     ------
     AdaptuneError
-        If a sequence cannot be used, its reference cannot be estimated, the odometry fails with its
-        own parameters, no set keeps the limits, or stored trials depend on something that has
-        changed.
+        If a sequence, its reference or the odometry cannot be used, no set keeps the limits, or
+        stored trials depend on something that has changed.
     """
     _ensure_references(study, progress)
     resume(study, again)
     config = study.config.offline
-    if timed := sorted(config.metrics & set(TIMED)):
-        _log.warning(
-            "%s differ from run to run: the same study run again will not find the same sets",
-            " and ".join(timed),
-        )
+    if timed := " and ".join(sorted(config.metrics & set(TIMED))):
+        _log.warning("%s differ from run to run: another run will not find the same sets", timed)
     archive = Archive(study.folder / "trials", InputNotes(study))
     archive.tidy()
-    with trial_workers(study, study.training, cluster) as workers:
+    names, space = study.training, study.odometry.space
+    with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = run_batches(study, archive, workers, progress)
-        best = candidates(config, _affordable(study, archive, verdicts))
+        finished = {
+            name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
+            for name in names
+        }
+        every_set, affordable_ones = _sets_of(space, verdicts), verdicts
+        if (budget := study.config.online.budget) is not None:
+            costs = measured_costs(archive, finished, every_set, study.odometry)
+            affordable_ones = {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
+        best = candidates(config, affordable_ones)
         # Rivals may cost more.
-        rivals = {*candidates(config, verdicts), *_sets_of(study, verdicts).defaults}
+        rivals = {*candidates(config, verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
-        whole = run_whole(study.training, sets, study.config.health, archive, workers, progress)
+        whole = run_whole(names, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
-    before = _stored_model(study)
+    before = _stored_model(study.model_path)
     model = _fitted(study, archive, verdicts, fixed, before)
-    finished = _finished(study, archive, verdicts)
-    means = {name: _means(trials, verdicts) for name, trials in finished.items()}
     write_text(study.folder / "fixed.yaml", files.dump(verdicts[fixed].parameters))
-    table = _trial_rows(config, study.odometry.space, verdicts, finished)
+    table = _trial_rows(config, space, verdicts, finished)
     tables.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
-    rows = _training_rows(study, verdicts, finished, fixed, whole)
+    errors = {n: of.error(model.length) for n, of in estimates_of(study, finished).items()}
+    rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
     tables.write_rows(study.folder, "training", rows)
-    judged = estimates_beside_intervals(study, study.training)
-    spread = baseline_words(config, [trials[0] for trials in finished.values()])
-    changed = [] if before is None else changes(before, model)
-    return Training(model, means, fixed, rows, remark, judged, spread, changed)
+    said = [] if before is None else changes(before, model)
+    said += [*estimates_beside_intervals(study, names), *doubts(rows)]
+    said += baseline_words(config, [trials[0] for trials in finished.values()])
+    means = {name: _means(trials, verdicts) for name, trials in finished.items()}
+    return Training(model, means, fixed, rows, remark, said)
 
 
-def _stored_model(study: OfflineStudy) -> ErrorModel | None:
+def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:
+    """Mean errors of trials in percent, NaN of those that were not run."""
+    return [trials[n].mean_error if n in trials else np.nan for n in numbers]
+
+
+def _stored_model(path: Path) -> ErrorModel | None:
     try:
-        return ErrorModel.load(study.model_path)
+        return ErrorModel.load(path)
     except ModelError:
         return None
 
@@ -221,19 +228,6 @@ def _driven(model: ErrorModel) -> tuple[str, str]:
     return of[way], "no gain" if expected is None else expected_in_words(expected)
 
 
-def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:
-    """Mean errors of trials in percent, NaN of those that were not run."""
-    return [trials[n].mean_error if n in trials else np.nan for n in numbers]
-
-
-def _finished(study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]) -> Finished:
-    """The judged trials by training sequence and number."""
-    return {
-        name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
-        for name in study.training
-    }
-
-
 def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
     """Estimate what is lacking; refuse what is without, before any stored trial is removed."""
     for name in study.config.training:
@@ -246,22 +240,9 @@ def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
     ensure_references(study, study.training, progress)
 
 
-def _sets_of(study: OfflineStudy, verdicts: Mapping[int, Verdict]) -> ParameterSets:
-    parameters = tuple(verdict.parameters for verdict in verdicts.values())
-    return ParameterSets(study.odometry.space, tuple(verdicts), parameters)
-
-
-def _affordable(
-    study: OfflineStudy, archive: Archive, verdicts: Mapping[int, Verdict]
-) -> dict[int, Verdict]:
-    """The trials whose sets stay within the budget, if there is one."""
-    budget = study.config.online.budget
-    if budget is None:
-        return dict(verdicts)
-    names = study.training
-    run = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in names}
-    costs = measured_costs(archive, run, _sets_of(study, verdicts), study.odometry)
-    return {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
+def _sets_of(space: ParameterSpace, verdicts: Mapping[int, Verdict]) -> ParameterSets:
+    sets = tuple(verdict.parameters for verdict in verdicts.values())
+    return ParameterSets(space, tuple(verdicts), sets)
 
 
 def _fixed(
@@ -355,7 +336,7 @@ def _fit(
     from offline.labelled import labelled_data
 
     feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
-    sets = _sets_of(study, feasible)
+    sets = _sets_of(study.odometry.space, feasible)
     run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
     data = labelled_data(
         archive,
@@ -400,37 +381,34 @@ def _trial_rows(
 
 
 def _training_rows(
-    study: OfflineStudy,
+    config: OfflineConfig,
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
     whole: WholeRuns,
+    reference_errors: Mapping[str, float],
+    space: ParameterSpace,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence; its own best set is found as the fixed one is."""
-    rows, config, space = [], study.config.offline, study.odometry.space
-    judged = estimates_of(study, finished)
+    rows = []
     for name, runs in finished.items():
-        stored = judged.get(origin(name))
         best = best_by_trials(config, {n: judge(config, [run]) for n, run in runs.items()})
-        rows.append(
-            {
-                "sequence": name,
-                "baseline": runs[0].mean_error,
-                "fixed": runs[fixed].mean_error,
-                "own best": runs[best].mean_error,
-                "lost, baseline": runs[0].lost,
-                "lost, fixed": runs[fixed].lost,
-                "baseline, whole run": whole[name][0].mean_error,
-                "fixed, whole run": whole[name][fixed].mean_error,
-                "_own best trial": best,
-                "_reference": "given" if stored is None else "estimated",
-                "_reference_error": stored and stored.error(study.config.sub_trajectory),
-            }
-            | {
-                f"_own best {key}": value
-                for key, value in space.row(verdicts[best].parameters).items()
-            }
-        )
+        error = reference_errors.get(origin(name))
+        row = {
+            "sequence": name,
+            "baseline": runs[0].mean_error,
+            "fixed": runs[fixed].mean_error,
+            "own best": runs[best].mean_error,
+            "lost, baseline": runs[0].lost,
+            "lost, fixed": runs[fixed].lost,
+            "baseline, whole run": whole[name][0].mean_error,
+            "fixed, whole run": whole[name][fixed].mean_error,
+            "_own best trial": best,
+            "_reference": "given" if error is None else "estimated",
+            "_reference_error": error,
+        }
+        own = space.row(verdicts[best].parameters)
+        rows.append(row | {f"_own best {key}": value for key, value in own.items()})
     return rows
 
 
