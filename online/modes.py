@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-import numpy as np
-
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.weights import weighted_selection
@@ -220,16 +218,6 @@ class ReplaySetup:
             return about | {"model": digest, "switching": {"mechanism": "live"}}
         named = self.switching.model_dump(mode="json", include={"size", "sets"})
         return about | {"model": digest, "switching": switching | named}
-
-    def core_ms(self, mode: Mode, model: ErrorModel | None) -> float:
-        """Milliseconds that a scan keeps the busiest core at work; NaN if that was not measured."""
-        if mode.name == UNTRAINED or model is None or model.costs is None:
-            return np.nan
-        if mode.selector is None:
-            return model.costs.alone(mode.fixed)
-        if not mode.bank:
-            return max(model.costs.adaptive([trial]) for trial in model.sets)
-        return model.costs.adaptive(mode.sets) / min(len(mode.sets), self._cores)
 
     def model(self, study: Study, path: Path) -> ErrorModel:
         """Load an error model.

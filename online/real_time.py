@@ -295,29 +295,6 @@ def arrivals(
         imus, dropped = [], 0
 
 
-def outlook(stamps: Sequence[int], settings: RealTimeConfig, core_ms: float) -> str:
-    """Whether this machine can hold the rate, in words; nothing if that is not known.
-
-    Parameters
-    ----------
-    stamps
-        Nanoseconds, of the first scans.
-    settings
-        Rate and queue.
-    core_ms
-        Milliseconds that a scan keeps the busiest core at work.
-    """
-    if len(stamps) < 2 or not np.isfinite(core_ms):
-        return ""
-    interval = float(np.median(np.diff(stamps))) * 1e-6 / settings.rate
-    needs = f"a scan takes about {core_ms:.0f} ms, and there is one every {interval:.0f} ms"
-    if core_ms <= interval:
-        return f"{needs}: this machine holds the rate"
-    if not settings.queue:
-        return f"{needs}: the odometry will lag behind"
-    return f"{needs}: about {1.0 - interval / core_ms:.0%} of the scans will be dropped"
-
-
 def _read_ahead(scans: Iterable[Scan]) -> Iterator[Scan]:
     """Read in a thread; an error is raised here."""
     read: Queue[Scan | BaseException | None] = Queue(_AHEAD)
@@ -353,7 +330,6 @@ def replay_in_real_time(
     selector: SelectorProcess | None = None,
     watch: Watch = lambda _: None,
     what: str = "the replay",
-    core_ms: float = np.nan,
     clock: Clock = CLOCK,
 ) -> ReplayRecord:
     """Replay a recording at the sensor's rate.
@@ -370,8 +346,6 @@ def replay_in_real_time(
         Chooses the parameters; without one they stay. What is late is dropped.
     watch
         Called after every scan.
-    core_ms
-        Milliseconds that a scan keeps the busiest core at work, if they are known.
     clock
         That the sensor goes by.
 
@@ -380,12 +354,10 @@ def replay_in_real_time(
     AdaptuneError
         If there are no scans.
     """
-    source = _read_ahead(scans)
-    first = list(islice(source, _AHEAD // 2))
-    if said := outlook([scan.stamp for scan in first], settings, core_ms):
-        _log.info("%s: %s", what, said)
     record = ReplayRecord(settings.rate)
     drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
+    source = _read_ahead(scans)
+    first = list(islice(source, _AHEAD // 2))  # read before the first one is due
     for arrival in arrivals(chain(first, source), settings.rate, settings.queue, clock):
         drive.step(arrival)
         watch(record)

@@ -35,7 +35,7 @@ from adaptune.study.study import ModeError, Study
 from adaptune.trajectory import Trajectory, tum_lines
 from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
-from online.real_time import RealTimeDrive, SelectorProcess, outlook
+from online.real_time import RealTimeDrive, SelectorProcess
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
 from online.replay import Choice, Look, ReplayRecord
 
@@ -280,9 +280,6 @@ _EVERY = 10**9
 _PUBLISHED = 5.0
 """Seconds in which a topic that nobody has named must be published."""
 
-_FIRST = 10
-"""Scans from which the sensor's rate is known."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -419,13 +416,11 @@ class RobotDrive:
                 setattr(record, name, deque(maxlen=_KEPT))
             health = self._study.config.health
             drive = RealTimeDrive(odometry, health, self._settings, selector, record, "drive")
-            arrived: list[int] = []
             if self._stopped:
                 self._scans.stop()
             try:
                 for arrival in self._scans.arrivals():
                     publisher.step(drive.step(arrival), record)
-                    self._tell_of_rate(arrived, arrival.due)
                     look("drive", 0, record)
             except KeyboardInterrupt:
                 self._scans.stop()
@@ -440,14 +435,6 @@ class RobotDrive:
             if not goes_on:
                 raise
             _log.warning("the fixed set cannot be applied: %s", error)
-
-    def _tell_of_rate(self, arrived: list[int], due: float) -> None:
-        """Log whether this machine holds the sensor's rate, as soon as that is known."""
-        if len(arrived) < _FIRST:
-            arrived.append(round(due * 1e9))
-            core_ms = np.nan if self._steers else self._setup.core_ms(self._mode, self._model)
-            if len(arrived) == _FIRST and (said := outlook(arrived, self._settings, core_ms)):
-                _log.info("%s", said)
 
 
 class _Publisher:

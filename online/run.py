@@ -259,7 +259,6 @@ def _in_real_time(
             selector,
             watch,
             str(run),
-            modes.setup.core_ms(mode, modes.model),
         )
 
 

@@ -1,5 +1,4 @@
 import itertools
-import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.selection import Selection
 from adaptune.study.config import RealTimeConfig
-from online.real_time import Answer, arrivals, outlook, replay_in_real_time
+from online.real_time import Answer, arrivals, replay_in_real_time
 
 TENTH = 10**8
 """Nanoseconds between scans."""
@@ -201,33 +200,3 @@ def test_an_odometry_that_is_too_slow_drops_scans():
     result = run(Steady(0.03), 40, rate=10.0)  # one every 10 ms
     assert result.dropped == 25
     assert len(result.trajectory) == 40 - result.dropped
-
-
-@pytest.mark.parametrize(
-    ("ms", "queue", "said"),
-    [
-        (40.0, 1, "a scan takes about 40 ms, and there is one every 50 ms: this machine holds"),
-        (100.0, 1, "about 50% of the scans will be dropped"),
-        (100.0, 0, "the odometry will lag behind"),
-        (np.nan, 1, ""),
-    ],
-)
-def test_it_says_before_whether_the_machine_holds_the_rate(ms, queue, said):
-    stamps = [i * TENTH for i in (0, 1, 2, 5, 6)]
-    found = outlook(stamps, RealTimeConfig(rate=2.0, queue=queue), ms)
-    assert said in found
-    assert bool(said) == bool(found)
-    assert outlook(stamps[:1], RealTimeConfig(), 10.0) == ""
-
-
-def test_it_is_logged(caplog):
-    with caplog.at_level(logging.INFO):
-        replay_in_real_time(
-            scans(3),
-            InProcess(Steady()),
-            HEALTH,
-            RealTimeConfig(rate=10.0),
-            what="home",
-            core_ms=3.0,
-        )
-    assert "home: a scan takes about 3 ms" in caplog.text

@@ -1,18 +1,19 @@
 """Selectors for another process, which imports them."""
 
 import time
+from pathlib import Path
 
 from adaptune.errors import AdaptuneError
 from adaptune.selection import Selection
 
 
 class Noting:
-    """Selects with what it saw."""
+    """Selects with what it saw, once there is a file if one is named."""
 
     fixed = 0
 
-    def __init__(self, slow=0.0, fails=False):
-        self.slow, self.fails = slow, fails
+    def __init__(self, gate=None, fails=False):
+        self.gate, self.fails = gate, fails
         self.seen = []
 
     def reset(self):
@@ -22,7 +23,8 @@ class Noting:
         self.seen.append((scan, motions))
 
     def select(self):
-        time.sleep(self.slow)
+        while self.gate is not None and not Path(self.gate).exists():
+            time.sleep(0.01)
         if self.fails:
             raise RuntimeError("out of luck")
         scan, motions = self.seen[-1]
