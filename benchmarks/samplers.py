@@ -30,7 +30,8 @@ from scipy.stats import wilcoxon
 
 from adaptune import processes
 from adaptune.report import tables
-from adaptune.report.paper import OTHERS, as_png_and_svg, log_scale, picture
+from adaptune.report.charts import Axis, Band, Chart, Drawn, Line, Panel
+from adaptune.report.drawing import draw_chart
 from adaptune.simulation.record import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig, load_study
@@ -234,21 +235,19 @@ def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, A
 def thesis(folder: Path, png: Path, names: list[str]) -> None:
     """Print the table, and draw the curves."""
     console = Console(width=100)
-    with picture(as_png_and_svg(png), 10.0, 4.0) as figure:
-        axes = figure.subplots(1, len(names), squeeze=False)[0]
-        for axis, name in zip(axes, names, strict=True):
-            rows, curves = searches(folder, name)
-            console.print(tables.table(f"{name}, {THESIS_TRIALS} trials", rows))
-            for (sampler, curve), colour in zip(curves.items(), OTHERS, strict=False):
-                n = np.arange(curve.shape[1])
-                axis.plot(n, np.median(curve[..., 0], axis=0), label=sampler, color=colour)
-                low, high = curve[..., 0].min(axis=0), curve[..., 0].max(axis=0)
-                axis.fill_between(n, low, high, color=colour, alpha=0.15, lw=0)
-            axis.set_title(f"{name}: median and range over {len(THESIS_SEEDS)} seeds")
-            axis.set_xlabel("trial [-]")
-            axis.set_ylabel("best RTE over 10 m [%]")
-            log_scale(axis)
-            axis.legend()
+    panels = []
+    x, y = Axis("trial [-]"), Axis("best RTE over 10 m [%]", log=True)
+    for name in names:
+        rows, curves = searches(folder, name)
+        console.print(tables.table(f"{name}, {THESIS_TRIALS} trials", rows))
+        drawn: list[Drawn] = []
+        for sampler, curve in curves.items():
+            n, errors = np.arange(curve.shape[1]), curve[..., 0]
+            drawn.append(Band(n, errors.min(axis=0), errors.max(axis=0), sampler))
+            drawn.append(Line(n, np.median(errors, axis=0), sampler))
+        panels.append(Panel(x, y, tuple(drawn), name))
+    title = f"Median and range over {len(THESIS_SEEDS)} seeds"
+    draw_chart(png, Chart("samplers", title, tuple(panels), columns=2))
 
 
 if __name__ == "__main__":

@@ -37,7 +37,8 @@ from adaptune.model import (
     TrainingData,
 )
 from adaptune.model.knn import NearestNeighbours
-from adaptune.report.paper import POINTS, as_png_and_svg, log_scale, picture
+from adaptune.report.charts import Axis, Chart, Line, Panel
+from adaptune.report.drawing import draw_chart
 from adaptune.space import Float, ParameterSets, ParameterSpace
 from offline.tuning import BANK_FRAMES
 from offline.validate import BANK_SIZE
@@ -217,15 +218,10 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
             costs(rule.select, asked[:5])
             medians[name].append(float(np.median(costs(rule.select, asked)[1])))
         print(f"{n:8} frames: " + ", ".join(f"{k} {v[-1]:.3f} ms" for k, v in medians.items()))
-    with picture(as_png_and_svg(path), 6.0, 4.0) as figure:
-        axes = figure.subplots()
-        for name, of_rule in medians.items():
-            axes.plot(sizes, of_rule, label=name, **POINTS[name])
-        log_scale(axes, "x")
-        log_scale(axes)
-        axes.set_xlabel(f"training frames [-], {n_sequences} sequences, {n_sets} sets")
-        axes.set_ylabel("CPU time of a selection [ms]")
-        axes.legend()
+    x = Axis(f"training frames [-], {n_sequences} sequences, {n_sets} sets", log=True)
+    y = Axis("CPU time of a selection [ms]", log=True)
+    lines = tuple(Line(sizes, of_rule, name) for name, of_rule in medians.items())
+    draw_chart(path, Chart("selection", "Cost of a selection", (Panel(x, y, lines),)))
 
 
 def main(png: Path | None) -> None:

@@ -1,34 +1,578 @@
-"""The charts of a study's trials and of its validation, from its folder."""
+"""Charts of the offline stage: of trials, of Pareto fronts, and of what was left out."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adaptune.archive import OF_SLOT, Archive
+from adaptune import files
+from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.recording.scan import OF_VIEW
 from adaptune.report.charts import (
     Axis,
     Band,
+    Bars,
     Chart,
     Charts,
     Drawn,
     Line,
+    Mark,
     Panel,
+    Parameter,
     Points,
     charts_of,
+    on_axis,
+    parameter_axis,
 )
+from adaptune.space import ODOMETRY, Categorical, Integer, ParameterSet, ParameterSpace
 from adaptune.study.study import Study
-from offline import trial_charts
-from offline.config import OfflineStudy
-from offline.objective import sampler_results
+from offline.config import OfflineConfig, OfflineStudy
+from offline.objective import judge, label, pareto_front, sampler_results, weighted
 from offline.search import Search, assess, make_searches
-from offline.trial_charts import TrialTable, importance_chart, importances, read_trials
+from offline.storage import distribution
 from offline.tuning import figures
+
+# The finished trials of a study as columns, for charts.
+
+
+@dataclass(frozen=True, eq=False)
+class TrialTable:
+    """Trials, in the order of their numbers."""
+
+    space: ParameterSpace
+    numbers: NDArray[np.int64]  # (n,)
+    sets: Sequence[ParameterSet]
+    # By training sequence (n,): the first objective, NaN where a trial was not run.
+    by_sequence: Mapping[str, NDArray[np.float64]]
+    values: NDArray[np.float64]  # (n,): its mean over all sequences, NaN if not run on all
+    feasible: NDArray[np.bool_]  # (n,): whether the trial keeps all limits
+    costs: NDArray[np.float64]  # (n,): milliseconds of CPU time a scan, NaN if unknown
+    objective: str = "RTE [%]"  # name of the first objective, with its unit
+    fixed: int | None = None  # trial number of the fixed set, once it is chosen
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def column(self, name: str) -> list[Any]:
+        """Values of one of `space.parameters`; None where a set has none."""
+        return [self.space.flat(of_set).get(name) for of_set in self.sets]
+
+    def on(self, sequence: str) -> NDArray[np.float64]:
+        """First objective on a sequence, of shape (n,)."""
+        return self.by_sequence[sequence]
+
+    def some(self, kept: NDArray[np.bool_]) -> "TrialTable":
+        """The same of some of the trials."""
+        return replace(
+            self,
+            numbers=self.numbers[kept],
+            sets=[own for own, its in zip(self.sets, kept, strict=True) if its],
+            by_sequence={name: of[kept] for name, of in self.by_sequence.items()},
+            values=self.values[kept],
+            feasible=self.feasible[kept],
+            costs=self.costs[kept],
+        )
+
+    def shared(self) -> "TrialTable":
+        """The same of the trials whose sets all sequences share."""
+        return self.some(self.numbers < OF_SLOT)
+
+    def odometries(self) -> dict[str, "TrialTable"]:
+        """By the name of an odometry its trials; of the only one by no name."""
+        names = [str(of_set.get(ODOMETRY, "")) for of_set in self.sets]
+        return {name: self.some(np.array(names) == name) for name in dict.fromkeys(names)}
+
+
+def read_trials(study: OfflineStudy) -> TrialTable:
+    """Read the finished trials of a study on its training sequences; there may be none."""
+    archive = Archive(study.folder / "trials")
+    finished = {name: archive.finished(name) for name in study.training}
+    return trial_table(study.config.offline, study.odometry.space, finished, fixed_set(study))
+
+
+def trial_table(
+    config: OfflineConfig,
+    space: ParameterSpace,
+    finished: Mapping[str, Mapping[int, Summary]],
+    fixed: ParameterSet | None = None,
+) -> TrialTable:
+    """Finished trials as columns.
+
+    Parameters
+    ----------
+    config
+        Its first objective and its limits count.
+    space
+        The parameters.
+    finished
+        By training sequence the finished trials by their numbers.
+    fixed
+        The fixed set, if it is chosen.
+    """
+    numbers = sorted({number for trials in finished.values() for number in trials})
+    n, objective = len(numbers), config.objective[0]
+    values, costs, feasible = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool)
+    by_sequence = {name: np.full(n, np.nan) for name in finished}
+    sets: list[ParameterSet] = []
+    for i, number in enumerate(numbers):
+        runs = {name: trials[number] for name, trials in finished.items() if number in trials}
+        verdict = judge(config, list(runs.values()))
+        sets.append(verdict.parameters)
+        costs[i] = np.mean([run.cost for run in runs.values()])
+        feasible[i] = verdict.feasible
+        for name, run in runs.items():
+            by_sequence[name][i] = weighted(objective, run.metrics)
+        if len(runs) == len(finished):
+            values[i] = verdict.values[0]
+    named = "RTE [%]" if objective == {"rte": 1.0} else label(objective, units=True)
+    chosen = next((k for k, own in zip(numbers, sets, strict=True) if own == fixed), None)
+    return TrialTable(
+        space, np.array(numbers, int), sets, by_sequence, values, feasible, costs, named, chosen
+    )
+
+
+def fixed_set(study: Study) -> ParameterSet | None:
+    """The fixed set that the offline stage has chosen; None before."""
+    path = study.folder / "fixed.yaml"
+    return files.Document.of_file(path).data if path.exists() else None
+
+
+BEST = 0.1
+"""Share of the trials that are the best."""
+_SPREAD = 20.0
+"""Largest over least value from which on an axis of a Pareto front is logarithmic."""
+FEW = 8
+"""With fewer trials, densities and importances mean nothing."""
+MOST_PANELS = 12
+"""Panels of a chart; further parameters and sequences are not shown."""
+_COLOURED = 4.0
+"""Colours say errors of up to so many times the least."""
+_BINS, _STEPS = 20, 120
+_WHOLE = 12
+"""A whole number of so many values at most has bars, and no density."""
+
+
+def best_tenth(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which trials are the tenth with the least values, at least one, of shape (n,).
+
+    Trials without a finite value are none of them.
+    """
+    known = np.isfinite(values)
+    n = max(1, round(BEST * int(known.sum()))) if known.any() else 0
+    chosen = np.zeros(len(values), bool)
+    chosen[np.argsort(np.where(known, values, np.inf), kind="stable")[:n]] = True
+    return chosen
+
+
+def density_chart(table: TrialTable) -> Chart | None:
+    """Density of each parameter over all trials, and over the best tenth."""
+    known = table.shared()
+    known = known.some(np.isfinite(known.values))
+    if len(known) < FEW:
+        return None
+    best = best_tenth(known.values)
+    groups = {"all trials": np.ones(len(known), bool), f"best tenth ({best.sum()})": best}
+    return Chart(
+        "parameter-density",
+        "Where the trials lie, and where the best of them",
+        tuple(_density_panels(known, groups, filled=True)),
+        "Density of each parameter over the trials, relative to trials that are spread evenly over "
+        "the range (1). Where the best tenth is much denser than all trials, values do well; where "
+        "it is flat, the parameter hardly matters.",
+        columns=min(2, len(known.space.parameters)),
+    )
+
+
+def density_by_group_chart(
+    table: TrialTable, groups: Mapping[str, Sequence[str]], kind: str = "sequence"
+) -> Chart | None:
+    """Density of each parameter over the best tenth of the trials in each group of sequences.
+
+    Parameters
+    ----------
+    table
+        The trials.
+    groups
+        By name, training sequences.
+    kind
+        What a group is, in a word.
+    """
+    chosen = {}
+    for name, sequences in groups.items():
+        values = np.mean([table.on(sequence) for sequence in sequences], axis=0)
+        if np.isfinite(values).sum() >= FEW:
+            chosen[name] = best_tenth(values)
+    panels = [p for p in _density_panels(table, chosen, filled=False) if p.drawn]
+    if len(chosen) < 2 or not panels:
+        return None
+    return Chart(
+        "parameter-density-by-group",
+        f"Where the best tenth of the trials lies, by {kind}",
+        tuple(panels),
+        f"As above, for the best tenth of the trials on each {kind}. Peaks that lie apart mean "
+        f"that no one set is best everywhere: this is what adapting can gain from.",
+        columns=min(2, len(panels)),
+    )
+
+
+def _density_panels(
+    table: TrialTable, groups: Mapping[str, NDArray[np.bool_]], filled: bool
+) -> Iterator[Panel]:
+    for name, parameter in list(table.space.parameters.items())[:MOST_PANELS]:
+        values = table.column(name)
+        there = np.array([value is not None for value in values], bool)
+        of_groups = {
+            group: [v for v, its in zip(values, kept & there, strict=True) if its]
+            for group, kept in groups.items()
+        }
+        x = parameter_axis(name, parameter)
+        if (marks := _bar_places(parameter)) is not None:
+            bars = tuple(_share_bars(of_groups, parameter, marks))
+            yield Panel(x, Axis("share of the trials [%]"), bars)
+        else:
+            drawn = tuple(_densities(of_groups, parameter, filled))
+            yield Panel(x, Axis("density, relative to even [-]"), drawn)
+
+
+def _bar_places(parameter: Parameter) -> NDArray[np.float64] | None:
+    """Where bars stand for the values of a parameter; None if it has too many."""
+    if isinstance(parameter, Categorical):
+        return np.arange(float(len(parameter.choices)))
+    if isinstance(parameter, Integer) and parameter.high - parameter.low < _WHOLE:
+        return np.arange(parameter.low, parameter.high + 1.0)
+    return None
+
+
+def _share_bars(
+    groups: Mapping[str, Sequence[Any]], parameter: Parameter, places: NDArray[np.float64]
+) -> Iterator[Bars]:
+    width = 0.8 / max(len(groups), 1)
+    for i, (name, values) in enumerate(groups.items()):
+        at = on_axis(values, parameter)
+        shares = 100.0 * (at[:, None] == places).sum(axis=0) / max(len(at), 1)
+        yield Bars(places + (i - 0.5 * (len(groups) - 1)) * width, shares, name, width=width)
+
+
+def _densities(
+    groups: Mapping[str, Sequence[Any]], parameter: Parameter, filled: bool
+) -> Iterator[Drawn]:
+    """Histograms and kernel densities, computed where the range is the unit interval."""
+    assert not isinstance(parameter, Categorical)
+
+    def placed(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        low, high = float(parameter.low), float(parameter.high)
+        return low * (high / low) ** unit if parameter.log else low + unit * (high - low)
+
+    for name, values in groups.items():
+        if not values:
+            continue
+        unit = np.array([parameter.to_unit(value) for value in values])
+        if filled:
+            counts, edges = np.histogram(unit, _BINS, (0.0, 1.0), density=True)
+            yield Band(
+                placed(np.repeat(edges, 2)[1:-1]),
+                np.zeros(2 * _BINS),
+                np.repeat(counts, 2),
+                name,
+            )
+        grid = np.linspace(0.0, 1.0, _STEPS)
+        if len(density := kernel_density(unit, grid)):
+            yield Line(placed(grid), density, name)
+
+
+def kernel_density(unit: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Density of points of the unit interval, at some of its points; empty if all are equal.
+
+    What lies near a bound is reflected at it: the density does not end before the range does.
+    """
+    from scipy.stats import gaussian_kde
+
+    if len(unit) < 2 or np.ptp(unit) < 1e-9:
+        return np.empty(0)
+    of_points = gaussian_kde(unit)
+    return np.asarray(of_points(at) + of_points(-at) + of_points(2.0 - at))
+
+
+def scatter_chart(
+    table: TrialTable, parameters: Sequence[str], sequences: Sequence[str]
+) -> Chart | None:
+    """Two parameters of all trials, coloured by the error: on each sequence, and in the mean.
+
+    Parameters
+    ----------
+    table
+        The trials.
+    parameters
+        The names of two.
+    sequences
+        Names of training sequences.
+    """
+    if len(parameters) != 2:
+        return None
+    x_axis, y_axis = (parameter_axis(name, table.space.parameters[name]) for name in parameters)
+    xy = [on_axis(table.column(name), table.space.parameters[name]) for name in parameters]
+    shown = list(sequences)[: MOST_PANELS - 1]
+    values = {name: table.on(name) for name in shown}
+    if len(sequences) > 1:
+        values["mean over all sequences"] = table.values
+    panels = []
+    for title, of in values.items():
+        kept = np.isfinite(of)
+        if kept.sum() < 2:
+            continue
+        x, y = xy[0][kept], xy[1][kept]
+        label = table.objective
+        log = bool((of[kept] > 0.0).all())
+        # The worst would take nearly all colours.
+        colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
+        drawn: list[Drawn] = [Points(x, y, "trial", colour, label, log_colour=log)]
+        best = int(of[kept].argmin())
+        drawn.append(Points(x[[best]], y[[best]], "best trial here", shape="diamond"))
+        drawn += _marked(table, xy[0], xy[1])
+        panels.append(Panel(x_axis, y_axis, tuple(drawn), title))
+    if not panels:
+        return None
+    left_out = len(sequences) - len(shown)
+    more = f" {left_out} more sequences are not shown." if left_out > 0 else ""
+    return Chart(
+        "parameter-scatter",
+        f"Error of the trials over {parameters[0]} and {parameters[1]}",
+        tuple(panels),
+        f"Each point is a trial; its colour is its error, and each panel has colours of its own; "
+        f"they end at {_COLOURED:g} times the least error there. "
+        "Where the good region lies elsewhere from panel to panel, adapting can gain." + more,
+        columns=min(3, len(panels)),
+    )
+
+
+def _marked(table: TrialTable, x: NDArray[Any], y: NDArray[Any]) -> list[Drawn]:
+    """The baseline and the fixed set, where they are known."""
+    numbers = {"baseline": 0, "fixed": table.fixed}
+    places = {mode: np.flatnonzero(table.numbers == n) for mode, n in numbers.items()}
+    return [Points(x[at], y[at], mode) for mode, at in places.items() if len(at)]
+
+
+def iteration_chart(table: TrialTable, reannealed: Mapping[int, Sequence[int]]) -> Chart | None:
+    """Error of each trial, and the least so far, over the trial's number: one panel a search.
+
+    Parameters
+    ----------
+    table
+        The trials.
+    reannealed
+        By the number of a search, 0 for that over all sequences, the numbers in it of the trials
+        after which annealing was heated again.
+    """
+    panels = []
+    slots = table.numbers // OF_SLOT
+    for slot in np.unique(slots).tolist()[:MOST_PANELS]:
+        values, title = table.values, ""
+        if slot:
+            # A search of its own is on one sequence.
+            of = max(table.by_sequence, key=lambda n: _n_known(table.on(n)[slots == slot]))
+            values, title = table.on(of), f"{of} alone"
+        kept = (slots == slot) & np.isfinite(values)
+        number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
+        if len(number) < 2:
+            continue
+        allowed = np.where(table.feasible[kept], errors, np.inf)
+        least = np.minimum.accumulate(allowed)
+        drawn: list[Drawn] = [
+            Points(number, errors, "trial", texts=[f"trial {n}" for n in table.numbers[kept]]),
+            Line(number, np.where(np.isfinite(least), least, np.nan), "best so far", steps=True),
+        ]
+        first = number == 0
+        drawn += [Points(number[first], errors[first], "baseline")] if first.any() else []
+        marks = [int(i) for i in reannealed.get(slot, ())]
+        drawn += [Mark(i, "" if k else "reannealing", "x") for k, i in enumerate(marks)]
+        log = bool((errors > 0.0).all())
+        panels.append(Panel(Axis("trial [-]"), Axis(table.objective, log), tuple(drawn), title))
+    if not panels:
+        return None
+    marked = " Dashed: where annealing was heated again." if any(reannealed.values()) else ""
+    return Chart(
+        "iterations",
+        "The search for parameters",
+        tuple(panels),
+        "Error of each trial in the order of the search, and the least so far of those within the "
+        f"limits. A flat end means that more trials promise little.{marked}",
+        columns=min(2, len(panels)),
+    )
+
+
+def _n_known(values: NDArray[np.float64]) -> int:
+    return int(np.isfinite(values).sum())
+
+
+def sensitivity_chart(table: TrialTable) -> Chart | None:
+    """Error of all trials over each parameter."""
+    table = table.shared()
+    table = table.some(np.isfinite(table.values))
+    panels = []
+    if len(table) < 2:
+        return None
+    for name, parameter in list(table.space.parameters.items())[:MOST_PANELS]:
+        x = on_axis(table.column(name), parameter)
+        at = int(table.values.argmin())
+        drawn = [
+            Points(x, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
+            *_marked(table, x, table.values),
+            Points(x[[at]], table.values[[at]], "best trial", shape="diamond"),
+        ]
+        y = Axis(table.objective, bool((table.values > 0.0).all()))
+        panels.append(Panel(parameter_axis(name, parameter), y, tuple(drawn)))
+    return Chart(
+        "sensitivity",
+        "Error over each parameter",
+        tuple(panels),
+        "Each point is a trial, its error is the mean over all training sequences. A clear valley "
+        "means that the parameter matters alone; a cloud means that others decide.",
+        columns=min(2, len(panels)),
+    )
+
+
+def cost_chart(table: TrialTable) -> Chart | None:
+    """Error over CPU time of all trials, with their Pareto front."""
+    table = table.some(np.isfinite(table.values) & np.isfinite(table.costs))
+    if len(table) < 2:
+        return None
+    front = pareto_front(np.column_stack([table.costs, table.values]))
+    drawn = (
+        Points(table.costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
+        Line(table.costs[front], table.values[front], "Pareto front", steps=True),
+        *_marked(table, table.costs, table.values),
+    )
+    log = bool((table.values > 0.0).all())
+    x, y = Axis("CPU time a scan [ms]", log=True), Axis(table.objective, log)
+    return Chart(
+        "cost",
+        "Error over cost of the trials",
+        (Panel(x, y, drawn),),
+        "Each point is a trial, in the mean over the training sequences. No trial has less of both "
+        "than those on the Pareto front.",
+    )
+
+
+def pareto_chart(
+    names: Sequence[str],
+    values: NDArray[np.float64],
+    front: NDArray[np.float64],
+    marked: Mapping[str, Sequence[float]],
+) -> Chart:
+    """The Pareto front and all sets, one panel for each two consecutive objectives.
+
+    Parameters
+    ----------
+    names
+        Of the objectives, with their units.
+    values
+        Of all sets that keep the limits, of shape (n, n_objectives).
+    front
+        Of those on the front, by a rising first objective.
+    marked
+        By name the values of the sets to mark.
+    """
+    panels = []
+    for i in range(len(names) - 1):
+        drawn: list[Drawn] = [Points(values[:, i], values[:, i + 1], "tried", faint=True)]
+        if len(names) == 2:  # with more objectives than are drawn, the front is no line
+            drawn.append(Line(front[:, 0], front[:, 1], "Pareto front", steps=True))
+        drawn.append(Points(front[:, i], front[:, i + 1], "Pareto front", shape="circle"))
+        drawn += [Points([of[i]], [of[i + 1]], name) for name, of in marked.items()]
+        shown = np.array([*values, *marked.values()])[:, i : i + 2]
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        logs = ((low > 0.0) & (high > _SPREAD * low)).tolist()
+        axes = [Axis(name, log) for name, log in zip(names[i : i + 2], logs, strict=True)]
+        panels.append(Panel(axes[0], axes[1], tuple(drawn)))
+    title = "The sets that no other set beats in every objective"
+    return Chart("pareto", title, tuple(panels), columns=2)
+
+
+# Which parameters matter: importances by Optuna, and what is drawn of them.
+
+
+FOREST: Any = {"n_trees": 16, "max_depth": 8, "seed": 0}
+"""Size of the forest, which bounds the time that it takes."""
+
+
+def importances(table: TrialTable) -> dict[str, float]:
+    """Share of each parameter in the variance of the error's logarithm, by falling share.
+
+    It is functional ANOVA, Optuna's default, on a small forest: Optuna's own takes minutes for some
+    thousand trials, and gives the same shares.
+
+    Parameters
+    ----------
+    table
+        Trials of one odometry.
+
+    Returns
+    -------
+    dict
+        Empty with fewer than `FEW` finished trials, one parameter, or equal errors.
+    """
+    known = table.some(np.isfinite(table.values) & (table.values > 0.0))
+    parameters = {
+        name: p
+        for name, p in table.space.parameters.items()
+        if all(value is not None for value in known.column(name))
+        and len(set(map(repr, known.column(name)))) > 1
+    }
+    logs = np.log(known.values)
+    if len(known) < FEW or len(parameters) < 2 or np.ptp(logs) < 1e-9:
+        return {}
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    distributions = {name: distribution(p) for name, p in parameters.items()}
+    columns = {name: known.column(name) for name in parameters}
+    study = optuna.create_study()
+    study.add_trials(
+        optuna.trial.create_trial(
+            params={name: column[i] for name, column in columns.items()},
+            distributions=distributions,
+            value=float(log),
+        )
+        for i, log in enumerate(logs)
+    )
+    evaluator = optuna.importance.FanovaImportanceEvaluator(**FOREST)
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: float(share) for name, share in found.items()}
+
+
+def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | None:
+    """Importance of each parameter, a panel for each odometry.
+
+    Parameters
+    ----------
+    by_odometry
+        What `importances` found, by the name of the odometry; "" if there is only one.
+    """
+    panels = []
+    for odometry, shares in by_odometry.items():
+        if not shares:
+            continue
+        names = tuple(reversed(list(shares)))
+        percent = [100.0 * shares[name] for name in names]
+        bars = Bars(np.arange(len(names)), percent, "", flat=True)
+        x = Axis("share of the error's variance [%]", limits=(0.0, 100.0))
+        panels.append(Panel(x, Axis("", names=names), (bars,), odometry))
+    if not panels:
+        return None
+    return Chart(
+        "importance",
+        "Which parameters matter",
+        tuple(panels),
+        "How much of the variance of the error (of its logarithm) over all trials a parameter "
+        "explains (functional ANOVA). Where the search has hardly varied a parameter, it seems "
+        "less important than it is. Few trials say little.",
+    )
+
 
 # Charts of what `adaptune validate` found.
 
@@ -102,28 +646,25 @@ def charts_of_trials(study: OfflineStudy) -> Charts:
 
 def _of_trials(study: OfflineStudy, table: TrialTable) -> Iterator[Chart | str | None]:
     names = [name for name in study.training if OF_VIEW not in name]
-    if (n := len(table.space.parameters)) > trial_charts.MOST_PANELS:
-        yield f"Of {n} parameters, the charts show the first {trial_charts.MOST_PANELS}."
+    if (n := len(table.space.parameters)) > MOST_PANELS:
+        yield f"Of {n} parameters, the charts show the first {MOST_PANELS}."
     found = {name: importances(of) for name, of in table.shared().odometries().items()}
-    yield trial_charts.iteration_chart(table, reannealings(study))
+    yield iteration_chart(table, reannealings(study))
     yield importance_chart(found) or (
-        f"No importance of parameters: it takes {trial_charts.FEW} finished trials and two "
-        f"parameters."
+        f"No importance of parameters: it takes {FEW} finished trials and two parameters."
     )
-    yield trial_charts.density_chart(table) or (
-        f"No densities of parameters: they take {trial_charts.FEW} finished trials."
-    )
+    yield density_chart(table) or (f"No densities of parameters: they take {FEW} finished trials.")
     kind, groups = sequence_groups(study, names)
-    yield trial_charts.density_by_group_chart(table, groups, kind)
-    yield trial_charts.sensitivity_chart(table)
+    yield density_by_group_chart(table, groups, kind)
+    yield sensitivity_chart(table)
     for odometry, of in table.odometries().items():
         pair = most_important(of, found.get(odometry, {}))
-        chart = trial_charts.scatter_chart(of, pair, names)
+        chart = scatter_chart(of, pair, names)
         if chart is not None and odometry:
             key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
             chart = replace(chart, key=key, title=title)
         yield chart
-    yield trial_charts.cost_chart(table) or (
+    yield cost_chart(table) or (
         "No costs of trials: they are of an older adaptune, or of an odometry that does not "
         "measure them."
     )

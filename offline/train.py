@@ -21,6 +21,7 @@ from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
 from adaptune.report import tables
+from adaptune.report.drawing import draw_chart
 from adaptune.space import ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.inputs import InputNotes, digest, resume
@@ -40,6 +41,7 @@ from offline.campaign import (
     run_whole,
     whole_values,
 )
+from offline.charts import pareto_chart
 from offline.cluster import Cluster
 from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy
 from offline.labelled import LabelledData, measured_costs
@@ -54,7 +56,6 @@ from offline.objective import (
     label,
     pareto_front,
 )
-from offline.pictures import draw_front
 from offline.search import BUDGETS, Finished
 from offline.trial import TrialSettings, TrialSetup
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
@@ -424,13 +425,13 @@ def _write_pareto(
     values = np.array([verdicts[n].values for n in feasible])
     front = sorted((feasible[i] for i in pareto_front(values)), key=lambda n: verdicts[n].values)
     tables.write_rows(folder, "pareto", [trials[n] for n in front])
-    draw_front(
-        folder / "pareto.png",
+    chart = pareto_chart(
         [label(weights, units=True) for weights in objective],
         values,
         np.array([verdicts[n].values for n in front]),
         {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
     )
+    draw_chart(folder / "pareto.png", chart)
 
 
 # Fit the error model to the labelled data set.

@@ -70,7 +70,6 @@ SLOW = [
     "online/test_recordings.py",
     "adaptune/test_interrupt.py",
     "adaptune/report/test_page.py",
-    "offline/test_pictures.py",
     "adaptune/reference/test_picture.py",
     "adaptune/test_mistakes.py",
     "offline/test_tuning.py",

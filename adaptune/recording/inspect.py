@@ -1,7 +1,6 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
 import datetime
-import textwrap
 from collections.abc import Iterator, Sequence
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from rich.text import Text
 
 from adaptune import files
 from adaptune.errors import AdaptuneError
-from adaptune.files import replacing
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
 from adaptune.recording import survey as faults
@@ -25,6 +23,8 @@ from adaptune.recording.opening import open_sequence
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import TIME_FIELDS
 from adaptune.recording.survey import Fault, Parts, Reading, Survey, n_valid, survey
+from adaptune.report.charts import Axis, Chart, Cloud, Panel, Points
+from adaptune.report.drawing import write_pictures
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 Layout = tuple[tuple[str, str, int], ...]
@@ -471,45 +471,24 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     """
     if inspection.scan is None:
         raise SequenceError(f"{inspection.path}: no scan can be drawn, none could be read")
-    from matplotlib.figure import Figure
-
     points = inspection.scan.scan.points
     # Few far points would shrink all others to a dot.
     reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
-    low, high = np.percentile(points[:, 2], (1, 99)) if len(points) else (0.0, 1.0)
-    figure = Figure(figsize=(9, 12), layout="constrained")
-    above, side = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
-    for axes, j, title in ((above, 1, "from above"), (side, 2, "from the side, z not to scale")):
-        order = np.argsort(points[:, 2])
-        x, y, z = points[order, 0], points[order, j], points[order, 2]
-        # As a picture inside an SVG: it would have tens of thousands of shapes.
-        dots = axes.scatter(x, y, c=z, s=0.5, vmin=low, vmax=high, rasterized=True)
-        axes.plot(0, 0, "r+", markersize=12, mew=2, label="LiDAR")
-        axes.set(title=title, xlabel="x [m]", ylabel=f"{'xyz'[j]} [m]", xlim=(-reach, reach))
-        axes.grid(alpha=0.3)
-    above.set(ylim=(-reach, reach), aspect="equal")
-    above.legend(loc="upper right")
+    low, high = np.percentile(points[:, 2], (1, 99)).tolist() if len(points) else (0.0, 1.0)
     margin = 0.1 * (high - low) + 0.5
-    side.set_ylim(low - margin, high + margin)
-    figure.colorbar(dots, ax=above, label="height z [m]", shrink=0.6, extend="both")
+    x, y, z = points[np.argsort(points[:, 2])].T
+    look: Any = {"colour_label": "height z [m]", "colour_limits": (low, max(high, low + 0.1))}
+    lidar = Points([0.0], [0.0], "LiDAR", shape="cross")
+    x_axis, y_axis = (Axis(f"{name} [m]", limits=(-reach, reach)) for name in "xy")
+    z_axis = Axis("z [m]", limits=(low - margin, high + margin))
+    above, side = Cloud(x, y, z, **look), Cloud(x, z, z, **look)
+    panels = (
+        Panel(x_axis, y_axis, (above, lidar), "from above", equal=True, height=2.0),
+        Panel(x_axis, z_axis, (side, lidar), "from the side, z not to scale"),
+    )
     text = f"{_scan_text(inspection.scan)}; drawn within {reach:.0f} m"
-    heading = [*textwrap.wrap(f"{inspection.path.name}, first scan", 90), *_balanced(text, 90)]
-    figure.suptitle("\n".join(heading), fontsize=10)
-    kind = "svg" if path.suffix.lower() == ".svg" else "png"
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format=kind, dpi=110)
-
-
-def _balanced(text: str, most: int) -> list[str]:
-    """Lines of about the same length that end with commas, as few as `most` characters allow."""
-    for stop in ",;":
-        text = text.replace(f"{stop} ", f"{stop}\n")
-    # Only between phrases may a line end.
-    text = text.replace(" ", "\N{NO-BREAK SPACE}").replace("\n", " ")
-    n = len(textwrap.wrap(text, most))
-    widths = range(len(text) // n, most + 1)
-    lines = next(fit for w in widths if len(fit := textwrap.wrap(text, w)) <= n)
-    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
+    title = f"{inspection.path.name}, first scan: {text}"
+    write_pictures(Chart("scan", title, panels), path)
 
 
 def render_cache() -> RenderableType:

@@ -1,14 +1,13 @@
 """Recordings of simulated courses: ROS bags and KITTI odometry folders."""
 
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
 from adaptune import files, geometry
@@ -24,7 +23,8 @@ from adaptune.recording.export import (
     write_kitti_sequence,
 )
 from adaptune.recording.scan import Scan
-from adaptune.report.paper import as_png_and_svg, colour_map, picture, plain
+from adaptune.report.charts import Axis, Chart, Cloud, Line, Panel
+from adaptune.report.drawing import write_pictures
 from adaptune.simulation import kernels
 from adaptune.simulation.course import (
     IMU,
@@ -274,7 +274,7 @@ def record(
     layout = _layout(path) if layout is None else layout
     stem = path.name if layout in _MARKS else path.stem
     truth = path.with_name(f"{stem}.tum")
-    previews = as_png_and_svg(path.with_name(f"{stem}.png"))
+    previews = [path.with_name(f"{stem}{suffix}") for suffix in (".png", ".svg")]
     for file in (path, truth, *previews):
         _check(file, overwrite, _MARKS.get(layout) if file is path else None)
     drive = Drive(course)
@@ -282,7 +282,6 @@ def record(
         raise SimulationError("the course is over before its first scan is: make it longer")
     with ExitStack() as stack:
         temporary_truth = stack.enter_context(replacing(truth))
-        temporary_previews = [stack.enter_context(replacing(preview)) for preview in previews]
         scans = _watched(drive, picture := Preview(drive), progress, path.stem)
         new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
         if layout == "kitti":
@@ -295,7 +294,7 @@ def record(
             _write_bag(drive, scans, new, 1 if layout == "ros1" else 2)
         stamps = drive.stamps()
         write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        picture.save(temporary_previews)
+        write_pictures(picture.chart(), *previews)
 
 
 def _layout(path: Path) -> Layout:
@@ -460,55 +459,39 @@ class Preview:
             self._scan = scan
         self._count += 1
 
-    def save(self, files: Iterable[Path]) -> None:
-        """Draw the map with the path, and the middle scan from above and as a panorama.
+    def chart(self) -> Chart:
+        """The map with the path, and the middle scan from above and as a panorama."""
+        course, n = self._drive.course, len(self._drive)
+        title = (
+            f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
+            f"seed {course.seed}: {n} scans, {self._drive.road.length:.0f} m"
+        )
+        panels = [self._map_panel()]
+        if self._scan is not None and len(self._scan):
+            panels += _scan_panels(self._scan.points)
+        return Chart("preview", title, tuple(panels))
 
-        Parameters
-        ----------
-        files
-            See `adaptune.report.paper.picture`.
-        """
-        course = self._drive.course
-        with picture(files, 16.0, 9.0) as figure:
-            upper: Any = ["map", "map", "scan"]
-            panels = figure.subplot_mosaic([upper, upper, ["panorama"] * 3])
-            figure.suptitle(
-                f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
-                f"seed {course.seed}: {len(self._drive)} scans, {self._drive.road.length:.0f} m"
-            )
-            self._draw_map(figure, panels["map"])
-            if self._scan is not None and len(self._scan):
-                _draw_scan(figure, panels["scan"], panels["panorama"], self._scan.points)
-
-    def _draw_map(self, figure: Any, axes: Any) -> None:
+    def _map_panel(self) -> Panel:
         points = np.concatenate(self._map) if self._map else np.empty((0, 3))
         x, y, z = points[np.argsort(points[:, 2], kind="stable")].T
-        dots = axes.scatter(x, y, c=z, s=0.5, vmin=-1.5, vmax=4.0, **_look())
         T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
-        axes.plot(T[:, 0, 3], T[:, 1, 3], color="#d55e00", lw=2.0, label="path")
-        axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="the recording from above")
-        label = "height above the sensor [m]"
-        figure.colorbar(dots, ax=axes, label=label, pad=0.01, extend="both")
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        cloud = Cloud(x, y, z, "height above the sensor [m]", (-1.5, 4.0))
+        drawn = cloud, Line(T[:, 0, 3], T[:, 1, 3], "path")
+        title = "the recording from above"
+        return Panel(Axis("x [m]"), Axis("y [m]"), drawn, title, equal=True, height=1.5)
 
 
-def _look() -> dict[str, Any]:
-    """Dots of a cloud: a picture in an SVG, too, which thousands of shapes would make slow."""
-    return {"linewidths": 0, "cmap": colour_map(), "rasterized": True}
-
-
-def _draw_scan(figure: Any, above: Any, panorama: Any, points: NDArray[np.float32]) -> None:
+def _scan_panels(points: NDArray[np.float32]) -> list[Panel]:
     away = np.linalg.norm(points, axis=1)
-    look = _look() | {"c": away, "norm": LogNorm(1.0, 80.0)}
-    above.scatter(points[:, 0], points[:, 1], s=0.6, **look)
-    span = np.percentile(np.abs(points[:, :2]).max(axis=1), 97)
-    above.set(aspect="equal", xlim=(-span, span), ylim=(-span, span))
-    above.set(title="one scan from above", xlabel="x [m]", ylabel="y [m]")
+    span = float(np.percentile(np.abs(points[:, :2]).max(axis=1), 97))
+    look: Any = {"colour_label": "range [m]", "colour_limits": (1.0, 80.0), "log_colour": True}
+    x, y = (Axis(f"{name} [m]", limits=(-span, span)) for name in "xy")
+    above = Cloud(points[:, 0], points[:, 1], away, **look)
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     elevation = np.degrees(np.arcsin(points[:, 2] / away))
-    dots = panorama.scatter(azimuth, elevation, s=9.0, marker="s", **look)
-    panorama.set(xlim=(180, -180), xlabel="azimuth [deg]", ylabel="elevation [deg]")
-    panorama.set_title("the same scan as the sensor sees it")
-    ticks = {"ticks": [1, 2, 5, 10, 20, 50], "format": plain}
-    bar = figure.colorbar(dots, ax=[above, panorama], label="range [m]", pad=0.01, **ticks)
-    bar.ax.minorticks_off()
+    seen = Cloud(azimuth, elevation, away, **look, size=4)
+    around = Axis("azimuth [deg]", limits=(180.0, -180.0))
+    return [
+        Panel(x, y, (above,), "one scan from above", equal=True, height=1.2),
+        Panel(around, Axis("elevation [deg]"), (seen,), "the same scan as the sensor sees it"),
+    ]

@@ -9,7 +9,7 @@ from adaptune.strict import Mistake, validated
 from adaptune.study.config import complete
 from offline.config import OfflineStudyConfig
 
-HEAVY = ("scipy", "numba", "open3d", "optuna", "matplotlib", "rosbags", "sklearn", "small_gicp")
+HEAVY = ("scipy", "numba", "open3d", "optuna", "vl_convert", "rosbags", "sklearn", "small_gicp")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-HEAVY = ("matplotlib", "numba", "open3d", "rosbags", "scipy", "sklearn")
+HEAVY = ("vl_convert", "numba", "open3d", "rosbags", "scipy", "sklearn")
 
 
 @pytest.mark.parametrize(

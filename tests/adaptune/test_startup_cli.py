@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-HEAVY = ("scipy", "numba", "open3d", "optuna", "matplotlib", "rosbags", "sklearn", "small_gicp")
+HEAVY = ("scipy", "numba", "open3d", "optuna", "vl_convert", "rosbags", "sklearn", "small_gicp")
 
 
 def imported(code):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from made_trials import made_table
 
-from offline.trial_charts import importance_chart, importances
+from offline.charts import importance_chart, importances
 
 
 def error(_, parameters):

@@ -135,7 +135,7 @@ def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
     )
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    heavy = {"optuna", "sklearn", "scipy", "open3d", "numba", "matplotlib", "pandas", "sqlalchemy"}
+    heavy = {"optuna", "sklearn", "scipy", "open3d", "numba", "vl_convert", "pandas", "sqlalchemy"}
     assert heavy.isdisjoint(done.stdout.split()), heavy.intersection(done.stdout.split())
 
 

@@ -3,19 +3,20 @@ import pytest
 from made_trials import SPACE, made_table
 
 from adaptune.archive import OF_SLOT, Summary
-from adaptune.report.charts import Bars, Line, Mark, Points
-from offline.config import OfflineConfig
-from offline.trial_charts import (
+from adaptune.report.charts import Axis, Bars, Line, Mark, Points
+from offline.charts import (
     best_tenth,
     cost_chart,
     density_by_group_chart,
     density_chart,
     iteration_chart,
     kernel_density,
+    pareto_chart,
     scatter_chart,
     sensitivity_chart,
     trial_table,
 )
+from offline.config import OfflineConfig
 
 
 def error(name, parameters):
@@ -145,3 +146,15 @@ def test_sensitivity_and_cost_show_all_trials():
 
 def test_too_few_trials_have_no_density():
     assert density_chart(made_table(error, 7)) is None
+
+
+def test_a_front_is_a_line_of_two_objectives_and_none_of_three():
+    values = np.array([[0.5, 9.0, 1.0], [0.7, 5.0, 2.0], [4.0, 2.0, 3.0], [30.0, 7.0, 4.0]])
+    names, marked = ["rte [%]", "memory [MB]", "cpu [% of a core]"], {"fixed": (0.5, 9.0, 1.0)}
+    (panel,) = pareto_chart(names[:2], values[:, :2], values[:3, :2], {"fixed": (0.5, 9.0)}).panels
+    named = [d.name for d in panel.drawn]
+    assert named == ["tried", "Pareto front", "Pareto front", "fixed"]
+    assert (panel.x, panel.y) == (Axis("rte [%]", log=True), Axis("memory [MB]"))
+    first, second = pareto_chart(names, values, values[:3], marked).panels
+    assert (first.x.label, first.y.label, second.y.label) == tuple(names)
+    assert not any(isinstance(d, Line) for panel in (first, second) for d in panel.drawn)

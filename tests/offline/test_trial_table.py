@@ -4,8 +4,8 @@ from made_trials import SPACE, made_sets, made_table, write_trials
 from adaptune import files
 from adaptune.archive import Summary
 from adaptune.space import Float, ParameterSpace, PooledSpace
+from offline.charts import read_trials, trial_table
 from offline.config import OfflineConfig, load_study
-from offline.trial_charts import read_trials, trial_table
 
 
 def test_the_mean_is_over_all_sequences_or_unknown():

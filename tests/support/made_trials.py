@@ -4,8 +4,8 @@ import numpy as np
 
 from adaptune.archive import Archive, Summary, Trial
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from offline.charts import trial_table
 from offline.config import OfflineConfig
-from offline.trial_charts import trial_table
 
 SPACE = ParameterSpace(
     {
