@@ -3,7 +3,6 @@
 import json
 import time
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
@@ -121,33 +120,13 @@ def spent(
     return None
 
 
-def all_done(config: OfflineConfig, folder: Path, numbers: Iterable[int]) -> bool:
-    """Whether a study has no trials left, and the model is fitted to those that it has.
-
-    ``trials.csv``, which a run writes at its end, is newer than all trials then.
-    """
-    table, limit = folder / "trials.csv", max_trials(config)
+def has_ended(folder: Path) -> bool:
+    """Whether a study's table of trials, which a run writes at its end, is newer than them all."""
+    table = folder / "trials.csv"
     if not table.exists():
         return False
     ended = table.stat().st_mtime_ns
-    if any(path.stat().st_mtime_ns > ended for path in (folder / "trials").glob("*/*.npz")):
-        return False
-    if limit is None or config.sampler == "grid":
-        return True
-    if config.hours or config.stagnation:
-        return True
-    # Every search shares trial 0.
-    searches = Counter(n // OF_SLOT for n in numbers if n)
-    return min(searches.values(), default=0) + 1 >= limit
-
-
-def more_trials(config: OfflineConfig, override: Sequence[str]) -> list[str] | None:
-    """Values to run as many trials with as without a budget; None if the budget allows as many."""
-    limit = max_trials(config)
-    if limit is None or limit >= TRIALS or config.sampler == "grid":
-        return None
-    rest = [text for text in override if not text.startswith("offline.trials=")]
-    return rest if len(rest) < len(override) else [*rest, f"offline.trials={TRIALS}"]
+    return all(path.stat().st_mtime_ns <= ended for path in (folder / "trials").glob("*/*.npz"))
 
 
 class Clock:

@@ -125,7 +125,7 @@ def trials(
     from adaptune.report import tables
     from adaptune.study.inputs import warn_of_stale
     from adaptune.study.references import estimates_in_words
-    from offline.search import all_done
+    from offline.search import has_ended
 
     warn_of_stale(loaded)
     names, archive = loaded.training, Archive(loaded.folder / "trials")
@@ -144,7 +144,7 @@ def trials(
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
         for sentence in estimates_in_words(loaded, names):
             say(sentence)
-        if all_done(loaded.config.offline, loaded.folder, (row["trial"] for row in finished)):
+        if has_ended(loaded.folder):
             say_next_of_trained(len(names) > 1, loaded.config.test, study, override, folder)
         else:
             why = "run the trials that are left, fit"

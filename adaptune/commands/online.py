@@ -256,7 +256,6 @@ def compare(
 
 def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
     from adaptune.study.study import MIN_RECORDINGS
-    from offline.search import TRIALS, more_trials
 
     loaded = load(study, override, folder)
     found = _compared(loaded)
@@ -268,11 +267,7 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
     if found.unfinished:
         say_next_of_study("replay what is missing", "online", study, override, folder)
         return
-    n, more = len(loaded.config.training), more_trials(loaded.config.offline, override)
-    if n < MIN_RECORDINGS and more is not None:
-        why = f"try {TRIALS} sets; {MIN_RECORDINGS} training recordings tell of other recordings"
-        say_next_of_study(why, "offline", study, more, folder)
-    elif n < MIN_RECORDINGS:
+    if (n := len(loaded.config.training)) < MIN_RECORDINGS:
         first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
         why = "find out what adapting gains elsewhere"
         say_next_of_study(why, "offline", study, override, folder, first)
