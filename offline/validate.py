@@ -32,7 +32,6 @@ from adaptune.study.study import (
     PER_STRETCH,
     RIVAL_WORDS,
     RIVALS,
-    Driven,
     driven,
     expected_in_words,
 )
@@ -417,8 +416,10 @@ def validate(
     model = _checked_model(study)
     data = _labelled(study, model)
     online = driven(study, model)
-    considered = study.mechanism == "bank" and PAIRED in study.rules
-    bank = _bank(study, model) if considered else 0
+    bank: int | list[int] = 0
+    if study.mechanism == "bank" and PAIRED in study.rules:
+        switching = study.config.online.switching
+        bank = switching.size if switching.sets is None else model.bank
     try:
         validation = leave_one_out(data, None, progress, bank)
     except ValidationError as error:
@@ -431,33 +432,24 @@ def validate(
         draw_chart(study.folder / "validation.png", chart)
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
-    said = [*_verdicts(study, online, validation), *_baseline_warning(study, data)]
+    bounds = data.bounds()
+    best = min(bounds, key=lambda n: bounds[n])
+    warning = baseline_warning(study.config.offline, data.whole(), best, data.fixed())
+    said = [online.words, *_verdicts(study.rules, study.mechanism == "bank", validation)]
+    said += [warning] if warning else []
     said += estimates_beside_intervals(study, study.training)
     return Validated(validation, rows, said)
 
 
-def _bank(study: OfflineStudy, model: ErrorModel) -> int | list[int]:
-    """How many members a bank has where a sequence is left out, or which."""
-    switching = study.config.online.switching
-    return switching.size if switching.sets is None else model.bank
-
-
-def _baseline_warning(study: OfflineStudy, data: LabelledData) -> list[str]:
-    bounds = data.bounds()
-    best = min(bounds, key=lambda n: bounds[n])
-    said = baseline_warning(study.config.offline, data.whole(), best, data.fixed())
-    return [] if said is None else [said]
-
-
-def _verdicts(study: OfflineStudy, online: Driven, validation: Validation) -> list[str]:
-    """What `adaptune online` will drive, then the estimate for it, then for what else it drives."""
-    said = [online.words]
-    if "adaptive" in study.rules:
+def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> list[str]:
+    """The estimate for what `adaptune online` will drive, then for what else it drives."""
+    said = []
+    if PAIRED in rules:
         said += [validation.verdict(PAIRED), *validation.against_rivals()]
     said.append(baseline_in_words(validation))
-    if "paper" not in study.rules:
+    if "paper" not in rules:
         return said
-    if study.mechanism == "bank":
+    if bank:
         why = "`online` lets it choose among the bank's members, here it chooses among all sets"
         return [*said, f"`paper` has no verdict: {why}."]
     return [*said, validation.verdict("paper")]
