@@ -99,19 +99,19 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
         self._seen = [np.flatnonzero(seen[frames[0]]) for frames in groups]
         self._X = X[self._members]
         self._y = np.ascontiguousarray(y)
-        self.near_squared_, self.near_sets_ = self._near(self._sets)
+        self.near_squared_, self.near_sets_ = self._near()
         return self
 
-    def _near(self, candidates: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.intp]]:
-        """For each group and candidate the nearest sets, of shape (n_groups, n_candidates, k).
+    def _near(self) -> tuple[NDArray[Any], NDArray[np.intp]]:
+        """For each group and set the nearest sets, of shape (n_groups, n_sets, k).
 
         Where a group has seen fewer sets the distance is infinite.
         """
-        squared = np.zeros((len(candidates), len(self._sets)))
+        squared = np.zeros((len(self._sets), len(self._sets)))
         for p in range(self._sets.shape[1]):
-            squared += (candidates[:, p, None] - self._sets[:, p]) ** 2
+            squared += (self._sets[:, p, None] - self._sets[:, p]) ** 2
         k = min(self.n_neighbors, len(self._sets))
-        near_squared = np.full((len(self._seen), len(candidates), k), np.inf)
+        near_squared = np.full((len(self._seen), len(self._sets), k), np.inf)
         near_sets = np.zeros(near_squared.shape, np.intp)
         for g, seen in enumerate(self._seen):
             of_group = squared if len(seen) == len(self._sets) else squared[:, seen]
@@ -132,25 +132,11 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
         """
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
-        predicted = np.array([self._predict(x, self.near_squared_, self.near_sets_) for x in X])
+        predicted = np.array([self.predict_one(x) for x in X])
         return predicted[:, 0] if self._one_set else predicted
 
     def predict_one(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predict the targets of all sets for one frame of shape (n_features,), unchecked."""
-        return self._predict(x, self.near_squared_, self.near_sets_)
-
-    def predict_at(self, x: NDArray[np.float64], sets: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predict the targets of other sets.
-
-        `x` is one frame (n_features,); the sets (n_candidates, n_parameters) may be new ones.
-
-        Returns shape (n_candidates,).
-        """
-        return self._predict(x, *self._near(sets))
-
-    def _predict(
-        self, x: NDArray[np.float64], near_squared: NDArray[Any], near_sets: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
         squared, members, group = nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
         frames = self._members[members]
         # Of equally near frames the earlier one first, whatever group it is of.
@@ -159,8 +145,8 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
             squared[order],
             frames[order],
             group[order],
-            near_squared,
-            near_sets,
+            self.near_squared_,
+            self.near_sets_,
             self._y,
             self.n_neighbors,
         )
@@ -189,7 +175,7 @@ class NearestNeighbours(Rule):
         return self
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Rule.predict`."""
+        """Predicted error of every set in percent; infinite for those that may not be chosen."""
         predicted = self.regressor_.predict_one(feature)
         some = self.data_.allows()
         if self.data_.candidates is not None:

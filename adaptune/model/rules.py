@@ -318,15 +318,6 @@ class Rule(ABC):
         """Learn, and compute whatever does not depend on the scan."""
 
     @abstractmethod
-    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predict the error of every set for one scan.
-
-        The feature is the scan's scaled descriptor, of shape (n_features,).
-
-        Returns shape (n_sets,): percent; infinite for sets that are not candidates.
-        """
-
-    @abstractmethod
     def select(self, feature: NDArray[np.float64]) -> Selection:
         """Choose a set, or weights, for one scan's scaled descriptor of shape (n_features,)."""
 
@@ -473,10 +464,10 @@ class PairedExpectedRatio(Rule):
         return [self.candidates_[position] for position in best]
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Rule.predict`.
+        """Predicted error of every set for one scan in percent, of shape (n_sets,).
 
-        For the fixed set too, this is the mixed ratio times its error; `select` returns the error
-        itself.
+        It is infinite for sets that are not candidates. For the fixed set too, it is the mixed
+        ratio times its error; `select` returns the error itself.
         """
         near = self.near(feature[None])
         predicted = np.full(len(self.data_.sets), np.inf)

@@ -146,15 +146,6 @@ class BankRule(Rule):
         products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
         return NearProducts(self.members_, evidence, products, fixed)
 
-    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Rule.predict`; the error of each member alone."""
-        near = self.near(feature[None])
-        weights = near.evidence.weights(self.settings.sharpness)
-        predicted = np.full(len(self.data_.sets), np.inf)
-        squares = np.einsum("qs,qsjj->qj", weights, near.products)
-        predicted[self.data_.sets.columns(self.members_)] = np.sqrt(squares[0])
-        return predicted
-
     def select(
         self,
         feature: NDArray[np.float64],

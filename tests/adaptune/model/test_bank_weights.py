@@ -49,9 +49,6 @@ def test_errors_that_cancel_get_the_weight():
     np.testing.assert_allclose(weights, [0.0, 0.5, 0.5, 0.0], atol=0.1)
     assert selection.trial in (1, 2)
     assert selection.predicted_error < 0.3 * selection.predicted_fixed
-    alone = rule.predict(data.features[5])
-    np.testing.assert_allclose(alone[:3], np.sqrt(3.0), rtol=0.1)
-    assert alone[3] > 5.0
 
 
 def test_weights_are_of_the_places_that_are_near():
