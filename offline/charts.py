@@ -23,13 +23,12 @@ from adaptune.report.charts import (
     Line,
     Mark,
     Panel,
-    Parameter,
     Points,
     charts_of,
     on_axis,
     parameter_axis,
 )
-from adaptune.space import ODOMETRY, Categorical, Integer, ParameterSet, ParameterSpace
+from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
 from adaptune.study.study import Study
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import judge, label, pareto_front, sampler_results, weighted
@@ -142,160 +141,14 @@ def fixed_set(study: Study) -> ParameterSet | None:
     return files.Document.of_file(path).data if path.exists() else None
 
 
-BEST = 0.1
-"""Share of the trials that are the best."""
 _SPREAD = 20.0
 """Largest over least value from which on an axis of a Pareto front is logarithmic."""
 FEW = 8
-"""With fewer trials, densities and importances mean nothing."""
+"""With fewer trials, importances mean nothing."""
 MOST_PANELS = 12
 """Panels of a chart; further parameters and sequences are not shown."""
 _COLOURED = 4.0
 """Colours say errors of up to so many times the least."""
-_BINS, _STEPS = 20, 120
-_WHOLE = 12
-"""A whole number of so many values at most has bars, and no density."""
-
-
-def best_tenth(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which trials are the tenth with the least values, at least one, of shape (n,).
-
-    Trials without a finite value are none of them.
-    """
-    known = np.isfinite(values)
-    n = max(1, round(BEST * int(known.sum()))) if known.any() else 0
-    chosen = np.zeros(len(values), bool)
-    chosen[np.argsort(np.where(known, values, np.inf), kind="stable")[:n]] = True
-    return chosen
-
-
-def density_chart(table: TrialTable) -> Chart | None:
-    """Density of each parameter over all trials, and over the best tenth."""
-    known = table.shared()
-    known = known.some(np.isfinite(known.values))
-    if len(known) < FEW:
-        return None
-    best = best_tenth(known.values)
-    groups = {"all trials": np.ones(len(known), bool), f"best tenth ({best.sum()})": best}
-    return Chart(
-        "parameter-density",
-        "Where the trials lie, and where the best of them",
-        tuple(_density_panels(known, groups, filled=True)),
-        "Density of each parameter over the trials, relative to trials that are spread evenly over "
-        "the range (1). Where the best tenth is much denser than all trials, values do well; where "
-        "it is flat, the parameter hardly matters.",
-        columns=min(2, len(known.space.parameters)),
-    )
-
-
-def density_by_group_chart(
-    table: TrialTable, groups: Mapping[str, Sequence[str]], kind: str = "sequence"
-) -> Chart | None:
-    """Density of each parameter over the best tenth of the trials in each group of sequences.
-
-    Parameters
-    ----------
-    table
-        The trials.
-    groups
-        By name, training sequences.
-    kind
-        What a group is, in a word.
-    """
-    chosen = {}
-    for name, sequences in groups.items():
-        values = np.mean([table.on(sequence) for sequence in sequences], axis=0)
-        if np.isfinite(values).sum() >= FEW:
-            chosen[name] = best_tenth(values)
-    panels = [p for p in _density_panels(table, chosen, filled=False) if p.drawn]
-    if len(chosen) < 2 or not panels:
-        return None
-    return Chart(
-        "parameter-density-by-group",
-        f"Where the best tenth of the trials lies, by {kind}",
-        tuple(panels),
-        f"As above, for the best tenth of the trials on each {kind}. Peaks that lie apart mean "
-        f"that no one set is best everywhere: this is what adapting can gain from.",
-        columns=min(2, len(panels)),
-    )
-
-
-def _density_panels(
-    table: TrialTable, groups: Mapping[str, NDArray[np.bool_]], filled: bool
-) -> Iterator[Panel]:
-    for name, parameter in list(table.space.parameters.items())[:MOST_PANELS]:
-        values = table.column(name)
-        there = np.array([value is not None for value in values], bool)
-        of_groups = {
-            group: [v for v, its in zip(values, kept & there, strict=True) if its]
-            for group, kept in groups.items()
-        }
-        x = parameter_axis(name, parameter)
-        if (marks := _bar_places(parameter)) is not None:
-            bars = tuple(_share_bars(of_groups, parameter, marks))
-            yield Panel(x, Axis("share of the trials [%]"), bars)
-        else:
-            drawn = tuple(_densities(of_groups, parameter, filled))
-            yield Panel(x, Axis("density, relative to even [-]"), drawn)
-
-
-def _bar_places(parameter: Parameter) -> NDArray[np.float64] | None:
-    """Where bars stand for the values of a parameter; None if it has too many."""
-    if isinstance(parameter, Categorical):
-        return np.arange(float(len(parameter.choices)))
-    if isinstance(parameter, Integer) and parameter.high - parameter.low < _WHOLE:
-        return np.arange(parameter.low, parameter.high + 1.0)
-    return None
-
-
-def _share_bars(
-    groups: Mapping[str, Sequence[Any]], parameter: Parameter, places: NDArray[np.float64]
-) -> Iterator[Bars]:
-    width = 0.8 / max(len(groups), 1)
-    for i, (name, values) in enumerate(groups.items()):
-        at = on_axis(values, parameter)
-        shares = 100.0 * (at[:, None] == places).sum(axis=0) / max(len(at), 1)
-        yield Bars(places + (i - 0.5 * (len(groups) - 1)) * width, shares, name, width=width)
-
-
-def _densities(
-    groups: Mapping[str, Sequence[Any]], parameter: Parameter, filled: bool
-) -> Iterator[Drawn]:
-    """Histograms and kernel densities, computed where the range is the unit interval."""
-    assert not isinstance(parameter, Categorical)
-
-    def placed(unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        low, high = float(parameter.low), float(parameter.high)
-        return low * (high / low) ** unit if parameter.log else low + unit * (high - low)
-
-    for name, values in groups.items():
-        if not values:
-            continue
-        unit = np.array([parameter.to_unit(value) for value in values])
-        if filled:
-            counts, edges = np.histogram(unit, _BINS, (0.0, 1.0), density=True)
-            yield Band(
-                placed(np.repeat(edges, 2)[1:-1]),
-                np.zeros(2 * _BINS),
-                np.repeat(counts, 2),
-                name,
-            )
-        grid = np.linspace(0.0, 1.0, _STEPS)
-        if len(density := kernel_density(unit, grid)):
-            yield Line(placed(grid), density, name)
-
-
-def kernel_density(unit: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Density of points of the unit interval, at some of its points; empty if all are equal.
-
-    What lies near a bound is reflected at it: the density does not end before the range does.
-    """
-    from scipy.stats import gaussian_kde
-
-    if len(unit) < 2 or np.ptp(unit) < 1e-9:
-        return np.empty(0)
-    of_points = gaussian_kde(unit)
-    return np.asarray(of_points(at) + of_points(-at) + of_points(2.0 - at))
 
 
 def scatter_chart(
@@ -653,9 +506,6 @@ def _of_trials(study: OfflineStudy, table: TrialTable) -> Iterator[Chart | str |
     yield importance_chart(found) or (
         f"No importance of parameters: it takes {FEW} finished trials and two parameters."
     )
-    yield density_chart(table) or (f"No densities of parameters: they take {FEW} finished trials.")
-    kind, groups = sequence_groups(study, names)
-    yield density_by_group_chart(table, groups, kind)
     yield sensitivity_chart(table)
     for odometry, of in table.odometries().items():
         pair = most_important(of, found.get(odometry, {}))
@@ -674,19 +524,6 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
     """Names of two parameters: those that matter most, or the first that all sets have."""
     every = [n for n in table.space.parameters if all(v is not None for v in table.column(n))]
     return [*shares, *(name for name in every if name not in shares)][:2]
-
-
-def sequence_groups(study: Study, names: Sequence[str]) -> tuple[str, dict[str, list[str]]]:
-    """Groups of training sequences: by scene where courses share theirs, else each alone."""
-    courses = study.config.courses
-    if all(name in courses for name in names):
-        scenes: dict[str, list[str]] = {}
-        for name in names:
-            kinds = sorted({scene for scene, _ in courses[name].legs})
-            scenes.setdefault(", ".join(kinds), []).append(name)
-        if 1 < len(scenes) < len(names):
-            return "scene", scenes
-    return "sequence", {name: [name] for name in names}
 
 
 def reannealings(study: OfflineStudy) -> dict[int, list[int]]:

@@ -8,18 +8,9 @@ from made_trials import write_trials
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from offline.campaign import run_batches
-from offline.charts import charts_of_trials, charts_of_validation, reannealings, sequence_groups
+from offline.charts import charts_of_trials, charts_of_validation, reannealings
 from offline.config import load_study
 
-COURSES = """\
-odometry: {name: gicp}
-courses:
-  a: {scenes: [cave]}
-  b: {scenes: [cave, cave]}
-  c: {scenes: [street, open]}
-  d: {scenes: [open, street]}
-training: [a, b, c, d]
-"""
 BOTH = """\
 odometry: [{name: gicp}, {name: ndt}]
 courses: {a: {scenes: [cave]}}
@@ -43,8 +34,6 @@ def test_trials_have_their_charts(study):
     assert [chart.key for chart in charts] == [
         "iterations",
         "importance",
-        "parameter-density",
-        "parameter-density-by-group",
         "sensitivity",
         "parameter-scatter",
     ]
@@ -57,7 +46,7 @@ def test_few_trials_say_what_is_missing(study):
     write_trials(study, error, 3)
     charts, notes = charts_of_trials(study)
     assert {"iterations", "sensitivity", "parameter-scatter"} == {chart.key for chart in charts}
-    assert len(notes) == 3
+    assert len(notes) == 2
 
 
 def test_each_of_several_odometries_has_a_scatter(tmp_path):
@@ -71,15 +60,6 @@ def test_each_of_several_odometries_has_a_scatter(tmp_path):
     assert len(set(keys)) == len(keys)
     importance = charts[keys.index("importance")]
     assert {panel.title for panel in importance.panels} <= {"gicp", "ndt"}
-
-
-def test_courses_of_the_same_scenes_are_one_group(tmp_path):
-    (tmp_path / "courses.yaml").write_text(COURSES, "utf-8")
-    study = load_study(tmp_path / "courses.yaml", [], tmp_path / "study")
-    groups = {"cave": ["a", "b"], "open, street": ["c", "d"]}
-    assert sequence_groups(study, study.training) == ("scene", groups)
-    # Each of another kind is alone.
-    assert sequence_groups(study, ["a", "c"]) == ("sequence", {"a": ["a"], "c": ["c"]})
 
 
 def annealing(study_file, folder, **given):

@@ -1,16 +1,11 @@
 import numpy as np
-import pytest
 from made_trials import SPACE, made_table
 
 from adaptune.archive import OF_SLOT, Summary
-from adaptune.report.charts import Axis, Bars, Line, Mark, Points
+from adaptune.report.charts import Axis, Line, Mark, Points
 from offline.charts import (
-    best_tenth,
     cost_chart,
-    density_by_group_chart,
-    density_chart,
     iteration_chart,
-    kernel_density,
     pareto_chart,
     scatter_chart,
     sensitivity_chart,
@@ -27,52 +22,6 @@ def error(name, parameters):
 
 def of_kind(panel, kind, name=None):
     return [d for d in panel.drawn if isinstance(d, kind) and (name is None or d.name == name)]
-
-
-def test_the_best_tenth_is_the_best_tenth():
-    values = np.random.default_rng(0).permutation(40).astype(float)
-    values[:5] = np.nan, np.inf, np.nan, 50.0, 60.0
-    best = best_tenth(values)
-    assert best.sum() == 4  # of 38
-    assert values[best].max() < values[np.isfinite(values) & ~best].min()
-    assert not best_tenth(np.full(3, np.nan)).any()
-
-
-def test_densities_integrate_to_one_and_peak_where_the_best_are():
-    table = made_table(lambda _, p: abs(np.log(p["distance"] / 3.0)), n=200)
-    panels = density_chart(table).panels
-    assert [panel.x.label for panel in panels] == ["distance", "points", "kernel"]
-    distance, points, kernel = panels
-    assert distance.x.log
-    assert not points.x.log
-    every, best = of_kind(distance, Line)
-    assert [every.name, best.name] == ["all trials", "best tenth (20)"]
-    for line in (every, best):
-        unit = np.log(line.x) / np.log(10.0)
-        assert np.trapezoid(line.y, unit) == pytest.approx(1.0, abs=0.02)
-    assert best.x[np.argmax(best.y)] == pytest.approx(3.0, rel=0.1)
-    assert max(best.y) > 3.0 * max(every.y)
-    for bars in of_kind(kernel, Bars):
-        assert sum(bars.heights) == pytest.approx(100.0)
-
-
-def test_density_does_not_leak_beyond_the_bounds():
-    at = np.linspace(0.0, 1.0, 201)
-    even = kernel_density(np.linspace(0.0, 1.0, 400), at)
-    np.testing.assert_allclose(even, 1.0, atol=0.05)
-    assert not len(kernel_density(np.full(9, 0.3), at))
-
-
-def test_groups_of_sequences_have_their_own_best():
-    chart = density_by_group_chart(made_table(error, 200), {"near": ["one"], "far": ["two"]})
-    near, far = of_kind(chart.panels[0], Line)
-    assert near.x[np.argmax(near.y)] == pytest.approx(2.0, rel=0.15)
-    assert far.x[np.argmax(far.y)] == pytest.approx(8.0, rel=0.15)
-    assert density_by_group_chart(made_table(error, 200), {"near": ["one"]}) is None
-    # One trial is no density.
-    few = density_by_group_chart(made_table(error, 12), {"near": ["one"], "far": ["two"]})
-    assert all(panel.drawn for panel in few.panels)
-    assert "distance" not in [panel.x.label for panel in few.panels]
 
 
 def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
@@ -129,7 +78,6 @@ def test_each_search_of_its_own_has_a_panel():
     assert list(of_kind(one, Line)[0].x) == list(range(1, 10))
     assert [mark.at for mark in of_kind(two, Mark)] == [4]
     # They were not run on all sequences.
-    assert density_chart(own) is None
     assert cost_chart(own) is None
 
 
@@ -142,10 +90,6 @@ def test_sensitivity_and_cost_show_all_trials():
     for x, y in zip(front.x, front.y, strict=True):
         assert not ((values <= [x, y]).all(axis=1) & (values < [x, y]).any(axis=1)).any()
     assert cost_chart(table.some(table.numbers < 1)) is None
-
-
-def test_too_few_trials_have_no_density():
-    assert density_chart(made_table(error, 7)) is None
 
 
 def test_a_front_is_a_line_of_two_objectives_and_none_of_three():
